@@ -11,7 +11,8 @@
     calib.export(model, "calibrated/", urdf="robot.urdf")
 
 Every verb takes a file where it takes a value; results print themselves, convert (`to_dict`, `to_dataframe`), draw
-(`plot`) and write the folders that the commands write (`save`). Units are SI: m, rad, s, kg, N m.
+(`plot`) and write the folders that the commands write (`save`). Units are SI: m, rad, s, kg, N m. While a call runs,
+BLAS has one thread, which is fastest here; OPENBLAS_NUM_THREADS or OMP_NUM_THREADS, where set, count instead.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, wraps
-from inspect import signature
+from inspect import Signature, isgenerator, signature
 from math import inf
 from numbers import Integral, Real
 from pathlib import Path
@@ -51,6 +51,8 @@ class Within:
 def checked(given: C) -> C:
     """Return a function, or a dataclass, that refuses arguments of other types than annotated.
 
+    A function runs with one thread of BLAS, `calib.workers.threads`.
+
     Numbers may be numpy's, and any sequence or array stands for a tuple; text is neither number nor sequence.
 
     Raises:
@@ -72,27 +74,37 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if not (len(args) > method or kwargs):  # nothing is given beside the defaults
-            return function(*args)
-        from calib.config_types import shown
-        from calib.errors import UsageError
+        from calib.errors import quiet
+        from calib.workers.threads import limited_steps, one_blas_thread
 
-        wanted, hints = expected()
-        try:
-            bound = wanted.bind(*args, **kwargs)
-        except TypeError as wrong:
-            raise UsageError(f"{name}: {wrong}") from None
-        for argument, value in bound.arguments.items():
-            variadic = wanted.parameters[argument].kind in (2, 4)  # *args, **kwargs
-            if argument in hints and not variadic and not _fits(value, hints[argument]):
-                hint = hints[argument]
-                if get_origin(hint) is Annotated and _fits(value, get_args(hint)[0]):  # of its type, beyond its range
-                    raise UsageError(f"{argument} {shown(value)}: expected {_words(hint)}")
-                found = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
-                raise UsageError(f"{name}: {argument}: expected {_words(hint)}, {found}")
-        return function(*args, **kwargs)
+        if len(args) > method or kwargs:  # something is given beside the defaults
+            _refuse_other_types(name, *expected(), args, kwargs)
+        if method:
+            with quiet():
+                return function(*args, **kwargs)
+        with one_blas_thread(), quiet():
+            result = function(*args, **kwargs)
+        return limited_steps(result) if isgenerator(result) else result
 
     return call
+
+
+def _refuse_other_types(name: str, wanted: Signature, hints: dict[str, Any], args: tuple, kwargs: dict) -> None:
+    from calib.config_types import shown
+    from calib.errors import UsageError
+
+    try:
+        bound = wanted.bind(*args, **kwargs)
+    except TypeError as wrong:
+        raise UsageError(f"{name}: {wrong}") from None
+    for argument, value in bound.arguments.items():
+        variadic = wanted.parameters[argument].kind in (2, 4)  # *args, **kwargs
+        if argument in hints and not variadic and not _fits(value, hints[argument]):
+            hint = hints[argument]
+            if get_origin(hint) is Annotated and _fits(value, get_args(hint)[0]):  # of its type, beyond its range
+                raise UsageError(f"{argument} {shown(value)}: expected {_words(hint)}")
+            found = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
+            raise UsageError(f"{name}: {argument}: expected {_words(hint)}, {found}")
 
 
 def _fits(value: Any, hint: Any) -> bool:

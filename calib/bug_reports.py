@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 
 from calib import files
-from calib.errors import CalibError
+from calib.errors import CalibError, brief
 
 CODE = 4
 """Exit code of an error that nobody foresaw."""
@@ -33,19 +33,24 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
     """
     name = f"calib-bug-{datetime.now():%Y%m%d-%H%M%S}-{id(error) % 9973}.txt"
     content = "\n".join([f"calib {shlex.join(command)}", *_versions(), "", *traceback.format_exception(error)])
-    said = f"an error that nobody foresaw: {_short(error)}"
+    said = f"internal error: {type(error).__name__}: {brief(error)}"
     for place in (Path() if folder is None else folder, Path(tempfile.gettempdir())):
         try:
             path = files.write(place / name, content)
         except CalibError:
             continue
-        return f"{said}; {path} says where: please send it in. Was every input what it should be?"
+        return f"{said}; a bug report was written: {path}{_where_to()}. Was every input what it should be?"
     return f"{said}; --debug shows where. Was every input what it should be?"
 
 
-def _short(error: BaseException, most: int = 200) -> str:
-    words = " ".join(f"{type(error).__name__}: {error}".split())
-    return words if len(words) <= most else f"{words[:most]}…"
+def _where_to() -> str:
+    """Say where a report is to be sent, as the package's metadata name it; nothing where they do not."""
+    try:
+        known = metadata.metadata(PACKAGES[0]).get_all("Project-URL") or []
+    except metadata.PackageNotFoundError:
+        return ""
+    found = (address for label, _, address in (entry.partition(", ") for entry in known) if "issue" in label.lower())
+    return next((f", please send it to {address}" for address in found), "")
 
 
 def _versions() -> list[str]:

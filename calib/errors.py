@@ -7,17 +7,28 @@ raise their own subclasses of `ValueError`.
 from __future__ import annotations
 
 import difflib
+import errno
+import os
 import shlex
 import sys
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # of a write, whatever the file
 
 
 class CalibError(Exception):
     """Root of all errors this toolkit raises on purpose."""
+
+
+class CalibWarning(UserWarning):
+    """What whoever uses a result must know of it."""
 
 
 class UsageError(CalibError):
@@ -101,6 +112,12 @@ def command_line(*words: object, program: str = "calib") -> str:
     return shlex.join([program, *map(str, words)])
 
 
+def brief(error: BaseException, most: int = 200) -> str:
+    """Return what an error says in one line of at most `most` letters."""
+    words = " ".join(str(error).split())
+    return words if len(words) <= most else f"{words[:most]}…"
+
+
 def suggestion(word: str, words: Collection[str]) -> str:
     """Return `` (did you mean '...'?)`` for the most similar of `words`, or nothing."""
     lower = {str(other).lower(): other for other in words}
@@ -118,6 +135,37 @@ def as_ours() -> Iterator[None]:
         if code is None:
             raise
         raise (Unidentifiable if code == 3 else UsageError)(str(error)) from error
+
+
+def complaint(error: Exception) -> tuple[str, int] | None:
+    """Return what to say of an error that is no bug of ours, and its exit code; None for others.
+
+    Beside our own: what the operating system refuses with a file's name, or for want of room, and want of memory.
+    """
+    if (code := exit_code(error)) is not None:
+        return str(error), code
+    if isinstance(error, OSError) and (error.filename is not None or error.errno in NO_ROOM):
+        place = "" if error.filename is None else f"{error.filename}: "
+        return f"{place}{error.strerror or error}", 2
+    if isinstance(error, MemoryError):
+        return f"the memory does not suffice ({error}): is a number or a file larger than meant?", 2
+    return None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what numpy, scipy, matplotlib and others say to programmers from the console; a `CalibWarning` passes.
+
+    With CALIB_DEBUG everything passes.
+    """
+    if os.environ.get("CALIB_DEBUG"):
+        yield
+        return
+    with warnings.catch_warnings(record=True, action="ignore") as caught:
+        warnings.simplefilter("always", CalibWarning)
+        yield
+    for one in caught:
+        warnings.warn(one.message, stacklevel=4)  # here, contextlib, what `quiet` is around, whoever called that
 
 
 def exit_code(error: Exception) -> int | None:

@@ -144,7 +144,7 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     """
     if _reached(out) and out.is_dir():
         raise UsageError(f"{out} is a folder; give a file to write to")
-    check_writable(out.absolute().parent)
+    check_writable(out.absolute().parent, out)
     check_not_input([out], inputs)
     if suffixes and out.suffix not in suffixes:
         raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
@@ -226,18 +226,19 @@ def _again(cell: str) -> str:
 PICTURE = marked("figure", ".png", MAKER.encode())
 
 
-def check_writable(folder: Path) -> None:
-    """Refuse, before any work is done, a folder that cannot be written to, or made.
+def check_writable(folder: Path, target: Path | None = None) -> None:
+    """Refuse, before any work is done, a folder that cannot be written to, or made, for `target` (the folder itself).
 
     Raises:
-        UsageError: with the folder and the reason.
+        UsageError: with the target, the folder and the reason.
     """
     nearest = next(one for one in (folder, *folder.absolute().parents) if _reached(one))
     try:
         with tempfile.TemporaryFile(dir=nearest):
             pass
     except OSError as error:
-        raise UsageError(f"cannot write to {nearest}: {error.strerror or error}; nothing was changed there") from error
+        message = f"cannot write {target or folder}: {error.strerror or error} in {nearest}; nothing was changed there"
+        raise UsageError(message) from error
 
 
 def _reached(path: Path) -> bool:
@@ -289,6 +290,8 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
     Raises:
         OSError: with the reason.
     """
+    if str(path).encode(errors="ignore").decode() != str(path):
+        raise OSError(errno.EILSEQ, "its name is no UTF-8: rename the file", str(path))
     mode = os.stat(path).st_mode
     handed = streams and str(path).startswith(("/dev/fd/", "/dev/stdin", "/proc/self/fd/"))
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or handed or str(path) == os.devnull):
@@ -353,8 +356,14 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     return write(path, text.getvalue())
 
 
-def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = ()) -> Path:
-    """Write values (N, k), a name before each row or none, as `write_table` does, in half its time: logs are long."""
+def write_numbers(
+    path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = (), notes: Sequence[str] = ()
+) -> Path:
+    """Write values (N, k), a name before each row or none, as `write_table` does, in half its time: logs are long.
+
+    Args:
+        notes: comment lines above the header.
+    """
     text = _headed(header)
     line = ",".join(["%.12g"] * values.shape[1]) + "\n"
     if names:
@@ -364,7 +373,12 @@ def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray, n
             text.write(line % tuple(row))
     else:
         text.write((line * len(values)) % tuple(values.ravel().tolist()))
-    return write(path, text.getvalue())
+    return write(path, remarks(notes) + text.getvalue())
+
+
+def remarks(notes: Sequence[str]) -> str:
+    """Return lines as comments of a CSV, TOML or YAML file."""
+    return "".join(f"# {note}\n" for note in notes)
 
 
 def _cell(value: Any) -> Any:
@@ -373,7 +387,8 @@ def _cell(value: Any) -> Any:
 
 def _headed(header: Sequence[str]) -> io.StringIO:
     text = io.StringIO()
-    misread = header[0].startswith("#") or any(mark in name for name in header for mark in ";\t")
+    marks = ";\t" if len(header) > 1 else ";\t| "
+    misread = header[0].startswith("#") or any(mark in name for name in header for mark in marks)
     quoting = csv.QUOTE_ALL if misread else csv.QUOTE_MINIMAL
     csv.writer(text, lineterminator="\n", quoting=quoting).writerow(map(_cell, header))
     return text

@@ -10,12 +10,16 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from calib import files
-from calib.errors import UsageError
+from calib.errors import CalibError, UsageError
 
-METRICS = "metrics.json"
-"""Written last: it says that the rest of a folder is there."""
+METRICS, SESSION = "metrics.json", "session.toml"
+"""By which results and sessions are known; the metrics are written last: they say that the rest is there."""
 REPORT, CERTIFICATE = "report.json", "certificate.html"
 """What figures and a certificate are made from, and the certificate."""
+OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
+"""By which an export is known, of a geometry and of dynamics."""
+MJCF, DRIVES, JOINT_ORIGINS = "robot.xml", "drives.csv", "joint_origins.yaml"
+"""Of an export of dynamics."""
 
 
 def check_target(
@@ -37,6 +41,8 @@ def check_target(
         raise UsageError(f"{out} is a file; results go into a folder (--out)")
     files.check_writable(out)
     files.check_not_input([out, *(out / name for name in ours)], inputs)
+    if other := files_of(out, {METRICS, SESSION} - set(ours)):
+        raise UsageError(f"{out} holds {other[0]}: it is another result's or session's folder; choose another (--out)")
     present = files_of(out, ours)
     if present and not all((out / name).exists() for name in marks):
         raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another (--out)")
@@ -75,8 +81,11 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], None]
             _move_files(staging, out, ours)
         else:
             os.replace(staging, out)
+    except CalibError as error:  # names the folder that was filled, not the one that was asked for
+        error.args = tuple(str(words).replace(str(staging), str(given)) for words in error.args)
+        raise
     except OSError as error:
-        raise UsageError(f"cannot write {out}: {error.strerror or error}; nothing was changed there") from error
+        raise UsageError(f"cannot write {given}: {error.strerror or error}; nothing was changed there") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
     return given

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import types
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -10,6 +11,8 @@ from functools import cache
 from numbers import Real
 from pathlib import Path
 from typing import Any, SupportsIndex, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from calib.errors import UsageError
 
 T = TypeVar("T")
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")  # what a spreadsheet's formula begins with, and our own mark
@@ -62,6 +65,23 @@ def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
         return wanted[0](plain_text(text))
     except ValueError as error:
         raise ValueError(f"{place}: {name}: {error}") from error
+
+
+def read_json(path: Path, advice: str = "make it again", kind: Any = dict) -> Any:
+    """Return what a JSON file of ours holds, as a value of `kind` (see `read_record`).
+
+    Raises:
+        UsageError: where the file is missing, damaged or of other content, with `advice`.
+    """
+    try:
+        return read_record(kind, json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise UsageError(f"{path} cannot be read ({error}); {advice}") from error
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text that we left, none where there is none; damaged letters are replaced."""
+    return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
 
 def read_record(kind: type[T], content: Any, place: str = "") -> T:

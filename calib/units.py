@@ -65,6 +65,12 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     return first, f"{first}/s", f"{first}/s²", torque
 
 
+def without_gains(unit: str) -> str:
+    """Say in words what the torques of a model in `unit` are, "A of joint 2", that were identified from currents."""
+    scaled = unit.removeprefix("A of ")
+    return f"in amperes, {f'scaled to {scaled}, ' if scaled != unit else ''}because no drive gains are known"
+
+
 def per_ampere(own: str, unit: str) -> str:
     """Return a parameter's unit in a model whose torques are in `unit`: of amperes, all are divided by a gain [N m/A].
 

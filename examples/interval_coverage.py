@@ -1,27 +1,33 @@
 """How the errors that fits and identifications state hold: one row per recording and split, and simulated parameters.
 
-CALIB_DATA=... python examples/interval_coverage.py [torques] [parameters] [positions [ROW ...]]
+CALIB_DATA=... python examples/interval_coverage.py [torques] [regimes] [parameters] [positions [ROW ...]]
 
-A ROW of the positions is named by its first cells: "Motoman small | each region". Without any all are made.
+A ROW of the positions is named by its first cells: "Motoman small | each region". Without any all are made. Regimes:
+the open recordings' pairs of `extrapolation.py` whose test is of another regime (faster, another range or motion).
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from extrapolation import identified_pair
+from extrapolation_pairs import OPEN
 
 import calib
+from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
 from calib.data.poses.measurements import take
 from calib.geometry.model_choice.folds import region_folds
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import parse_options
+from calib.identification.uncertainty.torque_errors import TorqueIntervals
 from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
@@ -42,11 +48,13 @@ RECORDINGS = {
     "Motoman wide": (MOTOMAN / "model_right.urdf", MOTOMAN / "right_wide_386.csv", 0.25),
     "TIAGo, three markers": (DATA / "tiago_laas/model.urdf", DATA / "tiago_laas/mocap_35poses.csv", 0.25),
 }
+ENDS = ("UR5", "UR10 A", "UR10 B", "Motoman small", "Motoman wide")
 STATIONS = (
     ("UR10 A", "UR10 B"), ("UR10 B", "UR10 A"), ("Motoman small", "Motoman wide"), ("Motoman wide", "Motoman small"),
 )  # fmt: skip
 SECONDS, RATE, SEEDS = 20.0, 1000.0, 50
 REGION_SEED = 7  # regions that are none of the fit's own folds
+END = 0.15  # share of the poses at one end of a joint that is left out
 
 
 PANDA, LWR = "franka_panda_inria/traj1_first60pct.npz", "kuka_lwr4plus_iit/measurements_1.npz"
@@ -98,19 +106,47 @@ def regions(robot: Path, file: Path) -> Iterator[GeometryFit]:
         yield calib.fit_geometry(robot, take(block, np.flatnonzero(~inside)), FitSettings(), validate=left_out)
 
 
-def torque_row(name: str, train: str, unseen: str, options: dict) -> str:
+def ends(robot: Path, file: Path) -> Iterator[GeometryFit]:
+    """Yield a fit per joint and end of its range that is left out."""
+    block = gather(robot, [file], settings=FitSettings()).fit[0]
+    for joint in np.flatnonzero(np.ptp(block.q, axis=0) > 1e-3):
+        low, high = np.quantile(block.q[:, joint], [END, 1.0 - END])
+        for name, left in (("low", block.q[:, joint] < low), ("high", block.q[:, joint] > high)):
+            if left.any():
+                unseen = replace(take(block, np.flatnonzero(left)), file=f"{name} end of joint {joint + 1}")
+                yield calib.fit_geometry(robot, take(block, np.flatnonzero(~left)), FitSettings(), validate=unseen)
+
+
+def torque_row(name: str, split: str, model: DynamicsModel) -> str:
     """Return a row of the torques' table: intervals on motion that the identification has not seen."""
-    robot = (DATA / train).parent / "model.urdf"
-    model = calib.identify_dynamics(
-        robot, str(DATA / train), validate=str(DATA / unseen), options=parse_options(options)
-    )
-    ((case, found),) = model.outcome.assessment.intervals.items()
+    cases = model.outcome.assessment.intervals
+    series = ("index", "sigma", "inside", "known")
+    joined = {key: np.concatenate([getattr(one, key) for one in cases.values()]) for key in series}
+    found = TorqueIntervals(**joined, extrapolated=np.concatenate([x.extrapolated for x in cases.values()], axis=1))
+    errors = [model.outcome.validation[case].raw.total for case in cases]
     joints = 100.0 * found.joints
     return (
-        f"| {name} | {Path(unseen).name} | {model.outcome.validation[case].raw.total:.1f} % | "
+        f"| {name} | {split} | {np.average(errors, weights=[len(x.index) for x in cases.values()]):.1f} % | "
         f"{100 * found.covered:.1f} % | {joints.min():.0f}–{joints.max():.0f} % | "
         f"{' '.join(f'{one:.2g}' for one in found.median)} | {100 * found.beyond.mean():.0f} % |"
     )
+
+
+def motion_rows() -> Iterator[str]:
+    """Yield the rows of the torques' table."""
+    for name, train, unseen, options in MOTIONS:
+        robot = (DATA / train).parent / "model.urdf"
+        files = [str(DATA / each) for each in (train, unseen)]
+        model = calib.identify_dynamics(robot, files[0], validate=files[1], options=parse_options(options))
+        yield torque_row(name, Path(unseen).name, model)
+
+
+def regime_rows() -> Iterator[str]:
+    """Yield a row per open pair of recordings whose test is of another regime."""
+    for pair in OPEN:
+        if pair.across:
+            with tempfile.TemporaryDirectory() as place:
+                yield torque_row(*pair.name.split(" → ", 1), identified_pair(pair.prepare(Path(place)), Path(place)))
 
 
 def position_rows() -> Iterator[tuple[str, str, Callable[[], list[GeometryFit]]]]:
@@ -119,6 +155,8 @@ def position_rows() -> Iterator[tuple[str, str, Callable[[], list[GeometryFit]]]
         settings = FitSettings(holdout=share)
         yield name, f"{100 * share:.0f} % at random", lambda: [calib.fit_geometry(robot, file, settings)]  # noqa: B023
         yield name, "each region left out", lambda: list(regions(robot, file))  # noqa: B023
+        if name in ENDS:
+            yield name, "each joint's ends left out", lambda: list(ends(robot, file))  # noqa: B023
     for one, other in STATIONS:
         robot, file, _ = RECORDINGS[one]
         settings, unseen = FitSettings(refit_frames=True), RECORDINGS[other][1]
@@ -134,12 +172,12 @@ def positions(chosen: Sequence[str] = ()) -> None:
             print(row(name, split, fits()), flush=True)
 
 
-def torques() -> None:
-    """Print the table of torques."""
+def torques(rows: Iterator[str]) -> None:
+    """Print the table of torques, all rows or those of other regimes."""
     print("| learnt from | unseen motion | unexplained | within 95 % | by joint | median ± by joint | extrapolated |")
     print("|---|---|---|---|---|---|---|", flush=True)
-    for motion in MOTIONS:
-        print(torque_row(*motion), flush=True)
+    for row in rows:
+        print(row, flush=True)
 
 
 def identified(arm: MovingArm, seeds: Sequence[int]) -> Identification:
@@ -178,11 +216,13 @@ def parameters(seeds: int = SEEDS) -> None:
 
 
 def main() -> None:
-    wanted = sys.argv[1:] or ["torques", "parameters", "positions"]
+    wanted = sys.argv[1:] or ["torques", "regimes", "parameters", "positions"]
     place = wanted.index("positions") + 1 if "positions" in wanted else len(wanted)
     wanted, chosen = wanted[:place], wanted[place:]
     if "torques" in wanted:
-        torques()
+        torques(motion_rows())
+    if "regimes" in wanted:
+        torques(regime_rows())
     if "parameters" in wanted:
         parameters()
     if "positions" in wanted:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import loaded as processes
@@ -16,6 +17,7 @@ from hypothesis import HealthCheck, settings
 from recordings import DATA
 
 from calib.cli import GARBAGE
+from calib.workers.threads import one_blas_thread
 
 # a shell's job in the background inherits that Ctrl-C is ignored; tests send it to themselves and to their processes
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -31,6 +33,13 @@ settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("fixed")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread() -> Iterator[None]:
+    """Limit BLAS for tests that call what stands behind the API, as the API does."""
+    with one_blas_thread():
+        yield
+
+
 def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
@@ -42,7 +51,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     return processes.stages(tmp_path_factory.mktemp("loaded"))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data() -> Path:
     """Return the folder of real recordings, or skip."""
     if not DATA.is_dir():

@@ -49,7 +49,7 @@ HOMES = {
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "cloudpickle": ["calib.workers.cluster"],
-    "threadpoolctl": ["calib.workers.cluster"],
+    "threadpoolctl": ["calib.workers.threads"],
     "typer": ["calib.cli", "calib.cli."],
     "click": ["calib.cli", "calib.cli."],
     "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure."],

@@ -93,3 +93,19 @@ def test_files_written_together_appear_together(tmp_path: Path) -> None:
         assert not (tmp_path / "a.csv").exists()
         files.write(tmp_path / "b.csv", "2")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "b.csv", "file"]
+
+
+@pytest.mark.parametrize("mark", [METRICS, "session.toml"])
+def test_the_folder_of_another_result_or_a_session_is_refused(mark, tmp_path: Path) -> None:
+    (tmp_path / mark).touch()
+    with pytest.raises(UsageError, match=f"holds {mark}"):
+        check_target(tmp_path, ("robot.urdf",), (), "export")
+
+
+def test_an_error_names_the_folder_asked_for(tmp_path: Path) -> None:
+    def write(folder: Path) -> None:
+        raise CalibError(f"cannot write {folder / 'a.csv'}")
+
+    with pytest.raises(CalibError) as caught:
+        write_staged(tmp_path / "out", (METRICS,), write)
+    assert str(caught.value) == f"cannot write {tmp_path / 'out' / 'a.csv'}"

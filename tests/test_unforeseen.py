@@ -25,7 +25,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "error, code, words",
     [
-        (KeyError("axis"), 4, "an error that nobody foresaw: KeyError: 'axis'; calib-bug-"),
+        (KeyError("axis"), 4, "internal error: KeyError: 'axis'; a bug report was written: calib-bug-"),
         (PermissionError(13, "Permission denied", "/x/y.csv"), 2, "/x/y.csv: Permission denied"),
         (MemoryError("Unable to allocate 373. GiB"), 2, "Unable to allocate 373. GiB"),
         (BrokenPipeError(32, "Broken pipe"), 141, ""),
@@ -60,3 +60,26 @@ def test_debug_shows_the_traceback(monkeypatch) -> None:
     monkeypatch.setattr("calib.procedure.formats.describe", failing(KeyError("axis")))
     with pytest.raises(KeyError):
         cli.run(["formats", "mdh"])
+
+
+@pytest.mark.parametrize("word", ["", "m\udcff.csv"])
+def test_a_word_that_is_empty_or_no_utf8_is_refused(word, capsys) -> None:
+    assert cli.run(["formats", word]) == 2 and "formats" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_no_bug(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("calib.procedure.formats.describe", failing(OSError(28, "No space left on device")))
+    assert cli.run(["formats", "mdh"]) == 2 and "No space left" in capsys.readouterr().err
+
+
+def test_warnings_of_others_are_kept_and_ours_pass() -> None:
+    import warnings
+
+    from calib.errors import CalibWarning, quiet
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with quiet():
+            warnings.warn("theirs", RuntimeWarning, stacklevel=1)
+            warnings.warn("ours", CalibWarning, stacklevel=1)
+    assert [str(one.message) for one in caught] == ["ours"]

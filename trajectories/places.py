@@ -80,12 +80,12 @@ class Clearance:
 
     Attributes:
         distances: q (N, n) -> (N, k) [m], negative inside.
-        product: (q, G (N, k)) -> (N, n), the slopes of Σ G · distances.
+        gradients: q (N, n) -> (N, k, n), their derivatives.
         labels: (k,) names of the pairs.
     """
 
     distances: Callable[[np.ndarray], np.ndarray]
-    product: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    gradients: Callable[[np.ndarray], np.ndarray]
     labels: tuple[str, ...]
     least: float = 0.0
     name: str = "clearance"
@@ -97,12 +97,13 @@ class Clearance:
 
     @property
     def groups(self) -> np.ndarray:
-        return np.zeros(len(self.labels), dtype=int)
+        return np.arange(len(self.labels))
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         return self.least - self.distances(motion.q)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         result = np.zeros((4, *motion.q.shape))
-        result[0] = -self.product(motion.q, weights)
+        _, rows, back = np.unique(motion.times, return_index=True, return_inverse=True)  # each pair asks for its own
+        result[0] = -np.einsum("mk,mkn->mn", weights, self.gradients(motion.q[rows])[back])
         return result

@@ -20,6 +20,7 @@ from calib.procedure.dynamic_stage import folder, identify, inputs, metric_table
 from calib.procedure.findings import Verdict
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
 from calib.robot.calibrated import CalibratedChain
+from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,11 +54,13 @@ class DynamicsModel:
         found, carried = self.outcome.found.fitted.estimate, self.outcome.carried
         return found if carried is None else replace(found, covariance=carried.covariance)
 
+    @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
         dynamics = self.outcome.found.dynamics
         return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
+    @one_blas_thread()
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the standard deviations (N, rows) [N m or N] of the errors of `torques`: 1.96 of them hold 95 %.
 
@@ -78,6 +81,7 @@ class DynamicsModel:
 
         return folder.write_folder(self.outcome, Path(out), dynamics_figures.write if plots else None)
 
+    @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: measured and predicted torques, autocorrelations, friction."""
         from calib.procedure.report import dynamics_figures

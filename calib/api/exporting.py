@@ -10,7 +10,7 @@ from calib.api.given import optional, saved
 from calib.api.kinematic import GeometryFit
 from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.arguments import checked
-from calib.errors import RobotError, UsageError
+from calib.errors import CalibWarning, RobotError, UsageError
 from calib.procedure.export import delivery, dynamics, geometry
 from calib.procedure.export.identified import is_identified
 from calib.procedure.parallel_stage.robots import refuse_parallel
@@ -55,7 +55,7 @@ def export(
             lines = delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into)
         judged = delivery.mark(into, delivery.verdicts(place))
     for words in judged:
-        warnings.warn(words, stacklevel=3)
+        warnings.warn(words, CalibWarning, stacklevel=3)
     return (*judged, *lines)
 
 

@@ -28,6 +28,7 @@ from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import joint_kinds
+from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,6 +76,7 @@ class PoseSelection:
         files.check_results([(Path(path), run_kind(self.chosen.chain.joint_names))], overwrite=overwrite)
         return write_run(Path(path), self.chosen.run, self.chosen.chain)
 
+    @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: sigma of the tool's position over the workspace, and by number of poses.
 
@@ -136,6 +138,7 @@ class GeometryFit:
         """The fitted parameters [m, rad] with their covariance."""
         return self.outcome.selection.fit.estimate
 
+    @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error, all axes together, at any poses.
 
@@ -164,6 +167,7 @@ class GeometryFit:
 
         return folder.write_folder(self.outcome, Path(out), partial(certificate.write_fit, plots=plots))
 
+    @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures of the certificate by name."""
         from calib.procedure.report import figures

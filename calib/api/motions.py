@@ -17,6 +17,7 @@ from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
 from calib.robot.calibrated import CalibratedChain
+from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,6 +42,7 @@ class ExcitationDesign:
 
         return folder.write_design(self.designed, Path(out), motion_figures.write_design if plots else None)
 
+    @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: motion, tool path, search, front."""
         from calib.procedure.report import motion_figures
@@ -80,6 +82,7 @@ class MotionPlan:
 
         return folder.write_plan(self.planned, Path(out), motion_figures.write_plan if plots else None)
 
+    @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: motion and speed profile."""
         from calib.procedure.report import motion_figures

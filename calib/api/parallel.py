@@ -12,13 +12,14 @@ import numpy as np
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
 from calib.estimation.estimate import Estimate
-from calib.procedure.excitation.parallel import ParallelDesign
 from calib.procedure.findings import Verdict
 from calib.procedure.parallel_stage import folder
+from calib.procedure.parallel_stage.design import ParallelDesign
 from calib.procedure.parallel_stage.fit import ParallelFit
 from calib.procedure.parallel_stage.identify import ParallelOutcome
 from calib.procedure.parallel_stage.plan import ParallelPlan, plan_lines, plan_metrics
 from calib.procedure.parallel_stage.robots import FoundRobot
+from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -99,6 +100,7 @@ class ParallelDynamics:
         """The base parameters with their covariance."""
         return self.outcome.found.fitted.estimate
 
+    @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the rows (N, rows) of a motion q, v, a (N, n) of the actuated joints, no payload on board.
 
@@ -112,6 +114,7 @@ class ParallelDynamics:
         """Write the folder that `calib identify --out` writes."""
         return folder.write_identified(self.outcome, Path(out), plots)
 
+    @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: measured and predicted rows."""
         return folder.figures(self.outcome)

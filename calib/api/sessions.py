@@ -33,7 +33,8 @@ def new_session(
     Args:
         folder: new.
         robot, base, tip: as of `calib.load`.
-        instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose`` or ``other-position``.
+        instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose``, ``other-position``, or
+            ``none``: dynamics alone, the robot's description taken as calibrated.
         poses, validation: how many to choose for the fit, and to measure and never fit.
         tool: (3,) where the target roughly sits in the tip's frame [m].
         limits: TOML file that both poses and motions keep (``calib formats limits``), or its tables.

@@ -5,6 +5,7 @@ needed to mend it stands in a file, see `calib.bug_reports`), 130 interrupted.""
 from __future__ import annotations
 
 import gc
+import io
 import os
 import signal
 import sys
@@ -16,10 +17,7 @@ import typer
 from typer.main import get_command
 
 from calib.cli import camera, dynamics, geometry, motion, session, study
-
-# many small matrices: BLAS threads only get in each other's way (a fit on two busy cores: 9 s against 19 s)
-for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_pool, "1")
+from calib.workers.threads import limit_process
 
 # a command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
 # 6 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10)
@@ -59,8 +57,12 @@ def options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with one of the codes above."""
     gc.set_threshold(*GARBAGE)
+    if arguments is None:  # the process is this command's
+        limit_process()
     if not os.environ.get("CALIB_DEBUG"):  # what numpy and others say to programmers helps nobody at a cell
         warnings.filterwarnings("ignore")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a console that lacks a letter gets its number
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = run(arguments)
     except KeyboardInterrupt:  # one more, while the first was being seen to
@@ -79,6 +81,10 @@ def _command() -> Any:
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; errors become one message on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    for before, word in zip(["calib", *given], given):
+        if word.encode(errors="ignore").decode() != word or not word:
+            what = "is no UTF-8 (rename the file)" if word else "is empty (leave the option out, or give it a value)"
+            return _complain(f"what stands behind {before} {what}", 2)
     try:
         code = int(_command()(args=_spread(given), standalone_mode=False) or 0)
         return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
@@ -99,15 +105,11 @@ def run(arguments: list[str] | None = None) -> int:
 
 def _failed(error: Exception, given: list[str]) -> int:
     """Say what went wrong, and return the exit code that it has."""
-    from calib.errors import exit_code
-
-    if (code := exit_code(error)) is not None:
-        return _complain(str(error), code)
-    if isinstance(error, OSError) and error.filename is not None:
-        return _complain(f"{error.filename}: {error.strerror or error}", 2)
-    if isinstance(error, MemoryError):
-        return _complain(f"the memory does not suffice ({error}): is a number or a file larger than meant?", 2)
     from calib import bug_reports
+    from calib.errors import complaint
+
+    if (foreseen := complaint(error)) is not None:
+        return _complain(*foreseen)
 
     return _complain(bug_reports.report(error, given), bug_reports.CODE)
 

@@ -47,6 +47,9 @@ def fit(
     tolerance: Annotated[
         float | None, typer.Option(metavar="MM", help="rms on unseen poses, in mm, above which the verdict is fail")
     ] = None,
+    deliverable: Annotated[
+        str, typer.Option(help="what the verdict is about: urdf (robot.urdf alone), or corrections (with them)")
+    ] = "urdf",
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
@@ -67,7 +70,7 @@ def fit(
 
     settings = FitSettings(
         model, loss, folds, stations, tools, holdout, refit_frames,
-        None if tolerance is None else 1e-3 * tolerance, seed,
+        None if tolerance is None else 1e-3 * tolerance, deliverable, seed,
     )  # fmt: skip
     check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
@@ -197,8 +200,6 @@ def export(
 
     A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
     """
-    import warnings
-
     from calib.errors import UsageError
     from calib.files import together
     from calib.procedure.export import delivery, geometry
@@ -210,10 +211,10 @@ def export(
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
-        with progress() as show, warnings.catch_warnings(action="ignore"):  # what it warns of is the first line
+        with progress() as show:
             show("all forms, and each file read back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
-        say_written(lines, into, delivery.worst(delivery.verdicts(folder)))
+        say_written(lines, into, delivery.verdicts(folder).level)
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
         raise UsageError(
@@ -221,12 +222,11 @@ def export(
         )
     found = geometry.read(folder)
     geometry.check_targets(folder, urdf, out, ur_kinematics, offsets, overwrite)
-    verdicts = delivery.verdicts(folder)
-    judged = delivery.remark(verdicts)
+    own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
     with together():
-        read = geometry.export_urdf(found, urdf, out, for_corrections, judged) if urdf and out else ""
+        read = geometry.export_urdf(found, urdf, out, for_corrections, own.remark) if urdf and out else ""
         if ur_kinematics:
-            geometry.export_ur_kinematics(found, ur_kinematics, judged)
+            geometry.export_ur_kinematics(found, ur_kinematics, own.remark)
         if offsets:
             geometry.export_offsets(found, offsets)
     if urdf and out:
@@ -239,13 +239,10 @@ def export(
     if offsets:
         say(f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones")
     if found.corrections is not None:
-        note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
-        left = geometry.without_corrections(folder)
-        note += f": {left}" if left else ""
-        say(note)
-    if judged:
-        say(judged)
-    exit_failed(delivery.worst(verdicts))
+        say(f"note: the corrections in {folder}/joint_corrections.csv are in none of these files")
+    if own.level:
+        say(str(own))
+    exit_failed(own.level)
 
 
 @app.command()
@@ -254,7 +251,8 @@ def compensate(
     targets: Annotated[Path, typer.Argument(help="CSV of nominal joints or tool poses: calib formats targets")],
     out: Annotated[Path, typer.Option(help="CSV file of joint commands")],
     frame: Annotated[
-        str, typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station")
+        str,
+        typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station"),
     ] = "base",
     tool: Annotated[
         str, typer.Option(help="what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]")
@@ -274,7 +272,14 @@ def compensate(
     overwrite: Overwrite = False,
     seed: Seed = 0,
 ) -> None:
-    """Turn targets into joint commands that put the real tool there."""
+    """Turn targets into joint commands that put the real tool there.
+
+    Targets of a workpiece that the instrument has measured: --frame STATION (the file's name, see the fit's report).
+
+    Targets taught with the robot, or commands that are to change least: --frame nominal.
+
+    Targets of an offline model of the cell, which stand in the robot's base: --frame base.
+    """
     from calib.api import kinematic
     from calib.files import check_results
     from calib.procedure.export.geometry import results

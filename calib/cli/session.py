@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.shared import Base, Overwrite, Plots, Seed, Tip, exit_failed, make_console, reporting, say
+from calib.errors import CalibError, UsageError, command_line
 
 if TYPE_CHECKING:
     from calib.procedure.session.questions import Answers
@@ -25,7 +26,7 @@ def new(
     ] = None,
     instrument: Annotated[
         str | None,
-        typer.Option(help="cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position"),
+        typer.Option(help="cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none"),
     ] = None,
     tool: Annotated[
         str | None, typer.Option(help="x,y,z: where the target roughly sits in the tip's frame [m]")
@@ -58,6 +59,9 @@ def new(
     dynamics: Annotated[
         bool | None, typer.Option("--dynamics/--geometry-only", help="identify the dynamics, too (default)")
     ] = None,
+    dynamics_only: Annotated[
+        bool, typer.Option("--dynamics-only", help="measure nothing: the description is taken as calibrated")
+    ] = False,
     payload: Annotated[
         list[str] | None, typer.Option(help="label=kg of a body to record with as well; may be repeated")
     ] = None,
@@ -76,12 +80,15 @@ def new(
     stands on the certificate.
     """
     from calib.api.sessions import new_session
-    from calib.errors import command_line
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.session.questions import Answers, checked
 
     refuse_parallel(robot, "calib new")
     told = tuple(obstacle) if obstacle else None
+    if dynamics_only:
+        if instrument not in (None, "none"):
+            raise UsageError(f"--dynamics-only measures nothing; the instrument is {instrument}")
+        instrument = "none"
     given = Answers(
         robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box,
         told, mounting, lens, board, carried, stands,
@@ -98,7 +105,6 @@ def _asked(given: Answers) -> Answers:
     """Ask for what was not given, at a terminal."""
     import sys
 
-    from calib.errors import CalibError, UsageError
     from calib.procedure.session.questions import QUESTIONS, with_answer
 
     if not sys.stdin.isatty():
@@ -175,7 +181,6 @@ def demo(
     plots: Plots = True,
 ) -> None:
     """Calibrate a simulated robot; compare with the hidden truth."""
-    from calib.errors import command_line
     from calib.procedure.session import demo as demonstration
 
     with reporting() as (say, progress):
@@ -228,7 +233,6 @@ def run(
 
 
 def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> None:
-    from calib.errors import command_line
     from calib.procedure.session import commands
 
     typed = command_line(command, folder, *([again] if again else []))
@@ -251,7 +255,6 @@ def view(
     overwrite: Overwrite = False,
 ) -> None:
     """Show robot, errors, poses, motions or torques in Rerun."""
-    from calib.errors import UsageError, command_line
     from calib.files import check_results
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.report import viewer

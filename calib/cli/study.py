@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, exit_failed, reporting, say
+from calib.errors import UsageError
 
 app = typer.Typer()
 SHOWN = 3  # conditions whose tables are printed in full
@@ -33,7 +34,6 @@ def study(
     Rows go to the disk as they come: a study that was stopped, or lost workers, goes on from there when the same
     command is given again; asked for more runs, it adds them. What a study file holds: calib formats study.
     """
-    from calib.errors import UsageError
     from calib.procedure.report import console
     from calib.procedure.study import outcome, report
 
@@ -109,7 +109,6 @@ def compare(
 
 def _names(text: str | None) -> list[str] | None:
     """Return the methods of a list with commas, held against those there are; None for all."""
-    from calib.errors import UsageError
     from calib.identification.methods.registry import method_named
 
     if text is None:

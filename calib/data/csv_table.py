@@ -1,8 +1,9 @@
 """CSV tables: a header with units, columns in SI, and complaints that name the row and the column.
 
-Separator tab, semicolon or comma (the first of these that the header has), or blanks between numbers alone; UTF-8 with
-or without a byte order mark; lines that begin with ``#`` are comments; the decimal mark is a point. Where no line
-but a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
+Separator tab, semicolon, comma or bar (the first of these that the header has), or blanks, where the first row of
+numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``
+are comments; the decimal mark is a point. Where no line but a comment names the columns (numpy's savetxt), the last
+comment before the numbers is the header.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
@@ -26,6 +27,7 @@ from calib.records import plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+_UNIT_APART = re.compile(r"[ ]+([\[(])")  # q1 [deg], where blanks part the names
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _CHUNK = 20_000
 LONGEST = 1 << 20  # letters of a line (our choice)
@@ -68,6 +70,11 @@ class Table:
         """Return a column (m,) as texts; numbers in their shortest form (``0``, not ``0.0``)."""
         cells = self.cells[self.index(name)]
         return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [plain_text(str(cell)) for cell in cells]
+
+    def block(self, head: str) -> np.ndarray | None:
+        """Return columns head1, head2, … as (m, n) floats; None without any."""
+        names = [name for name in self.header if name.startswith(head) and name[len(head) :].isdigit()]
+        return np.column_stack([self.numbers(name) for name in names]) if names else None
 
     def numbers(self, name: str, dimension: str = "", unit: str = "", gaps: bool = False) -> np.ndarray:
         """Return a column (m,) as floats in SI.
@@ -169,7 +176,8 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
                 # a quoted name that holds a line break goes on in the next line
                 while line.count('"') % 2 and len(line) < LONGEST and (more := file.readline(LONGEST)):
                     line += more
-                separator = _separator(line.strip())
+                separator = _separator(line.strip(), partial(_ahead, file))
+                line = _UNIT_APART.sub(r"\1", line) if separator == " " else line
                 lines = line.strip("\r\n").splitlines(keepends=True)
                 first = next(csv.reader(lines, delimiter=separator, skipinitialspace=True))
                 if _headless(first, path) or not headed:
@@ -197,11 +205,24 @@ def _headless(cells: Sequence[str], path: str | Path) -> bool:
     return sum(_is_number(cell) for cell in cells) > len(cells) / 2
 
 
-def _separator(line: str) -> str:
+def _separator(line: str, ahead: Callable[[], str]) -> str:
+    """Return the separator of a first line; `ahead` returns the line behind it."""
     line = re.sub(r'"[^"]*"', "", line)
-    if not any(mark in line for mark in ",;\t") and all(_is_number(cell) for cell in line.split()):
+    if mark := next((mark for mark in "\t;,|" if mark in line), ""):
+        return mark
+    if all(_is_number(cell) for cell in line.split()):
         return " "  # numpy's savetxt
-    return next((mark for mark in "\t;" if mark in line), ",")
+    names, numbers = _UNIT_APART.sub(r"\1", line).split(), ahead().split()
+    return " " if 1 < len(names) == len(numbers) and all(_is_number(cell) for cell in numbers) else ","
+
+
+def _ahead(file: IO[str]) -> str:
+    """Return the next line that is neither empty nor a comment; the file stays where it is."""
+    place = file.tell()
+    lines = iter(partial(file.readline, LONGEST), "")
+    found = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    file.seek(place)
+    return found
 
 
 def _comment_header(comment: str, separator: str, width: int, path: str | Path) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.arrays import frozen, shaped
 from calib.errors import RobotError
-from calib.robot.chain import AXES, Chain, Element
+from calib.robot.chain import AXES, Chain, Element, check_gravity
 from calib.transforms import pose
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
@@ -79,6 +79,7 @@ class Bodies:
     def with_gravity(self, gravity: np.ndarray) -> Bodies:
         """Return the bodies under another gravity vector (3,) in the base frame [m/s²]."""
         gravity = shaped(gravity, (3,), "gravity")
+        check_gravity(gravity)
         constants = np.array(self.constants)
         constants[-1, :3] = gravity
         return replace(self, gravity=frozen(gravity), constants=frozen(constants))

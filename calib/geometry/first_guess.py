@@ -15,6 +15,7 @@ Each guess then gets a few robust Gauss–Newton steps on the frames alone (`cal
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import singledispatch
 
@@ -32,6 +33,7 @@ from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion, invert, pose
+from calib.units import DEG
 
 WRONG_UNIT = 15.0  # measured over predicted spread of the positions (our choice)
 UNITS = {
@@ -43,6 +45,8 @@ UNITS = {
     25.4: "are they mm under a header that says in",
     0.03937: "are they in under a header that says mm",
 }
+FEW_DEGREES = 2.1 * math.pi * DEG  # no joint goes further: they may be rad read as deg (our choice)
+MIN_SPREAD = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
 TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
 ENOUGH = 300  # rows of a block that a guess is made from (our choice)
 
@@ -62,7 +66,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     for block in sorted(measured, key=lambda b: (_rank(b), -_turning(chain, b), -len(b))):
         block = take(block, np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int)))
         arm = forward(chain, block.q)
-        check_scale(block, arm)
+        check_scale(block, chain)
         for number in np.unique(block.tool):
             name, rows = block.tool_names[number], block.tool == number
             station, tool = _guess(block, arm, rows, stations.get(block.station), tools.get(name))
@@ -82,32 +86,59 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     )
 
 
-def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
+def check_scale(block: PoseMeasurements, chain: Chain) -> None:
     """Refuse measurements whose size cannot be the robot's: the ratio of measured to predicted spread of positions.
 
     Args:
         block: measurements; those without positions pass.
-        arm: (m, 4, 4) poses of the tip that the joints predict.
+        chain: predicts them from the joints.
 
     Raises:
-        MeasurementError: for a ratio beyond `WRONG_UNIT`, with the unit that would explain it.
+        MeasurementError: for a ratio beyond `WRONG_UNIT`, with the units that would explain it; for positions on a
+            line.
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
-    measured, predicted = (np.linalg.norm(x.std(axis=0)) for x in (block.position, arm[:, :3, 3]))
-    if predicted < 1e-3:
+    (measured, second), (predicted, across) = _spread(block.position), _spread(forward(chain, block.q)[:, :3, 3])
+    if predicted < MIN_SPREAD:
         return
-    ratio = float(measured / predicted)
-    if 1.0 / WRONG_UNIT < ratio < WRONG_UNIT:
-        return
-    factor = min(UNITS, key=lambda each: abs(np.log(ratio / each)))
-    likely = f": {UNITS[factor]}?" if abs(np.log(ratio / factor)) < np.log(2.0) else "."
-    raise MeasurementError(
-        f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
-        f"{predicted:.4g} m, {ratio:.3g} times as much{likely} State the unit in the header, as in 'x [mm]', or look "
-        "whether this is the right robot",
-        block.file,
-    )
+    if not 1.0 / WRONG_UNIT < measured / predicted < WRONG_UNIT:
+        likely, header = _likely_units(block, chain, measured, predicted)
+        read = "".join(f" The file was {note}." for note in block.notes if note.startswith("read as"))
+        raise MeasurementError(
+            f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
+            f"{predicted:.4g} m, {measured / predicted:.3g} times as much{likely}{read} State the unit in the "
+            f"header, as in {header}, or look whether this is the right robot",
+            block.file,
+        )
+    if second < across / WRONG_UNIT and across > MIN_SPREAD:
+        raise MeasurementError(
+            f"the measured positions lie on a line, within {1e3 * second:.3g} mm, where the robot's joints make it "
+            f"move {1e3 * across:.3g} mm across: are two of x, y, z constant or the same column, or were points "
+            "repeated? Measure poses all over the workspace",
+            block.file,
+        )
+
+
+def _spread(positions: np.ndarray) -> tuple[float, float]:
+    """Return the standard deviation of positions (m, 3), all axes together, and that across the line they lie along."""
+    sizes = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
+    return float(np.linalg.norm(sizes)), float(sizes[1])
+
+
+def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
+    """Return which units would explain a spread, those of the joints first, as a question; and the header to write."""
+    guesses = [("", predicted, "'x [mm]'")]
+    if np.abs(block.q).max() < FEW_DEGREES:
+        turning = np.array([joint.kind != "prismatic" for joint in chain.joints])
+        moved = _spread(forward(chain, np.where(turning, block.q / DEG, block.q))[:, :3, 3])[0]
+        guesses.insert(0, ("are the joints rad under a header that says deg", moved, "'q1 [rad]'"))
+    for words, size, header in guesses:
+        ratio = max(measured / size, 1e-300)
+        factor = min((1.0, *UNITS), key=lambda each: abs(math.log(ratio / each)))
+        if abs(math.log(ratio / factor)) < math.log(2.0):
+            return f": {', and '.join(filter(None, (words, UNITS.get(factor, ''))))}?", header
+    return ".", guesses[-1][2]
 
 
 def _rank(block: PoseMeasurements) -> int:

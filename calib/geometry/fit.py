@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -101,9 +102,11 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
     numbers = sum(part.value.size - part.nuisances for part in parts)
     if numbers < SPARE * unknowns:
         poses = sum(len(block.measured) for block in blocks)
+        needed = math.ceil(SPARE * unknowns * poses / max(numbers, 1))
         raise MeasurementError(
-            f"{poses} poses give {numbers} numbers, too few for {unknowns} unknowns; measure more poses (some 20 to 40 "
-            "for a full geometry), or ask for a smaller model ('offsets' or 'frames')",
+            f"{poses} poses are too few: {unknowns} unknowns need at least {needed} such poses, so that the fit can be "
+            "judged, too, and a full geometry some 20 to 40; measure more, or ask for a smaller model ('offsets' or "
+            "'frames')",
             blocks[0].measured.file,
         )
 

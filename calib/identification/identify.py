@@ -288,8 +288,10 @@ def _with_payloads(
 ) -> Dynamics[RegressorModel]:
     """Return the model with the parameters of payloads that no case carries, where they are known."""
     model, values = dynamics.model, np.array(dynamics.values)
-    for label, known in settings.payload_values.items():
-        if isinstance(model, IdentificationModel) and not any(label in case.carried for case in cases):
+    for label, stated in settings.payloads.items():
+        known = settings.payload_values.get(label, stated.parameters)
+        unseen = known is not None and not any(label in case.carried for case in cases)
+        if isinstance(model, IdentificationModel) and unseen:
             first = 10 * model.bodies.labels.index(label)
             values[first : first + 10] = known
     return Dynamics(model, values)

@@ -29,8 +29,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     prior = "auto"                   # auto, none, cad: draw what the motion does not tell to the robot's own inertias;
                                      # auto: where there are none, to rods between the joints
     folds = 6                        # time blocks of the cross-validation
-    accept = []                      # findings that are meant so: masses, speed, lag, clock, order, zero, limit, jump,
-                                     # bodies, loop, description
+    accept = []                      # findings that are meant so: masses, speed, lag, clock, sign, order, zero, limit,
+                                     # jump, bodies, loop, description
 
     [filter]                         # default: from the data
     cutoff = 20.0                    # f_q of the positions' filter [Hz], or one per joint
@@ -124,7 +124,9 @@ def _no_zero(value: Any) -> Any:
     return value
 
 
-FINDINGS = ("masses", "speed", "lag", "clock", "order", "zero", "limit", "jump", "bodies", "loop", "description")
+FINDINGS = (
+    "masses", "speed", "lag", "clock", "sign", "order", "zero", "limit", "jump", "bodies", "loop", "description",
+)  # fmt: skip
 """See `calib.procedure.dynamic_stage.plausibility`."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of them")]
 Gains = Annotated[tuple[float, ...], Expect("a list of numbers, finite and none of them zero"), Checked(_no_zero)]

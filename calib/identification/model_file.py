@@ -14,9 +14,10 @@ the joint's torque, friction and motor inertia are in amperes of its own motor, 
 
 ``torques_N.csv``: ``t [s]``, then measured_1 ... predicted_1 ... of each torque row [N m or N] and the joints q1 ...
 [rad or m], then sigma_1 ... of each torque row, the standard deviation expected of measured - predicted (1.96 of them
-hold 95 %), and ``extrapolated``, 1 where the motion leaves what was learnt from; thinned to about 100 Hz. ``calib
-identify`` writes ``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from);
-a session writes one per validation recording.
+hold 95 %), ``extrapolated``, 1 where the motion leaves what was learnt from, and, of recordings without a payload, v1
+... a1 ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify`` writes
+``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session writes
+one per validation recording.
 
 ``metrics.json``: errors by file under ``identification`` (learnt from) and ``validation`` (``evidence`` false: it
 repeats the training). Each has ``raw`` (torque as recorded, full rate), ``filtered`` (both sides low-passed to the
@@ -54,7 +55,7 @@ from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain
-from calib.units import TORQUE, per_ampere
+from calib.units import TORQUE, per_ampere, without_gains
 
 MODEL = "dynamics.json"
 NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
@@ -102,7 +103,7 @@ def refuse_currents(folder: Path, task: str) -> None:
     unit = read_table(folder).get("unit", TORQUE)
     if unit != TORQUE:
         raise UsageError(
-            f"{folder}: this model is in {unit}, identified from currents without drive gains; {task} needs N m: state "
+            f"{folder}: torques are {without_gains(unit)}; {task} needs N m: state "
             "gains = [...] (N m/A) in the options file, or identify them with [gain_identification] (runs without and "
             "with a load of known mass), and run calib identify again"
         )

@@ -44,6 +44,15 @@ class Payload:
     mass: Annotated[float, Real(above=0, most=1e4, unit="kg")] | None = None
     com: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None
 
+    @property
+    def parameters(self) -> tuple[float, ...] | None:
+        """Its ten standard parameters in the tip's frame as a point mass; None where mass or centre are not known."""
+        if self.mass is None or self.com is None:
+            return None
+        x, y, z = self.com
+        inertia = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
+        return tuple(self.mass * value for value in (*inertia, x, y, z, 1.0))
+
 
 @dataclass(frozen=True)
 class IdentificationSettings:
@@ -63,8 +72,8 @@ class IdentificationSettings:
         keep, drop: parameters never, or first, left out.
         prior: of the parameters, its sizes by evidence, drawn to the CAD or to rods (``auto``), to the CAD, or none.
         payloads: label → what is known of it.
-        payload_values: label → its ten standard parameters in the tip's frame, where they are known from elsewhere;
-            they serve for predictions where no recording to learn from carries it.
+        payload_values: label → its ten standard parameters in the tip's frame, where a gain identification found them;
+            they, or else the stated mass and centre, serve for predictions where no recording to learn from carries it.
         gravity: in the base frame [m/s²]; None: the robot's.
         samples: most rows (per torque) that are held; of longer recordings every second, third, ... row alone.
         folds: number of time blocks for cross-validation.

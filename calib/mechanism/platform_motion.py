@@ -87,6 +87,19 @@ class PlatformRegressor:
         """Return the slopes of Σ weights · torques (N, n) by x, v, a, each (N, r)."""
         return self._slopes(x, v, a, lambda motion: np.einsum("na,na->n", self._torques(motion), weights))
 
+    def speeds(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the actuators' speeds (N, n)."""
+        return self._speeds(along(self.model.known, self._reachable(x), v, a))
+
+    def speeds_gradient(
+        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of Σ weights · speeds (N, n) by x, v, a, each (N, r)."""
+        return self._slopes(x, v, a, lambda motion: np.einsum("na,na->n", self._speeds(motion), weights))
+
+    def _speeds(self, motion: LoopMotion) -> np.ndarray:
+        return motion.v[:, self.model.known.robot.actuated]
+
     def _reachable(self, x: np.ndarray) -> np.ndarray:
         """Return coordinates brought back to the robot's box: a search may leave it."""
         robot = self.model.known.robot

@@ -17,7 +17,18 @@ from calib.errors import RobotError
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
-HEAVIEST = 100.0  # [m/s²] (our choice)
+MAX_NUMBER = 1e12  # of masses, moments and lengths [SI] (our choice)
+MAX_GRAVITY = 100.0  # [m/s²] (our choice)
+
+
+def check_gravity(gravity: np.ndarray, place: str = "") -> None:
+    """Refuse a gravity vector (3,) [m/s²] that no robot stands under; `place` begins the message.
+
+    Raises:
+        RobotError: for one beyond `MAX_GRAVITY`, or not finite.
+    """
+    if not np.linalg.norm(gravity) < MAX_GRAVITY:
+        raise RobotError(f"{place}gravity {gravity.tolist()} is none: expected m/s², some 9.81 in all")
 
 
 @dataclass(frozen=True)
@@ -120,11 +131,10 @@ class Chain:
     def __post_init__(self) -> None:
         object.__setattr__(self, "tail", frozen(self.tail))
         object.__setattr__(self, "gravity", frozen(self.gravity))
-        if not np.linalg.norm(self.gravity) < HEAVIEST:
-            raise RobotError(f"'{self.name}': gravity {self.gravity.tolist()} is none: expected m/s², some 9.81 in all")
+        check_gravity(self.gravity, f"'{self.name}': ")
         for what in ("tail", "inertias"):
-            if (value := getattr(self, what)) is not None and not np.isfinite(value).all():
-                raise RobotError(f"'{self.name}': {what}: found a number that is not finite")
+            if (value := getattr(self, what)) is not None and not (np.abs(value) < MAX_NUMBER).all():
+                raise RobotError(f"'{self.name}': {what}: found a number that is not finite, or beyond {MAX_NUMBER:g}")
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
         for what, names in (("joint", self.joint_names), ("element", self.names)):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import pickle
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +14,7 @@ from threading import Lock
 from typing import Any
 
 from calib.errors import CalibError, UsageError
-from calib.workers.crew import THREADS, Answer, Died, run_call
+from calib.workers.crew import Answer, Died, run_call
 
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
 NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
@@ -120,19 +118,7 @@ def _cloudpickled(value: Any) -> bytes:
 
 def _on_cluster(call: bytes) -> bytes:
     """Run on a Dask worker."""
-    return run_call(call, _use_one_thread, _cloudpickled)
-
-
-def _use_one_thread() -> None:
-    """Bound threads of libraries in a process that another one started: of those loaded, and of those to come."""
-    from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingImports]
-
-    numba = sys.modules.get("numba")
-    later = [name for name in THREADS if numba is None or "NUMBA" not in name]  # it refuses a change once it runs
-    os.environ.update(dict.fromkeys(later, "1"))
-    threadpool_limits(1)
-    if numba is not None:
-        numba.set_num_threads(1)
+    return run_call(call, lambda: None, _cloudpickled)
 
 
 async def _answers(address: str) -> None:

@@ -11,9 +11,8 @@ from reprlib import repr as shortened
 from threading import Lock
 from typing import Any, Protocol
 
-from calib.errors import TaskLost
-
-THREADS = tuple(f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "BLIS", "NUMBA"))
+from calib.errors import TaskLost, quiet
+from calib.workers.threads import limit_worker
 
 Answer = tuple[int, Any, BaseException | None]  # task, result, or what the task raised
 Stream = Callable[[Callable, Iterable[tuple], Callable[[int], bool]], Generator[Answer]]
@@ -124,8 +123,10 @@ def run_call(
     """
     try:
         hear()
+        limit_worker()
         function, arguments = pickle.loads(call)
-        return dumps((function(*arguments), None))
+        with quiet():
+            return dumps((function(*arguments), None))
     except BaseException as error:
         hush()
         where = f"in a worker process:\n{traceback.format_exc()}"

@@ -8,14 +8,14 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from threading import Lock, Thread
 from typing import Any
 
 from calib.errors import CalibError
-from calib.workers.crew import THREADS, Answer, Died, NotBegun, run_call
+from calib.workers.crew import Answer, Died, NotBegun, run_call
 
 GRACE = 3.0  # [s] that tasks have to hand back what they found after Ctrl-C (our choice)
 ATTEMPTS = 3  # processes that a task may take along before it is given up (our choice)
@@ -34,8 +34,7 @@ class _Process:
         resource_tracker.ensure_running()  # else the process's start does, and lets Ctrl-C through
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # inherited until `_serve` can deal with it
         try:
-            with _one_thread_to_inherit():
-                self.process.start()
+            self.process.start()
         finally:
             self.theirs.close()
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -143,20 +142,6 @@ class Processes:
             for process in started:
                 process.kill()
                 process.join()
-
-
-@contextmanager
-def _one_thread_to_inherit() -> Iterator[None]:
-    """Let processes started meanwhile bound their threads: the libraries read these when they are loaded."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            del os.environ[name]
-            if value is not None:
-                os.environ[name] = value
 
 
 def _serve(pipe: connection.Connection) -> None:

@@ -119,7 +119,7 @@ class BothLoads:
 
 @cache
 def truth() -> Arm:
-    chain = dynamics.calibrated_chain()
+    chain = dynamics.true_chain()
     return Arm(chain, dynamics.true_parameters(chain))
 
 

@@ -21,6 +21,7 @@ import study_options
 import study_tables
 
 from calib import files
+from calib.data.poses.measurements import Positions
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, parameter_values, polish_frames
@@ -187,6 +188,20 @@ def study_fit(start: Chain, measured: Any, damping: float = 1e-4, weighted: bool
     return fit_with_prior(cell, blocks, base_columns(start), settings=Settings(damping=damping))
 
 
+def calibration(seed: int) -> tuple[Selection, Positions, GeometricFit]:
+    """Choose 17 poses by cond, measure them on the simulated arm, and fit."""
+    best = tried(Trial("cond", "local", seed, np.inf, 2000))  # until it ends by itself: the same poses every time
+    measured = measure(lwr4plus_cell(), np.asarray(best.q), [seed, 1], "fit")
+    return best, measured, study_fit(study_chain(lwr4plus.table_2()[0]), measured)
+
+
+def fitted_arm(seed: int) -> Chain:
+    """Return the arm that `calibration` finds: the library's, with frames 2 to 7 as fitted."""
+    found = calibration(seed)[2].cell.chain
+    values = dict(zip(found.names, found.values))
+    return lwr4plus.arm(np.array([[values[f"{name}{row}"] for name in lwr4plus.COLUMNS] for row in range(9)]))
+
+
 def nominal_readings(nominal: np.ndarray, found: GeometricFit, fitted: Any) -> dict[str, Installation]:
     """Return what Table 3's row 'nominal' may mean: the paper does not say whose frames 0, 1 and 8 it uses."""
     own = found.start
@@ -235,14 +250,14 @@ def within(rows: list[dict[str, Any]]) -> int:
 def run(seed: int, quick: bool, seeds: int = 3, seconds: float = 3.0, workers: int = 2) -> dict[str, Any]:
     """Do the study and return everything that ``metrics.json`` holds."""
     nominal, truth = lwr4plus.table_2()
-    best = tried(Trial("cond", "local", seed, np.inf, 2000))  # until it ends by itself: the same poses every time
+    best, measured, found = calibration(seed)
     poses = np.asarray(best.q)
     space, cell = search_space(nominal, "cond"), lwr4plus_cell()
     unseen = draw_candidates(
         space.lower, space.upper, 100 if quick else 500, lambda q: is_feasible(space, q), seed=[seed, 7]
     )
-    measured, validation = measure(cell, poses, [seed, 1], "fit"), measure(cell, unseen, [seed, 2], "validation")
-    found, linear = study_fit(study_chain(nominal), measured), study_fit(study_chain(nominal), measured, 0.0)
+    validation = measure(cell, unseen, [seed, 2], "validation")
+    linear = study_fit(study_chain(nominal), measured, 0.0)
     apart = np.abs(parameter_values(found.cell) - parameter_values(linear.cell))[found.free] / found.estimate.sigma
     readings = nominal_readings(nominal, found, measured)
     rows = parameter_rows(found, nominal, truth)

@@ -1,8 +1,8 @@
 """Speed of the dynamics: run with `pytest tests/benchmarks/test_dynamics.py --benchmark-only -s`.
 
-Set OPENBLAS_NUM_THREADS=1 on a shared machine, and add --benchmark-timer=time.thread_time to leave out what others
-take. All regressor figures are for 10 000 samples of the LWR4+ (7 joints, 70
-columns); the numpy version is the plain vectorised one below, the fairest a batch without a compiler can be.
+On a shared machine add --benchmark-timer=time.thread_time to leave out what others take. All regressor figures are for
+10 000 samples of the LWR4+ (7 joints, 70 columns); the numpy version is the plain vectorised one below, the fairest a
+batch without a compiler can be.
 """
 
 import numpy as np

@@ -2,7 +2,7 @@
 
 How good the search is, beside others and over seeds: `examples/lwr4plus/excitation_peers.py`.
 
-Set OPENBLAS_NUM_THREADS=1 on a shared machine. LWR4+ of the library, 64 base columns (43 inertial, Fv Fc off of seven
+LWR4+ of the library, 64 base columns (43 inertial, Fv Fc off of seven
 joints), limits of the URDF on position and velocity, torque from the library's inertias with published friction, tool
 at least 0.3 m from axis 1 and not below -0.2 m.
 """

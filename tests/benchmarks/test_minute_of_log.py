@@ -1,7 +1,7 @@
 """A minute of log to a validated Model 2, beside merely parsing that log from CSV with pandas.
 
 pip install --target /tmp/pandas --no-deps pandas python-dateutil six
-OPENBLAS_NUM_THREADS=1 PYTHONPATH=.:/tmp/pandas python -m pytest tests/benchmarks/test_minute_of_log.py -o addopts= \
+PYTHONPATH=.:/tmp/pandas python -m pytest tests/benchmarks/test_minute_of_log.py -o addopts= \
     --benchmark-timer=time.process_time --benchmark-columns=min,median,rounds
 """
 

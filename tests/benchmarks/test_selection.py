@@ -1,7 +1,4 @@
-"""Speed of pose selection: run with `pytest tests/benchmarks/test_selection.py --benchmark-only -s`.
-
-Set OPENBLAS_NUM_THREADS=1 on a shared machine: matrices this small lose by threads, under load by a factor of thirty.
-"""
+"""Speed of pose selection: run with `pytest tests/benchmarks/test_selection.py --benchmark-only -s`."""
 
 import poses_arm
 import pytest

@@ -1,6 +1,6 @@
 """Speed of the closed loop and of IDIM-IV, each beside what it is compared with.
 
-OPENBLAS_NUM_THREADS=1 python -m pytest tests/benchmarks/test_simulation.py -o addopts= --benchmark-group-by=group \
+python -m pytest tests/benchmarks/test_simulation.py -o addopts= --benchmark-group-by=group \
     --benchmark-columns=min,median,rounds
 """
 

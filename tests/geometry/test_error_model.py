@@ -12,7 +12,8 @@ from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import select_model
-from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
+from calib.geometry.uncertainty.error_model import END, ErrorModel, learn_errors
+from calib.geometry.uncertainty.left_out import LeftOut
 from calib.robot.load import load
 from calib.simulation.cells.cell import SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell
@@ -102,6 +103,35 @@ def test_sigma_grows_away_from_what_was_learnt_and_extrapolation_is_named(found)
     inside, outside = model.learnt[:50], model.learnt[:50] + 1.5
     assert np.median(model.position_sigma(outside)) > 1.5 * np.median(model.position_sigma(inside))
     assert not model.beyond(inside).any() and model.beyond(outside).any(axis=1).all()
+
+
+def test_beyond_an_end_that_erred_more_when_left_out_intervals_are_wider():
+    """Errors three times as large at one joint's lower end; planted rows, so that nothing else differs."""
+    rng = np.random.default_rng(0)
+    q, size = rng.uniform(-1.0, 1.0, (1000, 2)), rng.standard_normal((1000, 3))
+    far, joints = [], []
+    for joint in (0, 1):
+        for end, factor in ((q[:, joint] < -0.6, 1.0 + 2.0 * (joint == 0)), (q[:, joint] > 0.6, 1.0)):
+            rows = np.flatnonzero(end)
+            squares = factor**2 * np.sum(size[rows] ** 2, axis=1) / 3.0
+            far.append(np.column_stack([squares, np.zeros((len(rows), 3)), rows]))
+            joints.append(joint)
+    left = LeftOut.of(far[:1], far, joints)
+    (low, high), others = (left.wider([0.0, 1.0, 0.0, 0.0], (2.0, 2.0), (0.0, 1.0), q)[j] for j in (0, 1))
+    assert low > 1.5 * max(high, *others) and min(high, *others) >= 1.0
+
+
+def test_outside_a_range_the_interval_grows_by_its_end_and_not_where_frames_are_placed_anew(found):
+    model, cell = found
+    ends = tuple((2.0, 1.0) if j == 0 else (1.0, 1.0) for j in range(6))
+    wide, plain = (replace(model, discrepancy=replace(model.discrepancy, wider=each)) for each in (ends, ()))
+    q = np.repeat(model.learnt[:1], 3, axis=0)
+    low, first = np.quantile(model.learnt[:, 0], [0.0, END])
+    q[:, 0] = [low + 0.01, low - 0.25 * (first - low), low - (first - low)]
+    assert wide.position_sigma(q) / plain.position_sigma(q) == pytest.approx([1.0, 1.5, 2.0])
+    block = replace(measured(2, 3, 1.6, 0.0), q=q)
+    anew = [each.sigma_on(cell, block, placed_anew=True) for each in (wide, plain)]
+    assert anew[0] == pytest.approx(anew[1])
 
 
 def test_without_positions_or_with_few_nothing_is_expected(found):

@@ -13,6 +13,7 @@ from calib.errors import MeasurementError
 from calib.geometry.first_guess import average_pose, install
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings
+from calib.robot.kinematics import forward
 from calib.transforms import invert, pose, rotation_vector
 
 
@@ -137,3 +138,15 @@ def test_too_few_rows_are_refused_in_words(kind, count):
     measured = take(measure(truth, kind, 6, 0), np.arange(count))
     with pytest.raises(MeasurementError, match=f"{count} usable rows"):
         install(truth.chain, [measured])
+
+
+def test_positions_on_a_line_are_refused_and_radians_under_degrees_named():
+    truth = cell(load("ur5"), 1)
+    block = measure(truth, "position", 30, 1)
+    line = np.outer(np.linspace(0.0, 1.0, len(block)), [0.3, 0.4, 0.5])
+    with pytest.raises(MeasurementError, match="lie on a line"):
+        install(truth.chain, [replace(block, position=line)])
+    with pytest.raises(MeasurementError, match="are the joints rad under a header that says deg"):
+        less = 0.3 * block.q
+        seen = forward(truth.chain, less)[:, :3, 3]
+        install(truth.chain, [replace(block, q=np.radians(less), position=seen)])

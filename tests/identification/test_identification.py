@@ -105,6 +105,15 @@ def test_gains_come_from_a_payload_of_known_mass():
         identify_gains(data, {})
 
 
+def test_a_payload_that_only_unseen_motion_carries_counts_with_its_stated_mass_and_centre():
+    loaded, errors = planted.case("b", 1, ("load",)), {}
+    for payload in (Payload(2.0, (0.05, 0.025, 0.1)), Payload(2.0)):
+        settings = IdentificationSettings(friction="standard", payloads={"load": payload})
+        dynamics = identify(planted.arm(), [planted.case("a", 0)], settings).dynamics
+        errors[payload.com] = score(loaded, predict(dynamics, loaded)).raw.total
+    assert errors[0.05, 0.025, 0.1] < 0.1 * errors[None]
+
+
 def one_sine(name: str = "s"):
     """Return the case of a robot whose joints share one sine."""
     from calib.data.recordings.recording import Recording

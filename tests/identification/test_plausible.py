@@ -14,12 +14,12 @@ from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import MeasurementError
 from calib.identification.cases import Case, make_case
-from calib.identification.checks.recording_sizes import compare_sizes
+from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.checks.whole_robot import Rearranged
 from calib.identification.identify import identify
 from calib.identification.possible.contradiction import Contradiction, contradiction
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.plausibility import described, findings, impossible
+from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_signs
 from calib.procedure.findings import Finding, Verdict, settled
 from calib.robot.load import load
 
@@ -224,6 +224,17 @@ def test_a_right_angle_at_a_joints_zero_is_named_and_no_exchange_is_told_in_its_
     turned = recorded().q + np.array([0.0, np.pi / 2, 0.0])
     told = [one for one in found(replace(recorded(), q=turned, v=None)) if one.name in ("zero", "order")]
     assert [one.level for one in told] == ["marginal"] and "with -90 deg at joint2" in told[0].words
+
+
+@pytest.mark.parametrize("reverse", [(), (0,), (1,), (2,), (0, 2)])
+def test_joints_of_reversed_sign_are_named_and_no_others(reverse: tuple[int, ...]) -> None:
+    """Whether the robot's own masses are known or not."""
+    signs = np.where(np.isin(np.arange(3), reverse), -1.0, 1.0)
+    case = case_of(recorded(tau=recorded().effort * signs))
+    for arm in (ARM, replace(ARM, inertias=None)):
+        told = wrong_signs({"log": signs_of(case, arm)}, NAMES)
+        assert [one.level for one in told] == ["fail"] * len(reverse)
+        assert all(f"log: the torques of {NAMES[j]} have the wrong sign" in one.words for j, one in zip(reverse, told))
 
 
 def test_an_exchange_that_leaves_the_torques_unexplained_is_not_told() -> None:

@@ -104,7 +104,7 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
     assert calib("excite", "dualv", *words) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert max(metrics["peak_torque"]) < 127.0 and min(one["margin"] for one in metrics["margins"]) > -1e-9
-    rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=1)
+    rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=4)
     assert rows.shape == (1001, 1 + 3 + 3 * 4) and np.abs(rows[:, 1:3]).max() <= 0.08
     log = np.vstack([rows[:-1], rows[:-1], rows])[:, [0, *range(4, 8), *range(12, 16)]]
     log[:, 0] = np.arange(len(log)) / 1000.0
@@ -120,7 +120,7 @@ def test_plan_keeps_the_limits_and_passes_the_waypoints(folder, tmp_path, line):
     assert calib("plan", "dualv", "--waypoints", folder / "way.csv", "--out", out, *(["--line"] * line)) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert max(metrics["peak_torque"]) <= 127.0 and min(metrics["margins"]["torque"]) < 0.02
-    rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=1)
+    rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=4)
     for point in ([0.05, 0.04, np.radians(15)], [-0.06, 0.02, np.radians(-20)], [0.0, 0.0, 0.0]):
         assert np.abs(rows[:, 1:4] - point).max(axis=1).min() < 2e-3
 

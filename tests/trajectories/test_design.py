@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 
 import excited_arm as arm
@@ -23,7 +24,7 @@ from trajectories.design.starts import random_start
 from trajectories.design.verify import dense_motion, ensured, verify_motion
 from trajectories.errors import BadInput, NotExciting, NothingFeasible
 from trajectories.fourier import fourier_family
-from trajectories.places import Workspace
+from trajectories.places import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr()
 EFFORT = np.array([joint.effort for joint in CHAIN.joints])
@@ -132,10 +133,9 @@ def test_a_free_period_is_shortened_down_to_a_limit():
         goals=(AttainmentGoal(Duration(), 10.0), AttainmentGoal(Excitation("cond", "normalised"), 15.0, 0.0)),
         stretch=(0.4, 2.0),
     )
-    run = design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,))
+    run, proof = ensured(spot, design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,)))
     assert run.factor < 0.95 and run.values[0] == pytest.approx(15.0 * run.factor)
     assert run.values[1] <= 15.0 * (1 + 1e-5)
-    proof = verify_motion(spot.family, run.x, spot.constraints, factor=run.factor)
     assert proof.feasible
     assert min(one.share for one in proof.margins) < 0.1
 
@@ -231,13 +231,24 @@ def test_verification_finds_what_happens_between_samples():
 
 
 @pytest.mark.slow
-def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
-    spot = problem(samples=14, tightening=0.0)
-    run = one_start(spot, 120, "slsqp", 1, 0)
-    assert isinstance(run, SearchResult)
-    assert not verify_motion(spot.family, run.x, spot.constraints).feasible
-    again, proof = ensured(spot, run)
-    assert proof.feasible and again.evaluations > run.evaluations
+def test_a_motion_that_breaks_its_limits_is_searched_again():
+    spot, found = designed()
+    larger = replace(found, x=1.1 * found.x)
+    assert not verify_motion(spot.family, larger.x, spot.constraints).feasible
+    again, proof = ensured(spot, larger)
+    assert proof.feasible and again.evaluations > found.evaluations
+
+
+def test_a_wall_thinner_than_a_step_is_not_jumped_over():
+    """Joint 1 must stay on one side of 0.3 rad, which samples 0.6 s apart do not see."""
+    wall = Clearance(
+        lambda q: np.abs(q[:, :1] - 0.3) - 0.02, lambda q: np.sign(q[:, :1, None] - 0.3) * np.eye(1, 7),
+        ("wall - arm",),
+    )  # fmt: skip
+    spot = problem(samples=25, constraints=(*box_limits(CHAIN.lower, CHAIN.upper, VELOCITY), wall))
+    found, proof = ensured(spot, design(spot, starts=1, evaluations=100, seed=1))
+    side = np.sign(dense_motion(spot.family, found.x, np.linspace(0, 15, 3000)).q[:, 0] - 0.3)
+    assert proof.feasible and (side == side[0]).all() and found.values[0] < 200.0
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def constraints():
         TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, torque_product=BASE.torque_gradient),
         TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, covariance),
         Workspace(points, product, radius=0.3, lowest=-0.2, highest=0.9),
-        Clearance(lambda q: q[:, :2] ** 2 + 1, lambda q, G: np.pad(2 * q[:, :2] * G, ((0, 0), (0, 5))), ("a", "b")),
+        Clearance(lambda q: q[:, :2] ** 2 + 1, lambda q: 2 * q[:, :2, None] * np.eye(2, 7), ("a", "b")),
     ]
 
 
@@ -110,6 +110,18 @@ def test_constraints(constraint):
     basis, y, sharp = spot.basis(), drawn(1), (1.0, 20.0)
     f, directions = along(lambda z: evaluate(spot, basis, z, sharp).constraints, y)
     check(f, evaluate(spot, basis, y, sharp).rows @ directions, np.zeros(6), tolerance=1e-6)
+
+
+def test_extra_times_count_for_constraints_alone():
+    spot = problem(OBJECTIVES[0], (constraints()[0], constraints()[4]), stretch=(0.5, 2.0))
+    closer = replace(spot, extra=np.array([0.37, 1.21, 1.22]), tightening=np.array([0.003, 0.1]))
+    y, sharp = drawn(1), (8.0, 20.0)
+    one, two = (evaluate(each, each.basis(), y, sharp) for each in (spot, closer))
+    assert one.total == pytest.approx(two.total, rel=1e-12) and len(two.motion) == len(one.motion) + 3
+    np.testing.assert_allclose(one.slopes, two.slopes, rtol=1e-9, atol=1e-12)
+    f, directions = along(lambda z: evaluate(closer, closer.basis(), z, sharp).constraints, y)
+    check(f, two.rows @ directions, np.zeros(6), tolerance=1e-6)
+    assert (two.constraints[-1] > one.constraints[-1] + 0.09).all()
 
 
 @pytest.mark.parametrize("constraint", constraints(), ids=lambda c: c.name)

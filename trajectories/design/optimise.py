@@ -140,7 +140,7 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
     return NothingFeasible(
         f"no feasible motion in {_counted(starts)}: the nearest one breaks the {worst.name} limit "
         f"({worst.labels[column]}) by {max(excess, 0.0):.3g} {worst.unit} at t = {motion.times[row]:.3g} s; widen that "
-        "limit, take a longer period, or allow more starts",
+        "limit or take a longer period",
         worst.name, excess, worst.unit,
     )  # fmt: skip
 

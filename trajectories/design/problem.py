@@ -7,7 +7,8 @@ condition number are compared by logarithm: the same optimum, well scaled from 1
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +17,10 @@ from trajectories.basis import Basis, Family, SampledMotion, sample_times
 from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
 from trajectories.design.objectives import Excitation, Objective, Observed, Value, observed
 from trajectories.errors import BadInput
+
+INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
+NEAR = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
+MOST_EXTRA = 150  # instants that are added at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +59,9 @@ class ExcitationProblem:
         goals: of goal attainment.
         samples: instants over the period at which all is evaluated.
         stretch: (least, most) factor on the period; equal ends fix it.
-        tightening: how far inside the constraints to stay, as a share of each one's scale: room for what happens
-            between the samples.
+        extra: times [s] over the period at which the constraints are looked at besides.
+        tightening: how far inside the constraints to stay, as a share of each one's scale, one number or one for each:
+            room for what happens between the samples.
         coarse: a family of fewer variables and the same period, in which random starts begin; None: the family itself.
     """
 
@@ -67,7 +73,8 @@ class ExcitationProblem:
     goals: tuple[AttainmentGoal, ...] = ()
     samples: int = 200
     stretch: tuple[float, float] = (1.0, 1.0)
-    tightening: float = 0.003
+    extra: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    tightening: float | np.ndarray = 0.003
     coarse: Family | None = None
 
     def __post_init__(self) -> None:
@@ -85,7 +92,8 @@ class ExcitationProblem:
         return self.stretch[0] < self.stretch[1]
 
     def basis(self) -> Basis:
-        return self.family.basis(sample_times(self.family.period, self.samples))
+        """Return the family at the samples, then at the extra times."""
+        return self.family.basis(np.append(sample_times(self.family.period, self.samples), self.extra))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +105,7 @@ class Evaluation:
 
     Attributes:
         problem, basis: of the point.
-        motion: at the samples; `factor` on its period.
+        motion: at the samples, then at the extra times; `factor` on its period.
         sharpness: p of the spectra.
         smoothed: of each constraint.
         constraints: (r,) smoothed, feasible where ≤ 0.
@@ -113,9 +121,14 @@ class Evaluation:
     constraints: np.ndarray
     excess: float
 
+    @cached_property
+    def sampled(self) -> SampledMotion:
+        """The motion at the samples alone, which the objectives are of."""
+        return self.motion.part(np.arange(self.problem.samples)) if len(self.problem.extra) else self.motion
+
     @property
     def regressor(self) -> np.ndarray:
-        return self.motion.told(self.problem.regressor)
+        return self.sampled.told(self.problem.regressor)
 
     @property
     def values(self) -> np.ndarray:
@@ -143,14 +156,14 @@ class Evaluation:
         count = len(self.problem.goals) or 1
         if "_found" in self.__dict__:  # whoever asked for the merit will ask for its gradient
             return self._gradient[count:]
-        empty = [np.zeros((4, *self.motion.q.shape))] * count
+        empty = [np.zeros((4, *self.sampled.q.shape))] * count
         return self._by_variables(empty, np.zeros(count))[count:]
 
     @cached_property
     def _found(self) -> tuple[list[Value], dict[tuple[int, int], Observed]]:
         seen: dict[tuple[int, int], Observed] = {}
         wanted = (_sharpened(one, self.sharpness) for one in _terms(self.problem))
-        return [_value(one, self.motion, self.regressor, seen) for one in wanted], seen
+        return [_value(one, self.sampled, self.regressor, seen) for one in wanted], seen
 
     @cached_property
     def _gradient(self) -> np.ndarray:
@@ -158,11 +171,13 @@ class Evaluation:
         shares = np.eye(len(found))
         if not self.problem.goals:
             shares = _summed(self.problem, [one.value for one in found])[1]
-        slopes = [_slope(self.problem, self.motion, self.regressor, found, share, seen) for share in shares]
+        slopes = [_slope(self.problem, self.sampled, self.regressor, found, share, seen) for share in shares]
         return self._by_variables(slopes, shares @ np.array([one.by_duration for one in found]))
 
     def _by_variables(self, slopes: list[np.ndarray], by_duration: np.ndarray) -> np.ndarray:
-        stacked = np.concatenate([np.array(slopes), *(one.slopes(self.motion) for one in self.smoothed)])
+        spread = np.zeros((len(slopes), 4, *self.motion.q.shape))
+        spread[:, :, : self.problem.samples] = slopes
+        stacked = np.concatenate([spread, *(one.slopes(self.motion) for one in self.smoothed)])
         return _by_variables(self.problem, self.basis, self.motion, stacked, self.factor, by_duration)
 
 
@@ -175,12 +190,39 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     """
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(basis.motion(x), factor)
-    parts = tuple(smoothed(c, motion, sharpness[1], problem.tightening) for c in problem.constraints)
+    inside = np.broadcast_to(problem.tightening, len(problem.constraints))
+    parts = tuple(smoothed(c, motion, sharpness[1], float(own)) for c, own in zip(problem.constraints, inside))
     return Evaluation(
         problem, basis, motion, factor, sharpness[0], parts,
         np.concatenate([np.zeros(0), *(part.values for part in parts)]),
         max((part.excess for part in parts), default=-np.inf),
     )  # fmt: skip
+
+
+def critical_times(
+    problem: ExcitationProblem,
+    y: np.ndarray,
+    beyond: float,
+    constraints: Sequence[MotionConstraint] = (),
+    count: int = INSTANTS,
+) -> np.ndarray:
+    """Return the times over the family's period [s] at which a motion is near the constraints that it breaks.
+
+    Args:
+        y: (x, factor on the period if that is free).
+        beyond: share of its scale by which a constraint has to be broken to count.
+        constraints: default the problem's.
+        count: instants to look at.
+    """
+    times = sample_times(problem.family.period, count)
+    x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
+    motion = stretched(problem.family.basis(times).motion(x), factor)
+    near = np.zeros(len(times), dtype=bool)
+    for one in constraints or problem.constraints:
+        shares = (one.values(motion) / one.scale).max(axis=1)
+        near |= (shares > -NEAR) & (shares.max() > beyond)
+    found = times[near]
+    return found[:: -(-len(found) // MOST_EXTRA) or 1]
 
 
 def _value(one: Objective, motion: SampledMotion, Y: np.ndarray, seen: dict[tuple[int, int], Observed]) -> Value:

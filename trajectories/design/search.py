@@ -19,12 +19,13 @@ from trajectories.basis import Basis
 from trajectories.design.problem import (
     Evaluation,
     ExcitationProblem,
+    critical_times,
     evaluate,
     is_condition,
     merit,
     unmet,
 )
-from trajectories.design.starts import random_start
+from trajectories.design.starts import random_start, shrunk
 from trajectories.errors import NotExciting
 
 Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
@@ -56,7 +57,11 @@ STAGES = (
 )
 """Our choice."""
 S_RANGE = (-4.0, 12.0)
+KEPT = 1e-7  # of a constraint's scale, by which a point that keeps it may break it: rounding
 REPAIR = 30  # evaluations to bring a stage's last motion back inside
+SMALLER = 4  # times that a motion is halved which cannot be brought back inside
+DEEP = 0.02  # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
+RETRIES = 3  # of a stage that ends with such a motion
 
 
 class _Spent(Exception):
@@ -119,13 +124,17 @@ def one_start(
 ) -> SearchResult | Stuck:
     """Search from one random start (its number) or from given variables.
 
+    Where the best motion of a stage breaks a limit between the samples by more than `DEEP`, the stage goes on with the
+    instants where that was, from there or, where that cannot be repaired, from the last motion that did not.
+
     Args:
         evaluations: most, if all of `STAGES` are gone through.
         stages: those to go through; a given start is not led away by a coarse one.
     """
     began, drawn = time.perf_counter(), isinstance(start, int | np.integer)
     chosen = stages if drawn else tuple(stage for stage in stages if not stage.coarse)
-    run = StartSearch(*_at_stage(problem, chosen[0]))
+    extra = problem.extra
+    run = StartSearch(*_at_stage(problem, chosen[0], extra))
     if drawn:
         y = random_start(run.problem, run.basis, np.random.default_rng([seed, int(start)]))
     else:
@@ -134,22 +143,33 @@ def one_start(
     try:
         for number, stage in enumerate(chosen):
             if number:
-                run, y = run.continued(y, *_at_stage(problem, stage))
-            run.sharpness = stage.sharpness
-            y = run.solve(run.repaired(y), max(2, round(evaluations * stage.share)), method, stage.tolerance)
-            y = run.repaired(y, REPAIR)  # SLSQP travels outside, and may have ended there
+                run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
+            most = max(2, round(evaluations * stage.share))
+            for again in range(RETRIES, -1, -1):
+                run.sharpness = stage.sharpness
+                y = run.solve(run.inside(y), most, method, stage.tolerance)
+                y = run.repaired(y, REPAIR)  # SLSQP travels outside, and may have ended there
+                deep = np.zeros(0) if run.best is None else run.broken(run.best)
+                extra = np.union1d(extra, deep)
+                if not len(deep) or not again:
+                    break
+                back = run.last_unbroken()
+                run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
+                y = run.repaired(y)
+                y = back if run.least[0] > KEPT else y
     except KeyboardInterrupt:
         if run.best is None:
             raise
         run.interrupted = True
     if run.problem.family is not problem.family:  # interrupted before the whole family was looked at
-        run, y = run.continued(y, problem, problem.basis())
+        run, y = run.continued(run.reached(y), problem, problem.basis())
         run.repaired(y)
     return run.result(y, time.perf_counter() - began, int(start) if drawn else -1)
 
 
-def _at_stage(problem: ExcitationProblem, stage: Stage) -> tuple[ExcitationProblem, Basis]:
-    """Return the problem that a stage searches in, and its basis."""
+def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
+    """Return the problem that a stage searches in, with extra times, and its basis."""
+    problem = replace(problem, extra=extra)
     if stage.rough:
         problem = replace(problem, samples=max(8, problem.samples // 2))
     if stage.coarse and problem.coarse is not None:
@@ -175,14 +195,26 @@ class StartSearch:
         self._at: tuple[bytes, tuple[float, float]] | None = None
         self._evaluation: Evaluation | None = None
         self._tried = np.zeros(0)
+        self._trail: list[np.ndarray] = []
 
-    def _reached(self, last: np.ndarray) -> np.ndarray:
+    def reached(self, last: np.ndarray) -> np.ndarray:
         """Return the best point, the nearest to the limits where none keeps them, or the last where none was tried."""
         return self.best if self.best is not None else self.nearest if self.nearest is not None else last
 
-    def continued(self, last: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
-        """Return the search of another problem that goes on from here, and the point where it begins."""
-        y = self._reached(last)
+    def broken(self, y: np.ndarray) -> np.ndarray:
+        """Return the times of a motion that breaks limits between the samples by more than `DEEP`; none where not."""
+        return critical_times(self.problem, y, DEEP)
+
+    def last_unbroken(self) -> np.ndarray:
+        """Return the last of the improving points that does not, found by halving; the first one where all do."""
+        low, high = 0, len(self._trail) - 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if len(self.broken(self._trail[middle])) else (middle, high)
+        return self._trail[low]
+
+    def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
+        """Return the search of another problem that goes on from y, and the point where it begins."""
         if problem.family is not self.problem.family:
             p = self.basis.p
             path = self.problem.family.basis(basis.times).motion(y[:p])
@@ -195,7 +227,7 @@ class StartSearch:
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
         """Return what the search came to; y: its last point."""
         p, stretch = self.basis.p, self.problem.stretch
-        best = self._reached(y)
+        best = self.reached(y)
         factor = float(best[p]) if self.problem.free_period else stretch[0]
         if self.best is None:
             return Stuck(best[:p], factor, self.least, self.count, self.reason)
@@ -223,14 +255,25 @@ class StartSearch:
         lacking = (max(found.excess, 0.0), missed[0] if missed else 0.0)
         if lacking < self.least:
             self.least, self.nearest = lacking, y
-        if found.excess > 1e-7:
+        if found.excess > KEPT:
             return
         self.kept += 1
         value = merit(self.problem, found.exact)
         if value < self.merit:
             self.best, self.merit, self.values = y, value, found.exact
+            self._trail.append(y)
             self.history.append(value)
             self.times.append(time.process_time() - self.began)
+
+    def inside(self, y: np.ndarray) -> np.ndarray:
+        """Return a point that keeps the constraints: repaired, or of a smaller motion where that fails."""
+        found = self.repaired(y)
+        for _ in range(SMALLER):
+            if self.least[0] <= KEPT:  # some point keeps the constraints, whether or not the hard goals
+                break
+            y = shrunk(self.problem, y, 0.5)
+            found = self.repaired(y)
+        return found
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
         """Return a point that keeps the constraints, or the nearest found: min Σ max(0, c + 0.01)² by L-BFGS."""

@@ -1,4 +1,7 @@
-"""Where searches start: random motions inside the joint limits, about a pose that breaks the other limits least."""
+"""Where searches start: random motions inside the joint limits, about a pose that breaks the other limits least.
+
+Also where they start again: smaller motions about a pose that keeps the limits.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +39,17 @@ def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Genera
     fill = _fitting(boxes, stretched(basis.motion(constant), factor), stretched(basis.motion(x), factor))
     x = constant + rng.uniform(0.5, 0.9) * fill * (x - constant)
     return np.append(x, factor) if problem.free_period else x
+
+
+def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarray:
+    """Return a motion made smaller, to this share, about its pose that is furthest inside the limits."""
+    basis = problem.basis()
+    path = basis.motion(y[: basis.p])
+    still = np.zeros(path.q.shape)
+    resting = SampledMotion(path.times, path.q, still, still, still)
+    excess = np.max([(one.values(resting) / one.scale).max(axis=1) for one in problem.constraints], axis=0)
+    centre = basis.nearest(np.broadcast_to(path.q[np.argmin(excess)], path.q.shape))
+    return np.append(centre + share * (y[: basis.p] - centre), y[basis.p :])
 
 
 def _fitting(boxes: list[BoxLimit], still: SampledMotion, moving: SampledMotion) -> float:

@@ -15,11 +15,13 @@ import numpy as np
 
 from trajectories.basis import Family, SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.problem import ExcitationProblem
-from trajectories.design.search import SearchResult, one_start
+from trajectories.design.problem import ExcitationProblem, critical_times
+from trajectories.design.search import STAGES, SearchResult, one_start
+from trajectories.design.starts import shrunk
 from trajectories.errors import NothingFeasible
 
 BLOCK = 2000
+EVALUATIONS = 240  # of a search that goes on from a motion, if all its stages are gone through
 
 
 @dataclass(frozen=True)
@@ -99,46 +101,52 @@ def ensured(
     found: SearchResult,
     constraints: Sequence[MotionConstraint] | None = None,
     instants: int = 5000,
-    rounds: int = 3,
+    rounds: int = 4,
 ) -> tuple[SearchResult, Verification]:
-    """Return a motion that passes `verify_motion`; one that does not is searched again from there, further inside.
+    """Return a motion that passes `verify_motion`.
+
+    One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
+    that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.
 
     Args:
-        constraints: to verify against; default the problem's.
+        constraints: to verify against, one for each of the problem's; default these.
+        rounds: of searching again.
 
     Raises:
-        NothingFeasible: where that does not help.
+        NothingFeasible: where none of that helps.
     """
-    checked = problem.constraints if constraints is None else constraints
-    spent, report = (
-        found.evaluations,
-        verify_motion(problem.family, found.x, checked, factor=found.factor, instants=instants),
-    )
-    tighter = problem
+    checked, tighter, original = constraints or problem.constraints, problem, found
+
+    def verified(x: np.ndarray) -> Verification:
+        return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
+
+    report = verified(found.x)
     for _ in range(rounds):
         if report.feasible:
-            return replace(found, evaluations=spent), report
-        lacking = max(-one.share for one in report.margins)
-        # four times closer between the samples, and a little further inside (our choice)
-        tightening = tighter.tightening + min(1.2 * lacking, 0.01) + 1e-4
-        tighter = replace(tighter, samples=2 * tighter.samples, tightening=tightening)
+            return found, report
         y = np.append(found.x, found.factor) if problem.free_period else found.x
-        again = one_start(tighter, 240, "slsqp", found.seed, y)
-        spent += again.evaluations
+        lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
+        further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
+        extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
+        tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
+        again = one_start(tighter, EVALUATIONS, "slsqp", found.seed, y, STAGES[2:])
+        found = replace(found, evaluations=found.evaluations + again.evaluations)
         if isinstance(again, SearchResult):
             found = replace(
-                again, history=found.history, seconds=found.seconds + again.seconds,
+                again, history=original.history, evaluations=found.evaluations, seconds=found.seconds + again.seconds,
                 interrupted=found.interrupted or again.interrupted,
             )  # fmt: skip
-            report = verify_motion(problem.family, found.x, checked, factor=found.factor, instants=instants)
-    if not report.feasible:
-        worst = min(report.margins, key=lambda one: one.share)
-        raise NothingFeasible(
-            f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
-            f"{-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s; take more samples or a wider limit",
-            worst.name, -worst.margin, worst.unit,
-        )  # fmt: skip
-    return replace(found, evaluations=spent), report
+            report = verified(found.x)
+    for share in 0.8 ** np.arange(21):
+        small = shrunk(problem, found.x, share)
+        if (proof := verified(small)).feasible:
+            return replace(found, x=small), proof
+    worst = min(report.margins, key=lambda one: one.share)
+    raise NothingFeasible(
+        f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
+        f"{-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s; widen that limit or take a longer period",
+        worst.name, -worst.margin, worst.unit,
+    )  # fmt: skip
 
 
 def _margins(

@@ -15,11 +15,12 @@ SUFFIXES = ("", "_meas", "_measured")
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
+ANGLES = tuple(tuple(names.split()) for names in ("rx ry rz", "roll pitch yaw", "a b c", "w p r", "rpy_x rpy_y rpy_z"))
 SIGMA = ("sigma_x", "sigma_y", "sigma_z")
 SIGMA_ROTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
 BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
-OURS = (*POSITION, *QUATERNION, *MATRIX, *SIGMA, *SIGMA_ROTATION, "sigma_distance", *BASE, *LABELS)
+OURS = (*POSITION, *QUATERNION, *MATRIX, *ANGLES[0], *SIGMA, *SIGMA_ROTATION, "sigma_distance", *BASE, *LABELS)
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
@@ -34,7 +35,7 @@ class Layout:
         joints: n names, in the robot's order.
         positions: x y z of each target (reflector); one triple, or several where the columns are numbered.
         sigmas: the three sigmas of each target; () where not stated.
-        orientation: four names (quaternion), nine (matrix), or none.
+        orientation: four names (quaternion), nine (matrix), three (angles, whose meaning the options state), or none.
         sigma_rotation: three names or none.
         distance, sigma_distance, tool: one name or "".
         group: the columns whose labels together name a row's group.
@@ -95,7 +96,7 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
 
 def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout:
     columns = find_joints(table, options, joints)
-    kind = _find_kind(table, options)
+    kind = _find_kind(table, options, columns)
     if kind in LABEL_OF:
         return _grouped_layout(table, options, kind, columns)
     positions, sigmas, notes = _find_targets(table, options)
@@ -104,14 +105,16 @@ def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout
     tool, base = _find(table, options, "tool"), _family(table, options, BASE)
     if kind == "position":
         return Layout(kind, columns, positions, sigmas, tool=tool, base=base, notes=notes)
-    orientation = _find_orientation(table, options)
+    orientation = _find_orientation(table, options, columns)
     if not orientation:
-        raise MeasurementError("kind 'pose' needs qx qy qz qw, or r11 to r33; the header has neither", table.file)
+        message = "kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them"
+        raise MeasurementError(message, table.file)
     if len(positions) > 1:
         message = "kind 'pose' allows one target per row, found numbered positions"
         raise MeasurementError(message, table.file, column=positions[1][0])
     if orientation[0] not in ("qx", "r11"):
-        notes = (*notes, f"the orientation is read from {', '.join(orientation)}")
+        meaning = f" as {options.euler}" if len(orientation) == len(ANGLES[0]) else ""
+        notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
     rotation = _family(table, options, SIGMA_ROTATION)
     return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, base=base, notes=notes)
 
@@ -121,7 +124,9 @@ def _check_one_source(table: Table, options: FileOptions, position: Sequence[str
 
     Measured is what is named so, or what the options map though the file has the plain names, too.
     """
-    families = ((POSITION, position), (QUATERNION if len(orientation) == len(QUATERNION) else MATRIX, orientation))
+    plain = {len(QUATERNION): QUATERNION, len(MATRIX): MATRIX}.get(len(orientation))
+    names = plain or tuple(re.sub(f"({'|'.join(SUFFIXES[1:])})$", "", name) for name in orientation)
+    families = ((POSITION, position), (names, orientation))
     for (names, plain), (others, measured) in (families, families[::-1]):
         if plain != names or any(name in options.columns for name in names) or measured == others:
             continue
@@ -193,9 +198,39 @@ def find_joints(table: Table, options: FileOptions, joints: Sequence[str]) -> tu
     raise MeasurementError(f"{message}. Map them in the options' [columns]", table.file)
 
 
-def _find_orientation(table: Table, options: FileOptions) -> tuple[str, ...]:
-    """Return the names of a quaternion's four columns, a matrix's nine, or none."""
-    return _family(table, options, QUATERNION) or _family(table, options, MATRIX)
+def _find_orientation(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of a quaternion's four columns, a matrix's nine, three angles', or none.
+
+    Raises:
+        MeasurementError: for three angles whose meaning the options do not state.
+    """
+    found = _family(table, options, QUATERNION) or _family(table, options, MATRIX) or _angles(table, options, joints)
+    if len(found) == len(ANGLES[0]) and not options.euler:
+        message = (
+            f"{', '.join(found)} look like an orientation. State in the options what they mean: euler = 'vector' "
+            "(rotation vector, as Universal Robots have it), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
+            "B, C) ...; or kind = 'position' to leave them out"
+        )
+        raise MeasurementError(message, table.file, column=found[0])
+    return found
+
+
+def _angles(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of three angles, capital letters or not, that are no joints; () if there are none.
+
+    Columns named by one small letter (a, b, c) are anything, unless the options state what angles mean.
+    """
+    if any(name in options.columns for name in ANGLES[0]):
+        return _family(table, options, ANGLES[0])
+    any_name = (name for name in table.header if name not in joints)
+    known = {name.lower(): name for name in any_name if options.euler or len(name) > 1 or name.isupper()}
+    forms = [[name + suffix for name in names] for names in ANGLES for suffix in SUFFIXES]
+    complete = [tuple(known[name] for name in form) for form in forms if all(name in known for name in form)]
+    if len(complete) > 1:
+        one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ANGLES[0], complete[-1]))
+        message = f"the header has {', '.join(complete[0])} and {', '.join(complete[1])}: which are to be read?"
+        raise MeasurementError(f"{message} Map them in the options: [columns] {one}", table.file, column=complete[0][0])
+    return complete[0] if complete else ()
 
 
 def _no_extra(table: Table, found: Sequence[str]) -> None:
@@ -206,7 +241,7 @@ def _no_extra(table: Table, found: Sequence[str]) -> None:
             raise MeasurementError(message, table.file, column=extra[0])
 
 
-def _find_kind(table: Table, options: FileOptions) -> str:
+def _find_kind(table: Table, options: FileOptions, joints: Sequence[str]) -> str:
     if options.kind:
         if options.kind not in KINDS:
             raise MeasurementError(f"kind '{options.kind}' is none of {', '.join(KINDS)}", table.file)
@@ -215,7 +250,7 @@ def _find_kind(table: Table, options: FileOptions) -> str:
     if any(kind in kinds for kind in ("distance", "bar")) and not _find(table, options, "distance"):
         kinds = [kind for kind in kinds if kind not in ("distance", "bar")]
     if _find_targets(table, options)[0]:
-        kinds.append("pose" if _find_orientation(table, options) else "position")
+        kinds.append("pose" if _find_orientation(table, options, joints) else "position")
     if len(kinds) == 1:
         return kinds[0]
     if kinds:

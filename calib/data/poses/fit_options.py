@@ -4,7 +4,9 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
 
     kind = "position"                # pose, position, distance, bar, sockets, plane; where the header does not tell
     format = "csv"                   # csv, robodk, three_smr; where the header does not tell
-    euler = "wpr"                    # robodk: wpr is Rz(r)Ry(p)Rx(w), xyz is Rx(w)Ry(p)Rz(r), vector turns about it
+    euler = "xyz fixed"              # what rx ry rz (a b c, w p r, roll pitch yaw) mean: turns about fixed axes one
+                                     # after the other, "zyx moving" (KUKA's A B C) about axes that turn along, or
+                                     # "vector", a rotation vector (UR); wpr is xyz fixed, xyz is xyz moving
     groups = ["tool_position"]       # columns that, with the socket (plane), name one group
     station = "tracker A"            # one name for the instrument placement; by default each file has its own
     tool = "ball"                    # the tool's (reflector's) name
@@ -55,7 +57,8 @@ from calib.errors import UsageError, suggestion
 from calib.units import ANGLES, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
-EULER = ("wpr", "xyz", "vector")
+AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
+EULER = ("vector", "wpr", "xyz", *(f"{axes} {how}" for axes in AXES for how in ("fixed", "moving")))
 MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coupling", "harmonics", "wobble")
 LOSSES = ("auto", "none", "huber", "cauchy")
 
@@ -112,7 +115,7 @@ class FileOptions:
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
     format: Annotated[str, OneOf(FORMATS)] = ""
-    euler: Annotated[str, OneOf(EULER)] = "wpr"
+    euler: Annotated[str, OneOf(EULER)] = ""
     columns: Mapping[str, Name] = field(default_factory=dict)
     units: Mapping[str, Annotated[str, OneOf((*ANGLES, *LENGTHS))]] = field(default_factory=dict)
     sigma: Sigma = field(default_factory=Sigma)

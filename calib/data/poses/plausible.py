@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FINEST, FileOptions
@@ -137,6 +138,23 @@ def rotation_matrices(values: np.ndarray, table: Table, columns: Sequence[str]) 
             message = "the matrix r11 to r33 is left-handed (determinant -1): an axis is mirrored, or two are swapped"
         raise MeasurementError(message, table.file, int(table.rows[row]), columns[0])
     return matrices
+
+
+def turns(values: np.ndarray, table: Table, columns: Sequence[str], euler: str) -> np.ndarray:
+    """Return quaternions (m, 4) x y z w of three angles each (m, 3) [rad], whose meaning `euler` is (`fit_options`)."""
+    if euler == "vector":
+        return Rotation.from_rotvec(values).as_quat(canonical=True)
+    _check_turn(values, table, columns)
+    axes, _, how = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler).partition(" ")
+    return Rotation.from_euler(axes if how == "fixed" else axes.upper(), values).as_quat(canonical=True)
+
+
+def _check_turn(values: np.ndarray, table: Table, columns: Sequence[str]) -> None:
+    beyond = np.argwhere(np.abs(values) > TURN)
+    if len(beyond):
+        row, k = (int(i) for i in beyond[0])
+        message = f"{values[row, k]:g} rad is more than a turn: if it is in deg, name the column '{columns[k]} [deg]'"
+        raise MeasurementError(message, table.file, int(table.rows[row]), columns[k])
 
 
 def check_positive(values: np.ndarray, table: Table, columns: Sequence[str], advice: str) -> None:

@@ -4,8 +4,9 @@ Columns by default (a unit in brackets is converted, ``q1 [deg]``, ``x [mm]``; p
 
 ==================  ===================================================================================================
 joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``
-position, pose      ``x y z``; with ``qx qy qz qw`` or ``r11`` to ``r33`` a pose; also with ``_meas``, ``_measured``
-                    (where a file has both, the options' [columns] say which is to be read)
+position, pose      ``x y z``; with ``qx qy qz qw``, ``r11`` to ``r33`` or three angles (``rx ry rz``, ``a b c``,
+                    ``w p r``, ``roll pitch yaw``; the options' ``euler`` says what they mean) a pose; also with
+                    ``_meas``, ``_measured`` (where a file has both, the options' [columns] say which is to be read)
 several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
 base frame          ``base_x`` … ``base_qw``, measured with every row: the target is then seen from there
 sigmas              ``sigma_x``, ``_y``, ``_z`` (numbered as the reflectors, or common), ``sigma_rx``, ``_ry``, ``_rz``
@@ -190,6 +191,9 @@ def _unseen(seen: np.ndarray, layout: Layout) -> tuple[str, ...]:
 
 
 def _orientation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray:
+    if len(layout.orientation) == 3:
+        angles = _numbers(table, options, layout.orientation, "angle", "orientation")
+        return plausible.turns(angles, table, layout.orientation, options.euler)
     values = _numbers(table, options, layout.orientation, "", "")
     if len(layout.orientation) == 4:
         return plausible.unit_quaternions(values, table, layout.orientation)

@@ -26,11 +26,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen
 from calib.data.csv_table import Table, read_header, read_table, row_width
 from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.plausible import turns
 from calib.errors import MeasurementError
 
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -71,7 +71,8 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
         notes += more
     columns = {**options.columns, **{f"q{i + 1}": name for i, name in enumerate(names[:6])}}
     kind = options.kind or ("pose" if pose else "position")
-    return table, replace(options, columns=columns, kind=kind), (f"read as RoboDK's {kind}s", *notes)
+    read = f"read as RoboDK's {kind}s: joints in deg, positions in mm where the header says nothing else"
+    return table, replace(options, columns=columns, kind=kind), (read, *notes)
 
 
 def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
@@ -107,12 +108,9 @@ def _with_quaternion(table: Table, options: FileOptions) -> tuple[Table, tuple[s
             message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
             raise MeasurementError(message, table.file, int(table.rows[0]), "w")
         angles = np.deg2rad(angles)
-    if options.euler == "vector":
-        rotation = Rotation.from_rotvec(angles)
-    else:
-        rotation = Rotation.from_euler("xyz" if options.euler == "wpr" else "XYZ", angles)
-    meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}[options.euler]
-    quaternion = tuple(frozen(column) for column in rotation.as_quat(canonical=True).T)
+    euler = options.euler or "wpr"
+    meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}.get(euler, euler)
+    quaternion = tuple(frozen(column) for column in turns(angles, table, ("w", "p", "r"), euler).T)
     return (
         Table(
             table.file,

@@ -19,7 +19,7 @@ import numpy as np
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.errors import MeasurementError, suggestion
+from calib.errors import MeasurementError, brief, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
@@ -39,7 +39,9 @@ def read_bag(
     except MeasurementError:
         raise
     except Exception as error:  # whatever a damaged file makes of readers that are not ours
-        raise MeasurementError(f"cannot be read as a ROS bag ({error}): was it closed properly?", path) from error
+        raise MeasurementError(
+            f"cannot be read as a ROS bag ({brief(error)}): was it closed properly?", path
+        ) from error
     return _assemble(names, parts, skipped, path, options, ends)
 
 

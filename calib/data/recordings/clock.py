@@ -155,7 +155,7 @@ def _step(t: np.ndarray) -> float:
 def _roughness(q: np.ndarray, t: np.ndarray, keep: np.ndarray, period: float) -> float:
     """Return the median over the joints of the rms fourth difference of q on an even grid [rad or m]."""
     t, q = t[keep][:LOOK], q[keep][:LOOK]
-    grid = np.arange(t[0], t[-1], period)[: 2 * len(t)]
+    grid = t[0] + period * np.arange(min(2 * len(t), int(np.ceil((t[-1] - t[0]) / period))))  # a gap may be of weeks
     fourth = np.diff(CubicSpline(t, q)(grid), 4, axis=0)
     near = np.searchsorted(t, grid[2:-2])  # a bridged gap says nothing
     measured = np.diff(t)[np.clip(near, 1, len(t) - 1) - 1] < 1.5 * period

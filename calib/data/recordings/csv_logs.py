@@ -1,14 +1,15 @@
 """Recordings in CSV tables: a column of stamps, and one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``).
 
-A quantity's name (`recording_options`) stands before the joint's number or name, with or without a ``_`` (``q1``,
-``q_1``, ``position_elbow``, ``elbow_position``, ``q[1]`` is not a unit but a number); numbers start at 0 or 1.
+A quantity's name (`recording_options`) stands before or behind the joint's number or name, with or without a ``_``
+(``q1``, ``q_1``, ``position_elbow``, ``elbow_position``, ``J1 pos``; in ``q[1]`` is no unit but a number); numbers
+start at 0 or 1.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,17 @@ import numpy as np
 from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording, named
-from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, check_units, one_effort, scale
+from calib.data.recordings.recording_options import (
+    MEASURED,
+    SYNONYMS,
+    RecordingOptions,
+    check_units,
+    one_effort,
+    plain_stems,
+    scale,
+    stem_of,
+)
 from calib.errors import MeasurementError, UsageError, suggestion
-
-_NUMBERED = re.compile(r"^(?P<stem>.*?)[_\s.]?(?P<number>\d+)$")
 
 
 def read_log(
@@ -48,6 +56,8 @@ def read_log(
     unused = [name for place, name in enumerate(table.header) if place not in used]
     notes = [f"not read: {', '.join(unused)}"] if unused else []
     for ours, columns in found.items():
+        if stem_of(table.header[columns[0]])[0].startswith(MEASURED):
+            notes.append(f"{ours} is read from {', '.join(_called(table, columns))}")
         if len(units := dict.fromkeys(table.units[place] or "no unit" for place in columns)) > 1:
             notes.append(f"the columns of {ours} differ in their units ({', '.join(units)}): is that meant?")
     names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
@@ -95,7 +105,8 @@ def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dic
     found = {}
     for ours, synonyms in SYNONYMS.items():
         stems = (options.names[ours],) if ours in options.names else synonyms
-        if places := next((places for stem in stems if (places := _family(table, stem, joints, ours == "t"))), None):
+        ways = (_alone,) if ours == "t" else (partial(_of_joints, joints=joints), _numbered)
+        if places := next((places for stem in stems for way in ways if (places := way(table, stem))), None):
             found[ours] = places
         elif ours in options.names:
             message = f"no column begins with '{options.names[ours]}'{suggestion(options.names[ours], table.header)}"
@@ -103,25 +114,34 @@ def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dic
     return found
 
 
-def _family(table: Table, stem: str, joints: Sequence[str], single: bool) -> list[int]:
-    """Return the places of the columns of one quantity: by the joints' names, else by numbers."""
+def _alone(table: Table, stem: str) -> list[int]:
+    """Return the place of the one column of this name."""
     header = [name.lower() for name in table.header]
-    stem = stem.lower()
-    if single:
-        return [header.index(stem)] if stem in header else []
+    return [header.index(stem.lower())] if stem.lower() in header else []
+
+
+def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
+    """Return the places of the columns of one quantity that have the joints' names."""
+    header, stem = [name.lower() for name in table.header], stem.lower()
     for pattern in (f"{stem}_{{}}", f"{stem}{{}}", f"{stem} {{}}", f"{{}}_{stem}", f"{{}}.{stem}", f"{stem}.{{}}"):
         columns = [pattern.format(joint.lower()) for joint in joints]
         if columns and all(column in header for column in columns):
             return [header.index(column) for column in columns]
-    places = [(int(m["number"]), k) for k, name in enumerate(header) if (m := _NUMBERED.match(name)) and _is(m, stem)]
-    numbers = sorted(number for number, _ in places)
-    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
+    return []
+
+
+def _numbered(table: Table, stem: str) -> list[int]:
+    """Return the places of the columns of one quantity by their numbers, which go from 0 or 1 on without a gap."""
+    found: dict[str, list[tuple[int, int]]] = {}
+    for place, name in enumerate(table.header):
+        own, number = stem_of(name)
+        if number is not None:
+            found.setdefault(own, []).append((number, place))
+    places = sorted(found.get(plain_stems(tuple(found)).get(stem_of(stem)[0], ""), []))
+    numbers = [number for number, _ in places]
+    if not numbers or numbers[0] > 1 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         return []
-    return [place for _, place in sorted(places)]
-
-
-def _is(match: re.Match[str], stem: str) -> bool:
-    return match["stem"] in (stem, f"{stem}_joint", f"{stem}_j", f"joint_{stem}")
+    return [place for _, place in places]
 
 
 def _called(table: Table, places: Sequence[int]) -> list[str]:

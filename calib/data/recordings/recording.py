@@ -202,6 +202,10 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
             message = f"{text}: '{part}' is no time in seconds; a cut is written log.npz@0:9.4"
             raise UsageError(message) from error
     start, stop = ends
+    if start is not None and start < 0.0:
+        raise UsageError(
+            f"{text}: the cut starts at {start:g} s, before the recording does; seconds count from its start"
+        )
     if start is not None and stop is not None and not start < stop:
         raise UsageError(f"{text}: the cut ends at {stop:g} s, before it starts at {start:g} s")
     return match["file"], start, stop

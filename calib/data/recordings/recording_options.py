@@ -14,15 +14,17 @@ tau_link   tau_link, tau_l, tau_sensor, link_torque
 tau_motor  tau_motor, tau_m, motor_torque
 q_link     q_link, link_position
 q_ref      q_ref, q_des, q_cmd, q_desired, q_reference, q_command, q_target, position_reference, position_command,
-           desired_position, reference_position, target_position
+           desired_position, reference_position, target_position, target_q
 tau_ff     tau_ff, tau_feedforward, torque_feedforward
 ========== =============================================================================================
 
-FloBaRoID writes times, positions, velocities, torques.
+FloBaRoID writes times, positions, velocities, torques. Words before a name that say no more than that it was measured
+(`MEASURED`: ``actual_q_0``, ``state.q[0]``) do not matter where no column has the plain name.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,10 +47,12 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "q_link": ("q_link", "link_position"),
     "q_ref": (
         "q_ref", "q_des", "q_cmd", "q_desired", "q_reference", "q_command", "q_target", "position_reference",
-        "position_command", "desired_position", "reference_position", "target_position",
+        "position_command", "desired_position", "reference_position", "target_position", "target_q",
     ),
     "tau_ff": ("tau_ff", "tau_feedforward", "torque_feedforward"),
 }  # fmt: skip
+MEASURED = ("actual", "measured", "state", "robot")
+_NUMBER = re.compile(r"\d+(?!.*\d)")
 LATEST = 1.0  # largest lag that is believed [s] (our choice)
 RATES = ("frequency", "rate", "sample_rate", "fs")
 OWN = ("joint_names", "drive_gain", "use_range")
@@ -134,9 +138,29 @@ def check_units(name: str, units: Sequence[str], joints: Joints | None, path: st
             raise MeasurementError(message, path)
 
 
+def stem_of(name: str) -> tuple[str, int | None]:
+    """Return what a column is of, in small letters with ``_`` between words, and its last number: q, 1 of ``J1 q``."""
+    number = _NUMBER.search(name)
+    rest = f"{name[: number.start()]} {name[number.end() :]}" if number else name
+    words = [word for word in re.split(r"[\W_]+", rest.lower()) if word not in ("", "joint", "j")]
+    return "_".join(words), int(number[0]) if number else None
+
+
+def plain_stems(stems: Sequence[str]) -> dict[str, str]:
+    """Return stem → itself, and without the words of `MEASURED` before it → the one stem that has them."""
+    short: dict[str, list[str]] = {}
+    for stem in stems:
+        words = stem.split("_")
+        while len(words) > 1 and words[0] in MEASURED:
+            words = words[1:]
+            short.setdefault("_".join(words), []).append(stem)
+    return {name: own[0] for name, own in short.items() if len(own) == 1} | {stem: stem for stem in stems}
+
+
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
     """Return our name → the file's, with either ``torque`` or ``current``; needs positions and one of these two."""
-    plain = {member.lower().strip(): member for member in reversed(members)}
+    plain = {stem: member for member in reversed(members) if not (named := stem_of(member))[1] for stem in [named[0]]}
+    plain = {name: plain[stem] for name, stem in plain_stems(tuple(plain)).items()}
     found = {}
     for ours, synonyms in SYNONYMS.items():
         if ours in options.names:
@@ -144,7 +168,7 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
                 message = f"there is no '{options.names[ours]}'{suggestion(options.names[ours], members)}"
                 raise MeasurementError(f"{message}; found: {', '.join(members)}", path)
             found[ours] = options.names[ours]
-        elif name := next((plain[synonym] for synonym in synonyms if synonym in plain), ""):
+        elif name := next((plain[own] for synonym in synonyms if (own := stem_of(synonym)[0]) in plain), ""):
             found[ours] = name
     return one_effort(found, options, members, path)
 
@@ -155,7 +179,8 @@ def one_effort(
     """Return `found` with one of ``torque`` and ``current``; sensors behind the gear serve where there is neither."""
     if "q" not in found:
         wanted = ", ".join(SYNONYMS["q"])
-        raise MeasurementError(f"has no joint positions ({wanted}); found: {', '.join(members)}", path)
+        message = f"has no joint positions ({wanted}); found: {', '.join(members)}"
+        raise MeasurementError(message + _cure(found, members), path)
     kinds = [kind for kind in ("torque", "current") if kind in found]
     if not kinds and options.sensors:
         kinds = _two_torques(found, options, members, path)
@@ -164,11 +189,26 @@ def one_effort(
         kinds = ["torque"]
     if not kinds:
         wanted = ", ".join((*SYNONYMS["torque"], *SYNONYMS["current"]))
-        raise MeasurementError(f"has no torques and no currents ({wanted}); found: {', '.join(members)}", path)
+        message = f"has no torques and no currents ({wanted}); found: {', '.join(members)}"
+        raise MeasurementError(message + _cure(found, members), path)
     kind = options.kind or kinds[0]
     if kind not in found:  # the options say that what is called a torque is a current
         found[kind] = found.pop(kinds[0])
     return {ours: theirs for ours, theirs in found.items() if ours not in ("torque", "current") or ours == kind}
+
+
+def _cure(found: Mapping[str, str], members: Sequence[str]) -> str:
+    """Say how the options name what was not found: as columns that share a word with it, else the first and last."""
+    stems = [stem for member in members for stem in [stem_of(member)[0]] if stem not in (*found.values(), "")]
+    several = [stem for stem in stems if stems.count(stem) > 1] or stems or ["..."]
+    likely = {}
+    for ours in ("q", "torque", "current"):
+        words = {word for synonym in SYNONYMS[ours] for word in synonym.split("_")} - {"joint", *MEASURED}
+        if ours not in found and (own := next((stem for stem in stems if words & set(stem.split("_"))), "")):
+            likely[ours] = own
+    likely = likely or {"q": several[0], "torque": several[-1]}
+    names = ", ".join(f'{ours} = "{stem}"' for ours, stem in likely.items())
+    return f". Say in the options what they are called, as in [recording] names = {{ {names} }}"
 
 
 def _two_torques(found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:

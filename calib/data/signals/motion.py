@@ -172,7 +172,7 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
     for value in (*cutoff, *(() if faster is None else faster)):
         check_cutoff(float(value), sampled.rate, recording.file)
     decimator = _decimator(cutoffs, options, sampled, recording.file)
-    q, mask = _smooth(sampled, cutoff, options.order), _inside(sampled, cutoff, options)
+    q, mask = _smooth(sampled, cutoff, options.order), _inside(sampled, cutoff, options, recording.file)
     a = _differences(curvature, q, sampled, options.width)
     if faster is None:
         faster = cutoff if options.cutoff is not None else _velocity_cutoff(cutoffs, cutoff, a[mask], sampled.rate)
@@ -262,14 +262,18 @@ def _differences(
     return np.concatenate([of(q[own], sampled.rate, width) for own in _segments(sampled)])
 
 
-def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions) -> np.ndarray:
-    """Return the mask (N,) of the samples that the filters' ends do not spoil."""
+def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
+    """Return the mask (N,) of the samples that the filters' ends do not spoil; at least one, or it is refused."""
     inside = np.zeros(len(sampled.t), dtype=bool)
     edge = border(sampled.rate, float(cutoff.min()))
     edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))
     edge = max(edge, options.width)
     for own in _segments(sampled):
         inside[own.start + edge : max(own.start + edge, own.stop - edge)] = True
+    if not inside.any():
+        why = "the filters' ends" if options.borders is None else f"borders = {options.borders:g}"
+        message = f"no part without a gap is longer than {2 * edge / sampled.rate:.3g} s, which {why} take away"
+        raise MeasurementError(f"{message}: record longer, or lower the borders", file)
     return inside
 
 

@@ -33,6 +33,7 @@ class ExcitationReport:
         correlation: (n, n) of the positions.
         functions: number of independent functions of time that all positions are made of (2 for one sine).
         still: (n,) joints that never move.
+        seconds: for which any joint moves [s].
         notes: what a user should be told.
     """
 
@@ -42,6 +43,7 @@ class ExcitationReport:
     correlation: np.ndarray
     functions: int
     still: np.ndarray
+    seconds: float
     notes: tuple[str, ...]
 
     @property
@@ -68,9 +70,11 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     functions = int((singular > FUNCTION * singular[0]).sum())
     lines, strongest, share = (np.array(part) for part in zip(*found))
     notes = _notes(motion.joint_names, share, strongest, correlation, functions, still)
+    seconds = float((~motion.standstill()).sum() / motion.rate)
     return ExcitationReport(
-        frozen(lines, int), frozen(strongest), frozen(share), frozen(correlation), functions, frozen(still, bool), notes
-    )
+        frozen(lines, int), frozen(strongest), frozen(share), frozen(correlation), functions, frozen(still, bool),
+        seconds, notes,
+    )  # fmt: skip
 
 
 def repeats(training: Motion, other: Motion) -> float:

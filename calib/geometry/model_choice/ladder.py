@@ -46,6 +46,7 @@ class ModelStep:
         cross_validated: rms error on unseen rows [m].
         kept: whether the climb goes on from here.
         note: why, in words.
+        corrections: how many of the parameters are small joint corrections, shrunk by a ridge.
     """
 
     model: str
@@ -53,6 +54,7 @@ class ModelStep:
     cross_validated: float
     kept: bool
     note: str = ""
+    corrections: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,7 @@ class ModelSelection:
         folds: how the unseen rows were set aside.
         loss: the loss that was used.
         offered: all terms of the effects that were taken up; those in ``fit`` are the ones the data kept.
+        rigid_cross_validated: rms error of the best model without effects on held-out rows [m].
     """
 
     fit: GeometricFit
@@ -79,6 +82,7 @@ class ModelSelection:
     folds: Folds
     loss: str = "none"
     offered: tuple[Term, ...] = ()
+    rigid_cross_validated: float | None = None
 
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
         """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
@@ -235,7 +239,9 @@ class _Climber:
             )
             self.chosen = " + ".join(["geometry", *kept])
             last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
-            self.rungs[last] = replace(self.rungs[last], parameters=len(self.best.free))
+            self.rungs[last] = replace(
+                self.rungs[last], parameters=len(self.best.free), corrections=len(self.best.cell.deflection.terms)
+            )
             if model == "auto" and not (status := self.best.solution.status).good and before[1].solution.status.good:
                 note = f"did not converge ({status.name.lower()}): left out"
                 tried = [replace(rung, kept=False, note=note) for rung in self.rungs[len(before[2]) :]]
@@ -285,7 +291,8 @@ class _Climber:
         self, statistics: FoldStatistics, name: str, where: np.ndarray, kept: bool, note: str, rms: float | None = None
     ) -> ModelStep:
         rms = statistics.error(where).rms if rms is None else rms
-        return ModelStep(name, statistics.rigid + statistics.alive(where), rms, kept, note)
+        shrunk = statistics.alive(where)
+        return ModelStep(name, statistics.rigid + shrunk, rms, kept, note, shrunk)
 
     def _final(self, statistics: FoldStatistics, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
         """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""
@@ -331,6 +338,7 @@ class _Climber:
             self.folds,
             loss,
             self.offered,
+            None if self.nominal.cell.known.terms else self.error,
         )
 
 

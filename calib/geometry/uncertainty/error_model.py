@@ -8,7 +8,8 @@ ranges of single joints that were, every joint counting by its lever [m]. s says
 (near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius that
 holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.uncertainty.left_out`): nothing is
 said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the median
-of the ones to that of the others; sigmas are stated in units of the larger radius.
+of the ones to that of the others, and is larger outside the range of a joint, by what that end of it showed when it was
+left out; sigmas are stated in units of the larger radius.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class Discrepancy:
         levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
         profile: log s by joint; empty where errors are even.
         placed: the radii where base and tool are placed on the rows; None where they are the same.
+        wider: by joint, how many times as wide an interval is below and above its range; empty where nothing tells.
     """
 
     parameters: float
@@ -68,6 +70,7 @@ class Discrepancy:
     levers: tuple[float, ...]
     profile: Profile = ()
     placed: tuple[float, float] | None = None
+    wider: tuple[tuple[float, float], ...] = ()
 
     @property
     def radius(self) -> float:
@@ -139,7 +142,18 @@ class ErrorModel:
         found, parts = self.discrepancy, _distances(q, self.learnt, np.array(self.discrepancy.levers))
         rest = unevenness(found.profile, q) * found.floor + found.far * parts[0] + found.beyond * parts[1]
         radius = np.interp(parts[0] + parts[1], found.reach, radii or found.radii)
+        radius *= self._wider(q) if radii is None else 1.0
         return np.sqrt(found.parameters * own + rest) * radius / found.radius
+
+    def _wider(self, q: np.ndarray) -> np.ndarray:
+        """Return how many times as wide intervals (m,) are outside ranges: fully from half the width of an end on."""
+        result = np.ones(len(q))
+        for j, most in enumerate(self.discrepancy.wider):
+            low, first, last, high = np.quantile(self.learnt[:, j], [0.0, END, 1.0 - END, 1.0])
+            for far, end, factor in ((low - q[:, j], first - low, most[0]), (q[:, j] - high, high - last, most[1])):
+                share = np.clip(2.0 * far / max(end, 1e-9), 0.0, 1.0)
+                result = np.maximum(result, 1.0 + (factor - 1.0) * share)
+        return result
 
     def beyond(self, q: np.ndarray) -> np.ndarray:
         """Return which joints (m, n) stand outside the range that was learnt from: there a prediction extrapolates."""
@@ -214,8 +228,9 @@ def learn_errors(
     levers = _joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
     rows = _Rows(selected, measured, torques)
     near = [*rows.left_out(random_folds(measured, 5, seed), levers)]
-    groups = [selected.folds, *_range_folds(measured)]
-    left = LeftOut.of(near, [errors for each in groups for errors in rows.left_out(each, levers)])
+    groups = [(-1, selected.folds), *_range_folds(measured)]
+    far = [(joint, errors) for joint, each in groups for errors in rows.left_out(each, levers)]
+    left = LeftOut.of(near, [errors for _, errors in far], [joint for joint, _ in far])
     left, profile = left.scaled(rows.poses)
     weights, radii = left.learnt()
     low, high = (float(np.median(left.away[of])) for of in (left.near, ~left.near))
@@ -223,13 +238,15 @@ def learn_errors(
     wider = left.surprise(weights, reach)
     q = np.concatenate([block.q for block in measured])
     wide = radii[0] * wider[0], radii[1] * wider[1]
-    kappa, floor, far, beyond = weights
-    known = Discrepancy(kappa, floor, far, beyond, wide, reach, tuple(levers.tolist()), profile, radii)
+    outside = left.wider(weights, wide, reach, rows.poses)
+    kappa, floor, near_by, beyond = weights
+    lengths = tuple(levers.tolist())
+    known = Discrepancy(kappa, floor, near_by, beyond, wide, reach, lengths, profile, radii, outside)
     return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
 
 
-def _range_folds(measured: Sequence[PoseMeasurements]) -> list[Folds]:
-    """Return folds that leave out both ends of every joint's range, the middle staying in."""
+def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]]:
+    """Return joints, and folds that leave out both ends of their ranges, the middle staying in."""
     q = np.concatenate([block.q for block in measured])
     edges, result = np.cumsum([len(block) for block in measured])[:-1], []
     for j in range(q.shape[1]):
@@ -237,7 +254,7 @@ def _range_folds(measured: Sequence[PoseMeasurements]) -> list[Folds]:
         if high - low < 1e-6:
             continue
         fold = np.where(q[:, j] < low, 0, np.where(q[:, j] > high, 1, 2))
-        result.append(Folds("ranges", 2, tuple(np.split(fold, edges))))
+        result.append((j, Folds("ranges", 2, tuple(np.split(fold, edges)))))
     return result
 
 

@@ -17,7 +17,14 @@ from calib.identification.cases import Case
 from calib.identification.checks.motion_samples import take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
 from calib.identification.checks.torque_lag import Lag, lag_of
-from calib.identification.checks.whole_robot import ClockRatio, Rearranged, clock_ratio, rearranged
+from calib.identification.checks.whole_robot import (
+    ClockRatio,
+    Rearranged,
+    ReversedSigns,
+    clock_ratio,
+    rearranged,
+    reversed_signs,
+)
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
@@ -94,6 +101,12 @@ def compare_sizes(
     clock = clock_ratio(few, chain) if newtons and few is not None else None
     other = rearranged(few, chain) if known and few is not None else None
     return RecordingSizes(case.name, masses, limits, *speed, counted, motion.rate, lag, clock, other, motion.jumps)
+
+
+def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> ReversedSigns | None:
+    """Return which motors' torques of a recording have the wrong sign; arguments and None as of `compare_sizes`."""
+    few = take_samples(case, _under(chain, gravity), FEW)
+    return None if few is None else reversed_signs(few)
 
 
 def _speed_ratio(

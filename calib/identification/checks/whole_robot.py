@@ -1,4 +1,4 @@
-"""Torques beside those of the whole robot: does its clock run right, are its joints in order, and where is their zero?
+"""Torques beside those of the whole robot: does its clock run right, are signs, order and zeros of its joints as said?
 
 A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
 while masses, which gravity tells, stay as they are. How large inertias are beside masses, lengths alone say nearly: for
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.optimize import nnls
 
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
@@ -29,6 +30,7 @@ SURE = 5.0  # sigmas from which on a factor is told
 ALIKE = 0.3  # least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
 KNOWN = 0.5  # largest share of their torques' variance that is left as recorded
 QUARTERS = (1, 2, 3)  # turns of a joint's zero that are tried [90 deg]
+MAX_LEFT = 0.8  # of what is left as recorded, with a sign reversed: sound recordings at hand are left 0.91 and more
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,20 @@ class Rearranged:
     quarters: int
     factor: float
     left: float
+
+
+@dataclass(frozen=True)
+class ReversedSigns:
+    """Joints whose torques one model of the robot explains with the opposite sign.
+
+    Attributes:
+        joints: these, from 0.
+        before, after: rms shares of their torques that are left: as recorded, and with the signs reversed.
+    """
+
+    joints: tuple[int, ...]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
@@ -98,10 +114,52 @@ def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[f
     return alpha, float(np.sqrt(np.sum(weight[:, None] ** 2 * own**2 * np.array(spread)[:, None]))) / power
 
 
+def reversed_signs(samples: MotionSamples) -> ReversedSigns | None:
+    """Return the joints whose torques are explained with the opposite sign, and how well; None where there are none.
+
+    One model of all joints is fitted to each choice of signs: bodies and offsets of any size, Ia, Fv and Fc of every
+    drive not negative, since no drive brakes backwards. Signs are reversed one by one, the one that explains most
+    first, as long as the geometric mean of what is left of the joints falls to `MAX_LEFT` of it. The robot's own
+    masses need not be known.
+    """
+    m, n = samples.q.shape
+    scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
+
+    def rows(columns: np.ndarray) -> np.ndarray:
+        return (columns * scale[:, None]).transpose(1, 0, 2).reshape(n * m, -1)
+
+    drives = samples.drives.reshape(m, n, n, 4)
+    free = basis(rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2)))
+    positive, each = rows(drives[..., :3].reshape(m, n, -1)), rows(samples.torque[:, :, None] * np.eye(n))
+    positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
+    positive, each = (x - free @ (free.T @ x) for x in (positive, each))
+    across, triangle = np.linalg.qr(positive)
+
+    def left(signs: np.ndarray) -> np.ndarray:
+        torque = each @ signs
+        residual = torque - positive @ nnls(triangle, across.T @ torque)[0]
+        return np.maximum((residual.reshape(n, m) ** 2).mean(axis=1), 1e-9)
+
+    signs = np.ones(n)
+    before = now = left(signs)
+    while True:
+        tried = [left(np.where(np.arange(n) == j, -signs, signs)) for j in range(n)]
+        factors = [np.exp(0.5 * np.mean(np.log(one / now))) for one in tried]
+        best = int(np.argmin(factors))
+        if factors[best] > MAX_LEFT:
+            break
+        signs[best], now = -signs[best], tried[best]
+    joints = np.flatnonzero(signs < 0.0)
+    if not len(joints):
+        return None
+    return ReversedSigns(*(tuple(x.tolist()) for x in (joints, np.sqrt(before[joints]), np.sqrt(now[joints]))))
+
+
 def rearranged(samples: MotionSamples, chain: Chain) -> Rearranged | None:
     """Return the exchange of two joints, or the right angles at one's zero, that explain most more; None without such.
 
-    Each joint's torque is that of gravity and that of motion, by the robot's masses, each times a factor, and a drive.
+    Each joint's torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive
+    and those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
     """
     masses = standard_parameters(chain)
     order, straight = np.arange(chain.n), np.zeros(chain.n)
@@ -136,5 +194,6 @@ def _left(samples: MotionSamples, masses: np.ndarray, order: np.ndarray, zero: n
     moving = inverse_dynamics(samples.bodies, masses, q, v, a) - still
     drives, torque = drive_columns(v, a), samples.torque
     for joint, recorded in sorted(enumerate(order), key=lambda one: one[1]):
-        columns = np.column_stack([still[:, joint], moving[:, joint], drives[:, joint]])
+        beside = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(q), -1)
+        columns = np.column_stack([still[:, joint], moving[:, joint], beside])
         yield float(left_share(basis(columns), torque[None, :, recorded])[0])

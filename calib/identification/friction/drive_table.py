@@ -26,6 +26,14 @@ class Drives:
     sigma: np.ndarray | None = None
 
 
+def without_left(dynamics: Dynamics) -> Dynamics:
+    """Return an identified model without the terms that no such table holds."""
+    left, first = drive_table(dynamics).left, dynamics.model.inertial
+    values = np.array(dynamics.values)
+    values[[first + k for k, one in enumerate(dynamics.model.columns) if one.name in left]] = 0.0
+    return Dynamics(dynamics.model, values)
+
+
 def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Drives:
     """Return the drive terms of an identified model by joint, those of motor and link side added.
 

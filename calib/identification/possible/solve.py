@@ -153,7 +153,7 @@ def find_possible(information: Information, weight: float | None = None, prior: 
         Dynamics(model, values), _covariance(problem, gamma, curved_at), gamma, doubt,
         np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
         information.distance(values), away, allowed, blamed, references.source, prior,
-        (*references.notes, *_notes(model, information, problem, values, allowed)),
+        (*references.notes, *_notes(model, problem, values)),
     )  # fmt: skip
 
 
@@ -297,16 +297,9 @@ def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
     return inverse @ pseudo @ inverse.transpose(0, 2, 1)
 
 
-def _notes(
-    model: IdentificationModel, information: Information, problem: BodyCost, values: np.ndarray, allowed: float
-) -> Sequence[str]:
-    """Return what stands out: a distance beyond the covariance, bodies thinner than a millimetre."""
+def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) -> Sequence[str]:
+    """Return what stands out: bodies thinner than a millimetre."""
     found = []
-    if (away := information.distance(values)) > allowed:
-        found.append(
-            f"the consistent parameters are {away:.3g} standard deviations from the estimate, beyond {allowed:.3g} (95 "
-            f"% for {information.b} parameters): the torques no longer are quite those identified"
-        )
     for label, body in zip(model.bodies.labels, _bodies(problem, values)):
         if pseudo_inertia.margin(body) < 1e-3:
             found.append(f"body {label} is thinner than a millimetre: hardly possible")

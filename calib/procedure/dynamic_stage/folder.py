@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from calib import files
+from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
-from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
@@ -36,7 +35,7 @@ from calib.procedure.dynamic_stage.metric_tables import (
 )
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
-from calib.records import read_record
+from calib.records import read_json
 from calib.robot import calibrated
 from calib.units import per_ampere
 
@@ -99,6 +98,11 @@ class IdentificationFolder:
         return self.path / ESTIMATE, self.path / COVARIANCE
 
     @property
+    def torques(self) -> list[Path]:
+        """Torques measured and predicted on motion that is unseen, where there is any."""
+        return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
+
+    @property
     def unseen(self) -> UnseenFolder:
         """What the model comes to on motion it has not seen."""
         return UnseenFolder(self.path / "unseen")
@@ -149,10 +153,7 @@ class UnseenFolder:
 
 
 def _read(kind: type[T], path: Path) -> T:
-    try:
-        return read_record(kind, json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); identify again") from error
+    return read_json(path, "identify again", kind)
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -208,19 +209,26 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
 def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path) -> Path:
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
 
-    Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates.
+    Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates; without a
+    payload on board with speeds and accelerations, too, for `read_torques`.
     """
-    motion, rows = case.motion, case.target.shape[1]
+    motion = case.motion
     step = max(1, round(motion.rate / TORQUE_RATE))
-    names = [f"{what}_{j + 1}" for what in ("measured", "predicted") for j in range(rows)]
-    joints = [f"q{j + 1}" for j in range(motion.q.shape[1])]
-    table = np.column_stack([motion.t, case.target, predicted, motion.q])[::step]
-    if expected is None:
-        return files.write_numbers(path, ["t [s]", *names, *joints], table)
-    near = np.searchsorted(expected.index, np.arange(len(motion))[::step])
-    table = np.column_stack([table, expected.sigma[near], expected.beyond[near]])
-    sigmas = [f"sigma_{j + 1}" for j in range(rows)]
-    return files.write_numbers(path, ["t [s]", *names, *joints, *sigmas, "extrapolated"], table)
+    columns = {"measured_": np.asarray(case.target), "predicted_": predicted, "q": np.asarray(motion.q)}
+    if expected is not None:
+        near = np.searchsorted(expected.index, np.arange(len(motion)))
+        columns |= {"sigma_": expected.sigma[near], "extrapolated": expected.beyond[near]}
+    if not case.carried:
+        columns |= {"v": np.asarray(motion.v), "a": np.asarray(motion.a)}
+    names = [f"{what}{j + 1}" if one.ndim > 1 else what for what, one in columns.items() for j in range(one[0].size)]
+    return files.write_numbers(path, ["t [s]", *names], np.column_stack([motion.t, *columns.values()])[::step])
+
+
+def read_torques(path: Path) -> dict[str, np.ndarray]:
+    """Read what `_write_torques` has left: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
+    table = read_table(path)
+    found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}
+    return {name.rstrip("_"): one for name, one in found.items() if one is not None} if found["v"] is not None else {}
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

@@ -19,7 +19,7 @@ from calib.identification.identify_options import FileSettings, GainPair, Identi
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain
-from calib.units import TORQUE
+from calib.units import TORQUE, without_gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +127,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         for j, (gain, sigma) in enumerate(zip(found.gains, found.sigma))
     )
     note = (
-        f"no drive gains are known: torques are in amperes of joint {reference + 1}, gains relative to it {told}; "
-        "for N m give gains, or [gain_identification] with a payload of known mass"
+        f"torques are {without_gains(f'A of joint {reference + 1}')}; gains relative to it {told}; for N m give gains, "
+        "or [gain_identification] with a payload of known mass"
     )
     apart = [f"joint {j + 1}" for j in sorted(found.own)]
     own = (
@@ -145,8 +145,8 @@ def relative_warnings(unit: str) -> tuple[str, ...]:
     if unit == TORQUE:
         return ()
     return (
-        f"the model is in {unit}, not in N m: no masses, no URDF, no motion planning; the robot's own inertias do not "
-        "compare with it: state gains, or identify them with a load",
+        f"torques are {without_gains(unit)}: no masses, no URDF, no motion planning: state gains, or identify them "
+        "with a load",
     )
 
 

@@ -146,10 +146,23 @@ def gather(
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
     options = found.options
     cases = [_read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
+    _check_payloads(cases[:count], cases[count:], options.settings)
     return IdentificationInputs(
         known.without_corrections(), source, tuple(cases[:count]), tuple(cases[count:]), options,
         (*notes, *found.notes), found,
     )  # fmt: skip
+
+
+def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
+    """Refuse a recording that carries what neither the recordings to learn from nor the options say the weight of."""
+    known = {*settings.payload_values, *(label for label, load in settings.payloads.items() if load.parameters)}
+    known.update(label for case in cases for label in case.carried)
+    for case in unseen:
+        for label in set(case.carried) - known:
+            raise UsageError(
+                f"{case.name} carries '{label}', which no recording to learn from carries: state mass and com under "
+                f"[payload.{label}], or learn from a recording with it"
+            )
 
 
 def _path(each: str | Path | Recording) -> str:

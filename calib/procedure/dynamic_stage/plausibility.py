@@ -15,6 +15,8 @@ clock    inertias that are `INERT` times too large or small beside the masses th
 order    two joints with which exchanged the robot's own masses leave less than `EXCHANGED` of the torques, and of no
          joint's more than `UNTOLD`: marginal. Honest recordings gain nothing (1.0 and above), and where another robot,
          or a zero, is wrong, an exchange leaves that wrong
+sign     joints whose torques one model of bodies and friction explains with the opposite sign only, also of unseen
+         recordings (`calib.identification.checks.whole_robot.reversed_signs`), and of none more than `UNTOLD`: fail
 zero     a joint with a right angle or two at whose zero they leave less than `TURNED`, likewise: marginal
 limit    torques of a joint beyond `BEYOND` times its limit, another unit there: fail; beyond `OVER` times, a wrong gain
          or limit: marginal, as where none at any joint reaches `REACHED` of its limit. Recordings at hand: 0.2 to 0.7
@@ -30,14 +32,14 @@ loop     an estimate that takes the loop for granted (cloe, clie) and that recor
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from calib.data.recordings.checks import BEYOND
 from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
-from calib.identification.checks.whole_robot import ClockRatio, Rearranged
+from calib.identification.checks.whole_robot import ClockRatio, Rearranged, ReversedSigns
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import Finding
@@ -49,7 +51,7 @@ SLIGHT, COMMON, SURELY, WRONG = 0.05, 0.02, 5.0, 1.5
 HALVES = 2.0
 INERT, RODS = 2.0, 0.17
 LOST = 30.0
-EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
+EXCHANGED, TURNED, UNTOLD = 0.95, 0.7, 0.3
 NO_ROBOT, NEVER, NOTICED = 5.0, 10.0, 2.0
 OVER, REACHED = 1.2, 0.01
 
@@ -69,6 +71,20 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
         found += [*_lag(each.name, each.lag, joints), *_other(each.name, each.other, joints)]
         found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
     return found
+
+
+def wrong_signs(found: Mapping[str, ReversedSigns | None], joints: Sequence[str]) -> list[Finding]:
+    """Return what it means that recordings, by name, are explained with torques of the opposite sign."""
+    return [
+        Finding(
+            "sign", "fail",
+            f"{name}: the torques of {joints[j]} have the wrong sign: with it reversed, bodies and friction leave "
+            f"{100 * after:.0f} % of them unexplained, {100 * before:.0f} % as recorded; reverse it in the log",
+        )
+        for name, each in found.items()
+        if each is not None and max(each.after) ** 2 < UNTOLD
+        for j, before, after in zip(each.joints, each.before, each.after)
+    ]  # fmt: skip
 
 
 def impossible(found: Contradiction | None) -> list[Finding]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.identification.cases import Case
-from calib.identification.checks.recording_sizes import compare_sizes
+from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.friction.passivity import driven
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
@@ -35,7 +35,7 @@ from calib.procedure.dynamic_stage.verdict import (
 )
 from calib.procedure.findings import Verdict, settled
 from calib.simulation.loop.controllers import Controller
-from calib.units import TORQUE
+from calib.units import TORQUE, without_gains
 
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
@@ -144,6 +144,8 @@ def assess(
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
     odd = plausibility.findings(sizes, inputs.chain.joint_names) + plausibility.impossible(findings.contradiction)
     odd += plausibility.another_loop(findings.unlike) + plausibility.described(inputs.chain)
+    signs = {case.name: signs_of(case, inputs.chain, settings.gravity) for case in (*inputs.cases, *inputs.unseen)}
+    odd += plausibility.wrong_signs(signs, inputs.chain.joint_names)
     odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
@@ -155,6 +157,7 @@ def assess(
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
     verdict = _with_replays(verdict, tracking)
+    verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}") if amperes else verdict
     said = (
         *amperes, *(one.told for one in odd), *overlaps(inputs.cases, inputs.unseen),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
@@ -171,7 +174,7 @@ def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
     """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
     if not any(one.added.any() for one in tracking.replays):
         return verdict
-    words = "its inertias are those of no possible robot: predict torques with it, simulate the exported one"
+    words = "its inertias are not physically consistent: predict torques with it, simulate the exported robot"
     return replace(verdict, reason=f"{verdict.reason}; {words}")
 
 

@@ -37,6 +37,7 @@ MATTERS = 0.1  # of the greatest joint's rms torque: from here on a joint withou
 BEYOND = 0.05  # of a joint's range by which a recording may leave it: encoders and limits of a CAD are not exact
 CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
+MIN_MOTION = 3.0  # of all training files together [s]; less is too short to identify by (our choice)
 BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 HOLDS = 0.93  # least share of errors on unseen motion within the 95 % intervals, beyond chance
 JOINT_HOLDS = 0.90  # the same for a single joint, whose errors may leave them twice as often as stated
@@ -82,6 +83,8 @@ def judge(
     4. the unseen error is above `GOOD`, or `TRANSFER` times the fit's own: marginal;
     5. else pass.
 
+    Where that is no pass and the robot moves for less than `MIN_MOTION` in all training files, this comes first.
+
     Args:
         fit, validation: scores by file; validation without repeats.
         repeated: validation files that repeat the training motion.
@@ -90,6 +93,24 @@ def judge(
         rows: what the torque rows are called, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
         coordinate: what such a row belongs to, in a word.
     """
+    found = _judge(fit, validation, repeated, excitation, driven, rows, coordinate)
+    seconds = sum(report.seconds for report in excitation.values())
+    if found.level == "pass" or not excitation or seconds >= MIN_MOTION:
+        return found
+    told = f"the training motion lasts {seconds:.2g} s, too short to identify by: record 10 s or more of motion"
+    return Verdict(found.level, f"{told}; {found.reason}")
+
+
+def _judge(
+    fit: Mapping[str, Score],
+    validation: Mapping[str, Score],
+    repeated: Mapping[str, float],
+    excitation: Mapping[str, ExcitationReport],
+    driven: Sequence[int],
+    rows: Sequence[str],
+    coordinate: str,
+) -> Verdict:
+    """Return the verdict by rules 0 to 5, see `judge`."""
     if driven:
         named = ", ".join(str(joint + 1) for joint in driven)
         why = "is a torque's sign reversed, are columns swapped, is this the robot?"

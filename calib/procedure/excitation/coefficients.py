@@ -7,6 +7,7 @@
     period = 20.0                    # [s]
     rate = 1000.0                    # of the controller [Hz]
     repeat = 5                       # periods that were written to run
+limits = ["velocity limits: joint_1 1.92 rad/s (robot description)", ...]
     [[joint]]
     name = "joint_1"
     q0 = 0.1                         # [rad or m]
@@ -18,6 +19,7 @@ With ``family = "bspline"`` a joint has ``points``, control points of a periodic
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -91,13 +93,13 @@ class Periodic:
         return q, v, a
 
 
-def table(motion: Periodic, robot: str) -> dict[str, Any]:
-    """Return the content of ``trajectory.toml`` of a robot's motion."""
+def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]:
+    """Return the content of ``trajectory.toml`` of a robot's motion; `limits` say what it keeps."""
     fourier = motion.kind == "fourier"
     head: dict[str, Any] = {
         "robot": robot, "family": motion.kind, "period": motion.period, "rate": motion.rate, "repeat": motion.repeat,
         "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s" if fourier
-        else "periodic spline, uniform knots over the period; rad, m, s",
+        else "periodic spline, uniform knots over the period; rad, m, s", "limits": list(limits),
     }  # fmt: skip
     joints = []
     for name, c in zip(motion.joint_names, motion.coefficients):

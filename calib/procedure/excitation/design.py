@@ -13,7 +13,7 @@ import numpy as np
 from calib.errors import UsageError
 from calib.procedure.excitation.goals import SCALINGS, NamedGoal, objectives_of, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
-from calib.procedure.excitation.limits import MotionLimits
+from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.prediction import MotionOutlook, foretell
@@ -29,6 +29,7 @@ from trajectories.design.pareto import Front, proposed_goals, sweep
 from trajectories.design.problem import AttainmentGoal, ExcitationProblem
 from trajectories.design.search import SearchResult
 from trajectories.design.verify import Verification, dense_motion, ensured
+from trajectories.errors import NothingFeasible
 from trajectories.fourier import fourier_family
 
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
@@ -118,11 +119,14 @@ def excite(
     wanted = read_goals(settings, given, condition)
     report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
     search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
-    found, problem = _searched(problem, wanted, settings.starts, search, say)
-    say("verifying")
-    found, problem = _whole(found, problem, settings.rate)
-    with finishing():
-        found, proof = ensured(problem, found, checked)
+    try:
+        found, problem = _searched(problem, wanted, settings.starts, search, say)
+        say("verifying")
+        found, problem = _whole(found, problem, settings.rate)
+        with finishing():
+            found, proof = ensured(problem, found, checked)
+    except NothingFeasible as error:
+        raise located(error) from error
     front = None
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
@@ -271,7 +275,7 @@ def _constraints(
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return what the search keeps, and what is verified: the torque with the model's own Coulomb sign."""
     if dynamics.values is None or not np.isfinite(limits.torque).any():
-        return limits.constraints, limits.constraints, ("no torque limit is checked",)
+        return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()
     if margin is None:
         margin = 0.0 if dynamics.friction else GUARD

@@ -17,6 +17,7 @@ from calib.folders import METRICS, check_target, write_staged
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.design import INSTANTS, Designed
+from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.planning import Planned
 from calib.robot.tables import dumps
 from calib.units import motion_units
@@ -54,14 +55,15 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
 
     def write(folder: Path) -> None:
         period, played = _one_period(designed), designed.playback
-        chain = designed.inputs.chain
-        _write_setpoints(period, folder / coefficients.SAMPLES)
-        files.write(folder / coefficients.NAME, dumps(coefficients.table(_periodic(designed), chain.name)))
+        chain, bounds = designed.inputs.chain, designed.inputs.limits.bounds
+        _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
+        series = coefficients.table(_periodic(designed), chain.name, bounds.lines())
+        files.write(folder / coefficients.NAME, dumps(series))
         longer = played.approach is not None or played.repeat > 1
-        _write_optional(played.run if longer else None, folder / coefficients.RUN)
-        _write_optional(played.approach, folder / "approach.csv")
-        _write_optional(played.rehearsal, folder / REHEARSAL)
-        _write_messages(played.run, chain.joint_names, folder, max(1, round(period.rate / MESSAGES)))
+        _write_optional(played.run if longer else None, bounds, folder / coefficients.RUN)
+        _write_optional(played.approach, bounds, folder / "approach.csv")
+        _write_optional(played.rehearsal, bounds, folder / REHEARSAL)
+        _write_messages(played.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
             draw(designed, folder)
         if designed.front is not None and len(designed.front.values):
@@ -82,10 +84,10 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
     """
 
     def write(folder: Path) -> None:
-        _write_setpoints(planned.track, folder / coefficients.PLANNED)
-        _write_messages(planned.track, planned.chain.joint_names, folder)
-        _write_optional(planned.approach, folder / "approach.csv")
-        _write_optional(planned.rehearsal, folder / REHEARSAL)
+        _write_setpoints(planned.track, planned.bounds, folder / coefficients.PLANNED)
+        _write_messages(planned.track, planned.bounds, folder)
+        _write_optional(planned.approach, planned.bounds, folder / "approach.csv")
+        _write_optional(planned.rehearsal, planned.bounds, folder / REHEARSAL)
         if draw is not None:
             draw(planned, folder)
         files.write_json(folder / METRICS, plan_metrics(planned))
@@ -93,23 +95,25 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
     return write_staged(out, ALL, write)
 
 
-def _write_setpoints(track: Setpoints, path: Path) -> Path:
-    """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller."""
+def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:
+    """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller, below what limits the motion."""
+    bounds.check(track)
     parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
     header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
-    return files.write_numbers(path, header, np.column_stack([track.times, *parts.values()]))
+    return files.write_numbers(path, header, np.column_stack([track.times, *parts.values()]), notes=bounds.lines())
 
 
-def _write_optional(track: Setpoints | None, path: Path) -> None:
+def _write_optional(track: Setpoints | None, bounds: MotionBounds, path: Path) -> None:
     if track is not None:
-        _write_setpoints(track, path)
+        _write_setpoints(track, bounds, path)
 
 
-def _write_messages(track: Setpoints, joint_names: Sequence[str], folder: Path, every: int = 1) -> None:
+def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every: int = 1) -> None:
     """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), one sample of `every`."""
-    message = joint_trajectory(track, joint_names, every)
-    files.write(folder / "trajectory.json", to_json(message))
-    files.write(folder / "trajectory.yaml", to_yaml(message))
+    bounds.check(track)
+    message = joint_trajectory(track, [joint.name for joint in bounds.joints], every)
+    files.write(folder / "trajectory.json", to_json(message))  # which has no place for remarks
+    files.write(folder / "trajectory.yaml", files.remarks(bounds.lines()) + to_yaml(message))
 
 
 def _one_period(designed: Designed) -> Setpoints:
@@ -161,6 +165,7 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
             "approach": _seconds(designed.playback.approach), "rehearsal": _seconds(designed.playback.rehearsal),
         },
         "prediction": None if designed.outlook is None else prediction.table(designed.outlook),
+        "limits": given.limits.bounds.lines(),
         "notes": list(designed.notes),
     }  # fmt: skip
 
@@ -192,7 +197,7 @@ def design_lines(designed: Designed) -> list[str]:
     parts.append(f"{played.repeat} period{'s' if played.repeat > 1 else ''}")
     result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
     result += [] if designed.outlook is None else prediction.lines(designed.outlook)
-    return result + [f"note: {note}" for note in designed.notes]
+    return [*result, *designed.inputs.limits.bounds.lines(), *(f"note: {note}" for note in designed.notes)]
 
 
 def _together(designed: Designed) -> list[str]:
@@ -236,16 +241,16 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
         "torque_sigma": None if planned.sigma is None else planned.sigma.tolist(),
         "torque_limits": [float(x) if np.isfinite(x) else None for x in planned.limits.torque],
         "approach": _seconds(planned.approach),
+        "limits": planned.bounds.lines(),
         "notes": list(planned.notes),
     }  # fmt: skip
 
 
 def plan_lines(planned: Planned) -> list[str]:
     """Return what a person wants to read at the end."""
-    crossed = "none" if np.isfinite(planned.limits.velocity).all() else "none that is known"
     words = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; some limit is within {ACTIVE:.0%} of being "
-        f"reached for {_active_share(planned):.1%} of the time, {crossed} is crossed at "
+        f"reached for {_active_share(planned):.1%} of the time, none is crossed at "
         f"{_verified(planned)} instants",
         "smallest margins:",
     ]
@@ -258,7 +263,7 @@ def plan_lines(planned: Planned) -> list[str]:
         words.append(f"the path's own shape: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
     if planned.deviation is not None:
         words.append(f"the tool keeps its lines to {1e6 * planned.deviation[0]:.2g} µm")
-    return words + [f"note: {note}" for note in planned.notes]
+    return [*words, *planned.bounds.lines(), *(f"note: {note}" for note in planned.notes)]
 
 
 @dataclass(frozen=True)

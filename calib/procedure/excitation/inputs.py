@@ -147,8 +147,6 @@ def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimit
             for one in terms
         ]  # fmt: skip
         values = np.concatenate([standard_parameters(chain), own])
-    else:
-        notes.append("the robot's masses are not known: torques are not limited")
     friction = limits.friction is not None
     if values is not None and not friction:
         notes.append("friction is not known (no model, no [friction]): torques are predicted without it")

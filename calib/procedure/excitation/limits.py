@@ -8,7 +8,7 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
     [velocity]                       # moduli; default the robot's own
     q1 = "90 deg/s"
     share = 0.9                      # of the limits, those of the robot included
-    [acceleration]                   # default: none
+    [acceleration]                   # default: where no torque limit counts, 2/s times the speed limit; none of plans
     all = 8.0
     [jerk]
     all = 100.0
@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,17 +39,32 @@ from calib.config import check_keys, parse, read_toml, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
+from calib.procedure.excitation.motion_bounds import (
+    DEFAULT_ORIGIN,
+    DEFAULT_RISE,
+    MAX_ACCELERATION,
+    MAX_TORQUE,
+    PLACE,
+    MotionBounds,
+)
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
-from calib.robot.chain import Chain, Joint
+from calib.robot.chain import Chain
 from calib.robot.description_checks import impossible_bodies
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
+from trajectories.errors import NothingFeasible
 from trajectories.places import Clearance, Workspace
 
 MARGINS = ("margin", "deviations")  # keys of [torque] that are no joint's
+STATED_IN = {
+    "position": "[joints]", "velocity": "[velocity]", "acceleration": "[acceleration]", "jerk": "[jerk]",
+    "torque": "[torque] (a joint's, or margin)", "workspace": "[target] (height, axis_distance) and [[point]]",
+    "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
+}  # fmt: skip
+"""Tables of the limits file by the name of the constraint."""
 
 
 @strict
@@ -100,7 +114,8 @@ class MotionLimits:
 
     Attributes:
         constraints: all but torque.
-        torque: (n,) limits [N m or N]; infinite where there is none.
+        bounds: of speed, acceleration and torque, each joint's.
+        torque: (n,) limits [N m or N], whether a model predicts torques or not; infinite where there is none.
         margin, deviations: of the torque limit; `margin` None where the file does not say.
         friction: (2, n) Fv and Fc; None where the file does not say.
         resonance: [rad/s] or None.
@@ -108,6 +123,7 @@ class MotionLimits:
     """
 
     constraints: tuple[MotionConstraint, ...]
+    bounds: MotionBounds
     torque: np.ndarray
     margin: float | None
     deviations: float
@@ -141,8 +157,8 @@ def read_motion_limits(
             are known.
 
     Raises:
-        UsageError: for an unknown key or a value that a key cannot have, and for limits of 0 or below in the robot's
-            description in whose place nothing is stated.
+        UsageError: for an unknown key or a value that a key cannot have, and where nothing limits speeds, or
+            accelerations and torques (`MotionBounds`).
     """
     stated = LimitsFile() if path is None else parse(LimitsFile, read_toml(path), str(path))
     where, own = str(path or "limits"), stated.torque
@@ -153,13 +169,13 @@ def read_motion_limits(
     speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
     velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
     acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
+    acceleration = np.full(chain.n, np.inf) if acceleration is None else acceleration
     jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
     amounts = {key: value for key, value in own.items() if key not in MARGINS}
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
-    needed = {"velocity": velocity}
-    if predicted or chain.inertias is not None:
-        needed["effort"] = torque
-    unlimited = check_stated(chain.joints, needed, str(source or chain.name))
+    counted = torque if predicted or chain.inertias is not None else np.full(chain.n, np.inf)
+    sizes = velocity, acceleration, counted
+    bounds = _bounds(chain, str(source or chain.name), stated, path, sizes, default=not given_way)
     margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
@@ -169,20 +185,28 @@ def read_motion_limits(
     points = _points(stated.point, chain, where)
     friction = _friction(stated.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    boxes = box_limits(found.lower, found.upper, velocity, acceleration, jerk, linear=linear)
+    boxes = box_limits(found.lower, found.upper, velocity, bounds.acceleration, jerk, linear=linear)
     constraints: list[MotionConstraint] = [*boxes]
     constraints += _places(stated, found, points)
     if found.collision is not None:
         constraints.append(_clearance(found))
-    notes = [*found.notes, *unlimited]
+    notes = list(found.notes)
     if found.collision is None:
         notes.append(_unchecked(path))
     else:
         sets = (("kept", found.checked), ("NOT checked", found.unchecked))
         notes += [f"{words}: {', '.join(names)}" for words, names in sets if names]
     return MotionLimits(
-        tuple(constraints), torque, margin, deviations, friction, stated.frequency.resonance, tuple(notes)
+        tuple(constraints), bounds, torque, margin, deviations, friction, stated.frequency.resonance, tuple(notes)
     )
+
+
+def located(error: NothingFeasible) -> NothingFeasible:
+    """Return the error with the place where a user can change the limit that no motion keeps."""
+    if error.constraint not in STATED_IN:
+        return error
+    place = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
+    return NothingFeasible(f"{error}; {place}", error.constraint, error.excess, error.unit)
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:
@@ -198,36 +222,23 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
         )
 
 
-def check_stated(joints: Sequence[Joint], bounds: Mapping[str, np.ndarray], where: str, file: bool = True) -> list[str]:
-    """Return in words which joints have no limit of speed (of torque), where nothing was written for one.
+def _bounds(
+    chain: Chain, robot: str, stated: LimitsFile, path: Path | None, sizes: Sequence[np.ndarray], default: bool
+) -> MotionBounds:
+    """Return the bounds of a motion's joints; by default accelerations that nothing else limits have some.
 
     Args:
-        joints: n of them.
-        bounds: by ``velocity`` and ``effort``, (n,) with what a limits file states; only the ones that count.
-        where: the robot's file, for messages.
-        file: whether a limits file may state them.
-
-    Raises:
-        UsageError: where something was written that is none, and no limits file says better.
+        sizes: (n,) largest velocities, accelerations, torques.
     """
-    notes = []
-    for what, table, units in (
-        ("velocity", "velocity", ("90 deg/s", "0.5 m/s")), ("effort", "torque", ("100 Nm", "100 N"))
-    ):  # fmt: skip
-        free = [joint for joint, bound in zip(joints, bounds.get(what, ())) if np.isinf(bound)]
-        unstated = [(one, words) for one in free for words in one.unstated if words.startswith(what)]
-        for joint, wrong in unstated[:1]:
-            unit = units[joint.kind != "revolute"]
-            advice = f'or state it in a limits file: [{table}] {joint.name} = "{unit}"' if file else f"such as {unit}"
-            raise UsageError(
-                f"{where}, joint '{joint.name}': {wrong} is no limit, and no motion is designed without one; correct "
-                f"it there, {advice}"
-            )
-        if free:
-            names = ", ".join(joint.name for joint in free)
-            place = f"in a limits file ([{table}])" if file else f"in the robot's file ({what})"
-            notes.append(f"no {table} limit is known of {names}: NOT limited; state it {place}")
-    return notes
+    velocity, acceleration, torque = sizes
+    tables = {"velocity": stated.velocity, "torque": stated.torque}
+    origin = {kind: f"robot description, {path}" if table else "robot description" for kind, table in tables.items()}
+    origin["acceleration"] = str(path)
+    free = (acceleration > MAX_ACCELERATION) & (torque > MAX_TORQUE)
+    if default and free.any():
+        origin["acceleration"] = DEFAULT_ORIGIN if np.isinf(acceleration).all() else f"{path}, or {DEFAULT_ORIGIN}"
+        acceleration = np.where(free, DEFAULT_RISE * velocity, acceleration)
+    return MotionBounds(robot, chain.joints, velocity, acceleration, torque, origin)
 
 
 def _unchecked(path: Path | None) -> str:
@@ -313,12 +324,7 @@ def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionCon
 
 def _clearance(found: Limits) -> Clearance:
     names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
-    return Clearance(found.collision.distances, partial(_distance_product, found.collision), names, found.clearance)
-
-
-def _distance_product(collision: Any, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return the slopes (N, n) of Σ G · distances."""
-    return np.einsum("mk,mkn->mn", G, collision.gradients(q))
+    return Clearance(found.collision.distances, found.collision.gradients, names, found.clearance)
 
 
 def _per_joint(

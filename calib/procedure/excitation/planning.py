@@ -21,6 +21,7 @@ from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.torque_uncertainty import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
+from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.playback import approach_to, check_slower
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
@@ -72,7 +73,8 @@ class Planned:
 
     Attributes:
         chain: the robot, and `law`: its dynamics; None where its masses are not known.
-        limits, lower, upper: what the motion keeps.
+        bounds: what limits its speed and acceleration, and where that is stated.
+        limits, lower, upper: what the motion keeps, margins of torque taken off.
         timings: one per path: a single one through all waypoints, or one per tool line.
         track: the motion at the controller's rate.
         margins: (n,) to the joint limits [rad or m].
@@ -86,6 +88,7 @@ class Planned:
 
     chain: Chain
     law: PathDynamics | None
+    bounds: MotionBounds
     limits: TimingLimits
     lower: np.ndarray
     upper: np.ndarray
@@ -132,7 +135,7 @@ def plan(
     chain, source = load_rigid(robot, waypoints, base, tip)
     known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
-    lower, upper, bounds = _bounds(chain, known, law)
+    lower, upper, bounds = known.positions.lower, known.positions.upper, _timing_limits(known)
     arm = chain if model is None else read_dynamics(model)[0]
     points = read_waypoints(waypoints, arm, lower, upper, settings.start)
     say("the path")
@@ -152,11 +155,12 @@ def plan(
     timings, bounds, sigma = _timed(paths, bounds, law, uncertain, known.deviations, chain, settings.rate)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
+    known.bounds.check(motion)
     lead, remarks = None, ()
     if settings.start is not None:
         lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
     return Planned(
-        chain, law, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
+        chain, law, known.bounds, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
         slowed(motion, settings.slower) if settings.slower != 1 else None, sigma, (*known.notes, *notes, *remarks),
     )  # fmt: skip
 
@@ -230,7 +234,7 @@ def _law(
         if known.friction is not None and not stated:
             stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
         if chain.inertias is None:
-            return None, ("the robot's masses are not known: torques are not limited",), None
+            return None, (), None
         check_bodies(chain, known.torque)
         values = np.column_stack([stated.get(key, np.zeros(chain.n)) for key in DRIVES])
     except RobotError as error:
@@ -271,18 +275,10 @@ def _guarded(bounds: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLi
     return replace(bounds, torque=bounds.torque - margin)
 
 
-def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tuple[np.ndarray, np.ndarray, TimingLimits]:
-    """Return joint limits and the limits of timing."""
-    boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
-    free = np.full(chain.n, np.inf)
-    sizes = [boxes[order].upper if order in boxes else free for order in (1, 2)]
+def _timing_limits(known: MotionLimits) -> TimingLimits:
+    """Return the limits of timing."""
     margin = known.margin or 0.0
-    if not 0 <= margin < 1:
-        raise UsageError(f"torque margin {margin:g}: expected a share of the limits from 0 to below 1")
-    torque = known.torque * (1 - margin) if law is not None else free
-    if not any(np.isfinite(x).any() for x in (*sizes, torque)):
-        raise UsageError(f"robot '{chain.name}' has no limits of speed, acceleration or torque; state them (limits)")
-    return known.positions.lower, known.positions.upper, TimingLimits(sizes[0], sizes[1], torque)
+    return TimingLimits(known.bounds.velocity, known.bounds.acceleration, known.bounds.torque * (1 - margin))
 
 
 def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPath], np.ndarray | None]:

@@ -14,6 +14,7 @@ from calib.dynamics.base import BaseModel
 from calib.errors import UsageError
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
 from calib.procedure.excitation.limits import MotionLimits
+from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.chain import Chain
 from trajectories.approach import straight_approach
@@ -24,7 +25,7 @@ from trajectories.design.verify import dense_motion
 from trajectories.places import Clearance
 from trajectories.setpoints import Setpoints, joined, slowed
 
-ACCELERATION, JERK = 2.0, 20.0  # of an approach, per s and s² times the velocity limit, where nothing else is said
+RISE, JERK = DEFAULT_RISE, 20.0  # of an approach, per s and s² times its speed, where nothing else is said
 LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
 BLOCK = 4000
 
@@ -127,7 +128,7 @@ def approach_to(
     velocity = np.minimum(sizes.get(1, free), LEISURE)
     acceleration, jerk = (
         np.where(np.isfinite(sizes.get(order, free)), sizes.get(order, free), factor * velocity)
-        for order, factor in ((2, ACCELERATION), (3, JERK))
+        for order, factor in ((2, RISE), (3, JERK))
     )
     found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
     notes = [_place(one, found) for one in known.constraints if not isinstance(one, BoxLimit)]

@@ -28,6 +28,7 @@ from calib.errors import UsageError
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
+from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
 from calib.procedure.sigma_comparison import compare_sigmas
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
@@ -41,7 +42,6 @@ PERIODS = (5.0, 10.0, 20.0, 40.0)
 TOLD = 0.3  # a parameter that is known to so much of its value is told (our choice)
 INSTANTS = 500  # over a period
 TASK = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
-RISE = 2.0  # accelerations [1/s] times the speed (our choice, as of measuring runs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
     q, v, a = low + (high - low) * rng.random((TASK, n)), *(2.0 * rng.random((2, TASK, n)) - 1.0)
     for j, value in given.locked.items():
         q[:, j], v[:, j], a[:, j] = 0.0 if value is None else value, 0.0, 0.0
-    return _columns(given, given.model.exact.regressor(q, fast * v, RISE * fast * a))
+    return _columns(given, given.model.exact.regressor(q, fast * v, DEFAULT_RISE * fast * a))
 
 
 def _columns(given: ExcitationInputs, Y: np.ndarray) -> np.ndarray:

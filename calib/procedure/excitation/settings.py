@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from calib.arguments import Within, checked
+from calib.errors import UsageError
 
 Rate = Annotated[float, Within(above=0.0, most=1e5)]  # [Hz]
 Slower = Annotated[float, Within(1.0, 1000.0)]
@@ -70,7 +71,7 @@ class ExcitationSettings:
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
-            raise _refusal(f"family '{self.family}' is none of {', '.join(FAMILIES)}")
+            raise UsageError(f"family '{self.family}' is none of {', '.join(FAMILIES)}")
         for text in (*self.goals, *self.hard):
             if text not in AIMS or text in self.hard:
                 split_goal(text)
@@ -86,16 +87,10 @@ def split_goal(text: str) -> tuple[str, float]:
     try:
         value = float(amount)
     except ValueError:
-        raise _refusal(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
+        raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
     if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
-        raise _refusal(f"goal '{text}': '{name}' is none of {', '.join(GOALS)}, joint1 …")
+        raise UsageError(f"goal '{text}': '{name}' is none of {', '.join(GOALS)}, joint1 …")
     return name, value
-
-
-def _refusal(words: str) -> Exception:
-    from calib.errors import UsageError  # numpy behind it: the command line makes its defaults here, and is quick
-
-    return UsageError(words)
 
 
 DEFAULT_DESIGN = ExcitationSettings()

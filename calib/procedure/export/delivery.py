@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from calib import files
 from calib.errors import RobotError, UsageError
-from calib.folders import check_target, write_staged
+from calib.folders import DRIVES, JOINT_ORIGINS, MJCF, OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry
 from calib.procedure.export.geometry import results
-from calib.procedure.export.parameters import PARAMETERS
-from calib.procedure.findings import LEVELS
+from calib.procedure.export.identified import ExportedPrediction
+from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import (
     CORRECTED_URDF,
     FORMULA,
@@ -27,13 +28,26 @@ from calib.robot.calibrated import ROBOT
 from calib.robot.description_checks import impossible_bodies
 from calib.robot.formats.markup import with_comment
 
+README = "README.txt"
 COPIED = (ROBOT, TERMS, FORMULA)
-OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"
+UR_KINEMATICS = "ur_kinematics.yaml"
 WRITTEN = (*COPIED, URDF, CORRECTED_URDF, OFFSETS, UR_KINEMATICS)
-DYNAMICS = "dynamics"  # where they are, if on another geometry than robot.urdf's
 MARKS = (OFFSETS, PARAMETERS)  # by which an earlier export is known, of a geometry or of dynamics
-SAID = {"fail": "; do not use", "marginal": ""}  # verdicts that the exported files state, and what is added to them
-FIRST = tuple(f"verdict {level}: " for level in SAID)  # how a README.txt of ours begins; another's is left alone
+USES = {
+    URDF: "for ROS, MoveIt and simulators; if in doubt, take this one",
+    CORRECTED_URDF: f"only for programs that apply {TERMS}, worse than {URDF} without them; masses as in the source",
+    TERMS: "small corrections of each joint, which no URDF can hold",
+    FORMULA: "how to apply them",
+    ROBOT: "for this toolkit: geometry with covariance, and the corrections",
+    OFFSETS: "for the controller: joint offsets to add to its mastering; the rest of the geometry left out",
+    UR_KINEMATICS: "for ur_description: kinematics_params_file",
+    MJCF: "for MuJoCo: geometry, masses, motor inertia and friction",
+    DRIVES: "for simulators: motor inertia, friction and offset of each joint, with sigmas",
+    JOINT_ORIGINS: "for tesseract",
+    PARAMETERS: "all parameters of geometry and dynamics with covariances",
+}
+MARKED = (URDF, CORRECTED_URDF, MJCF, UR_KINEMATICS)  # state their verdict themselves
+CORRECTED, DYNAMIC = (CORRECTED_URDF, TERMS, ROBOT), (URDF, MJCF)
 
 
 def deliver(fit: Path, source: Path, out: Path) -> list[str]:
@@ -48,7 +62,7 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         What was written, in words.
     """
     notes: list[str] = []
-    write_staged(out, WRITTEN, lambda staging: notes.extend(_write(fit, source, staging)))
+    write_staged(out, USES, lambda staging: notes.extend(_write(fit, source, staging)))
     return notes
 
 
@@ -89,7 +103,7 @@ def _write(fit: Path, source: Path, out: Path) -> list[str]:
     )
     notes = [
         f"robot.urdf: {made}; {read}",
-        *(f"AS THE SOURCE HAS IT: {each}" for each in impossible_bodies(found.chain)),
+        *(f"as the source has it: {each}" for each in impossible_bodies(found.chain)),
     ]
     geometry.export_offsets(found, out / OFFSETS)
     notes.append("robot.toml, joint_offsets.csv")
@@ -101,68 +115,78 @@ def _write(fit: Path, source: Path, out: Path) -> list[str]:
     except (RobotError, UsageError):  # no UR arm
         pass
     if found.corrections is not None:
-        left = geometry.without_corrections(fit)
-        words = f"{TERMS}: what a URDF cannot hold, on top of {CORRECTED_URDF}; formula in {FORMULA}"
-        notes.append(f"{words}; {left}" if left else words)
+        notes.append(f"{TERMS}: what a URDF cannot hold, on top of {CORRECTED_URDF}; formula in {FORMULA}")
     return notes
 
 
-def verdicts(folder: Path) -> dict[str, tuple[str, str]]:
-    """Return verdict and reason of a fit or an identification by its folder; in a session those on unseen rows.
+def verdicts(folder: Path) -> Verdicts:
+    """Return what was judged of a fit or an identification, by its folder; in a session by unseen rows.
 
-    Empty where the folder is of an earlier version and does not say it.
+    Empty where the folder is of an earlier version and does not say it, or where its session has yet to judge it.
     """
     identified = IdentificationFolder(folder)
     validated = ValidationFolder(folder.absolute().parent / VALIDATED)
     try:
         if identified.model.is_file():
             found = identified.unseen.verdict() if identified.unseen.report.is_file() else identified.metrics()
-            return {"dynamics": (found.verdict, found.reason)}
+            return Verdicts({"dynamics": Verdict(found.verdict, found.reason)} if found.verdict else {})
         own = folder.absolute().name == IN_SESSION and validated.judged.is_file()
         judged = validated.metrics() if own else FitFolder(folder).metrics()
     except UsageError:
-        return {}
-    return {"geometry": (judged.verdict, judged.reason)}
+        return Verdicts()
+    return Verdicts({"geometry": Verdict(judged.verdict, judged.reason)} if judged.verdict else {}, judged.deliverables)
 
 
-def worst(verdicts: Mapping[str, tuple[str, str]]) -> str:
-    """Return the worst of the stages' verdicts; empty where there is none."""
-    return max((level for level, _ in verdicts.values()), key=LEVELS.index, default="")
+def by_file(out: Path, found: Verdicts) -> dict[str, Verdicts]:
+    """Return what was judged of each exported file that is there, and that a robot or a simulation may move by."""
+    dynamic = (out / PARAMETERS).exists()
+    return {
+        name: found.of("corrections" if name in CORRECTED else "urdf", dynamic and name in DYNAMIC)
+        for name in (*MARKED, *CORRECTED)
+        if (out / name).exists()
+    }
 
 
-def remark(verdicts: Mapping[str, tuple[str, str]]) -> str:
-    """Return what to say of an export whose worst verdict is no pass: every stage that has it, with the reason."""
-    level = worst(verdicts)
-    if level not in SAID:
-        return ""
-    reasons = (f"{stage}: {reason}" for stage, (own, reason) in verdicts.items() if own == level)
-    return f"verdict {level}: {'; '.join(reasons)}{SAID[level]}"
+def prediction(out: Path) -> ExportedPrediction | None:
+    """Return how well an exported robot predicts torques; None without dynamics, or where that is not known."""
+    path = out / PARAMETERS
+    found = json.loads(path.read_text(encoding="utf-8")).get("prediction") if path.exists() else None
+    return None if found is None else ExportedPrediction(**found)
 
 
-def mark(out: Path, verdicts: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Write a verdict that is no pass at the head of the exported files and into a README.txt; return the words.
+def mark(out: Path, found: Verdicts) -> list[str]:
+    """Write verdicts that are no pass at the head of the exported files, and what each file is for into a README.txt.
 
     Args:
-        out: the folder of the export; where all stages pass an earlier README.txt of ours is removed from it.
-        verdicts: stage to verdict (``pass``, ``marginal``, ``fail``) and reason.
-    """
-    from calib.procedure.export.masses import MJCF  # slow to load, and needed for a verdict that is no pass alone
+        out: the folder of the export.
+        found: what was judged.
 
-    readme = out / "README.txt"
-    ours = not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith(FIRST)
-    words = remark(verdicts)
-    if not words:
-        if ours:
-            readme.unlink(missing_ok=True)
-        return []
-    if ours:
-        inspect = "The files in this folder were exported for inspection only.\n" if worst(verdicts) == "fail" else ""
-        files.write(readme, f"{words}\n{inspect}")
-    names = (URDF, CORRECTED_URDF, MJCF, UR_KINEMATICS)
-    for path in (place / name for place in (out, out / DYNAMICS) for name in names):
-        if path.is_file():
-            mark_file(path, words)
-    return [words]
+    Returns:
+        What does not pass, in words.
+    """
+    judged = by_file(out, found)
+    for name, own in judged.items():
+        if own.remark and name in MARKED:
+            mark_file(out / name, own.remark)
+    readme, known = out / README, prediction(out)
+    if not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith("verdict "):
+        head = [str(found) if found.level else "verdict unknown", *([str(known)] if known else []), ""]
+        files.write(readme, "\n".join([*head, *_uses(out, judged), ""]))
+    aside = {name: own for name, own in judged.items() if name in (URDF, CORRECTED_URDF) and own.level != found.level}
+    lines = [found.remark, *(own.remark and f"{name}: {own.remark}" for name, own in aside.items())]
+    return [line for line in lines if line]
+
+
+def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
+    """Yield what each exported file is for, and the verdict on it."""
+    holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses as in the source"
+    for name, use in USES.items():
+        if (out / name).exists():
+            yield f"{name}: {use}" + (f"; geometry with {holds}" if name == URDF else "")
+            if name in judged and judged[name].level:
+                yield f"    {judged[name]}" if name in (URDF, CORRECTED_URDF) else f"    verdict {judged[name].level}"
+    if (out / PARAMETERS).exists():
+        yield "the geometry alone: calib export FIT --urdf SOURCE.urdf --out robot_geometry_only.urdf"
 
 
 def mark_file(path: Path, words: str) -> None:

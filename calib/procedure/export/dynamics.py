@@ -10,8 +10,10 @@ drives.csv            joint, armature, damping, friction, offset, and the sigma 
                       by hand. A sigma is empty where the model has no such term.
 joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
                       calibration / joints / name / position x y z [m], orientation x y z w.
-parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, and
-                      what consistency cost.
+parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, what
+                      consistency cost, and ``prediction``: unexplained torque [%] by the exported robot (robot.urdf
+                      with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
+README.txt            what each file is for, and the verdict on it.
 
 Masses are those of bodies that can exist (`calib.identification.possible.solve`). What the torques do not tell is drawn
 to the robot's own masses: by the entropic (log-det) prior, which keeps off the border of what can exist; with ``--prior
@@ -26,15 +28,23 @@ as tanh(v / v0).
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from calib import files
-from calib.folders import write_staged
-from calib.procedure.export.identified import IdentifiedRobot, consistency_lines, drive_notes, mass_notes, read
-from calib.procedure.export.masses import MJCF, as_mjcf, as_urdf
-from calib.procedure.export.parameters import PARAMETERS, parameters
+from calib.folders import DRIVES, JOINT_ORIGINS, MJCF, PARAMETERS, write_staged
+from calib.procedure.export.identified import (
+    IdentifiedRobot,
+    consistency_lines,
+    drive_notes,
+    exported_prediction,
+    mass_notes,
+    read,
+)
+from calib.procedure.export.masses import as_mjcf, as_urdf
+from calib.procedure.export.parameters import parameters
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.robot.calibrated import nominal_of
 from calib.robot.formats import urdf_write
@@ -43,7 +53,7 @@ from calib.robot.formats.tesseract import joint_origins
 
 TABLE = ("joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit")
 SIGMAS = ("armature_sigma", "damping_sigma", "friction_sigma", "offset_sigma")
-WRITTEN = (URDF, MJCF, "drives.csv", "joint_origins.yaml", PARAMETERS)
+WRITTEN = (URDF, MJCF, DRIVES, JOINT_ORIGINS, PARAMETERS)
 
 
 def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: str = "entropic") -> list[str]:
@@ -65,18 +75,19 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: st
     content, encoding = (urdf_write.write_new(given.chain), "utf-8") if source is None else text(source)
     where = "the chain's own URDF" if source is None else str(source)
     edited, notes = as_urdf(given, content, where, given.chain if source is None else nominal_of(given.robot))
-    model = as_mjcf(given)
+    model, known = as_mjcf(given), exported_prediction(given, identified)
 
     def write(staging: Path) -> None:
         files.write(staging / URDF, edited.encode(encoding))
         files.write(staging / MJCF, model)
-        _export_drives(given, staging / "drives.csv")
-        files.write_json(staging / PARAMETERS, parameters(given))
+        _export_drives(given, staging / DRIVES)
+        files.write_json(staging / PARAMETERS, parameters(given) | {"prediction": known and asdict(known)})
         if source is not None:
-            files.write(staging / "joint_origins.yaml", joint_origins(content, edited, where))
+            files.write(staging / JOINT_ORIGINS, joint_origins(content, edited, where))
 
     write_staged(out, WRITTEN, write)
     lines = [
+        *([str(known)] if known else []),
         "robot.urdf: joint origins, masses and friction; Pinocchio reads the same poses and torques to 1e-9",
         "robot.xml: MJCF with armature, damping and frictionloss; Pinocchio reads the same poses and torques to 1e-9",
         "drives.csv, parameters.json" + ("" if source is None else ", joint_origins.yaml (tesseract's SRDF)"),

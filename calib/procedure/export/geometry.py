@@ -44,27 +44,6 @@ def read(folder: Path) -> CalibratedChain:
     return robot
 
 
-def without_corrections(folder: Path) -> str:
-    """Return what a fit's metrics say of its URDF without the joint corrections, on the first unseen file, or fitted.
-
-    Empty where the fit has none, or does not say it.
-    """
-    try:
-        metrics = FitFolder(folder).metrics()
-    except UsageError:  # a fit by an earlier version says nothing of it
-        return ""
-    unseen = next(iter(metrics.validation.items()), None)
-    where, found = (f"on {unseen[0]}, unseen", unseen[1]) if unseen else ("on the fitted poses", metrics.fit)
-    bare, after, before = (arm and arm.main for arm in (found.urdf_alone, found.calibrated, found.nominal))
-    if not (bare and after and before):
-        return ""
-    worse = "; THAT IS WORSE THAN THE NOMINAL ARM" if bare.rms > before.rms else ""
-    return (
-        f"{where}, the URDF alone leaves {bare.rms:.3f} mm rms, with its corrections {after.rms:.3f} mm (nominal arm "
-        f"{before.rms:.3f} mm){worse}"
-    )
-
-
 def check_targets(
     folder: Path,
     source: Path | None,

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.bodies import Bodies, bodies_of
-from calib.identification.friction.drive_table import Drives, drive_table
+from calib.identification.friction.drive_table import Drives, drive_table, without_left
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_information
 from calib.identification.possible.solve import PossibleBodies, find_possible
+from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_torques
 from calib.procedure.export import geometry
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -65,19 +66,51 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
     return IdentifiedRobot(geometry.read(folder), information, found, bodies, table)
 
 
+@dataclass(frozen=True)
+class ExportedPrediction:
+    """Unexplained share of the torque [%] on a recording: by the exported robot, and by the identified model."""
+
+    file: str
+    exported: float
+    identified: float
+
+    def __str__(self) -> str:
+        return (
+            f"the exported robot (with drives.csv) leaves {self.exported:.2f} % of the torque unexplained, the "
+            f"identified model {self.identified:.2f} % ({self.file})"
+        )
+
+
+def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
+    """Return how well the exported robot predicts torques, of the worst recording beside the model in `folder`.
+
+    None where these recordings carry payloads or are by a version that did not keep their speeds.
+    """
+    dynamics, found = without_left(given.found.dynamics), []
+    for path in IdentificationFolder(folder).torques:
+        motion = read_torques(path) if path.is_file() else {}
+        if not motion:
+            continue
+        torque = dynamics.model.torque(dynamics.values, motion["q"], motion["v"], motion["a"], ())
+        size = np.linalg.norm(motion["measured"]) / 100.0
+        left = [float(np.linalg.norm(motion["measured"] - one) / size) for one in (torque, motion["predicted"])]
+        found.append(ExportedPrediction(str(path.relative_to(folder)), *left))
+    return max(found, key=lambda one: one.exported, default=None)
+
+
 def consistency_lines(found: PossibleBodies, b: int) -> list[str]:
     """Return what consistency cost, in words."""
     lines = [
-        f"masses of possible bodies: thinnest {1e3 * float(found.margins.min()):.3g} mm (as a standard deviation), "
-        f"{found.distance:.3g} sigmas from the estimate of {b} parameters (95 %: {found.allowed:.3g}); drawn to "
-        f"{found.source}, weight {found.weight:.3g} by the evidence, {found.prior} prior"
+        f"physically consistent inertias, {found.distance:.3g} σ from the estimate of {b} parameters (limit "
+        f"{found.allowed:.3g}); regularised towards {found.source}, weight {found.weight:.3g}, {found.prior} prior; "
+        f"thinnest body {1e3 * float(found.margins.min()):.3g} mm (as a standard deviation)"
     ]
     if not found.possible:
         blamed = ", ".join(f"{name} (without it {left:.3g})" for name, left in found.blamed)
         lines.append(
-            f"THE ESTIMATE IS THAT OF NO POSSIBLE ROBOT: the nearest one is {found.nearest:.3g} sigmas away, beyond "
-            f"{found.allowed:.3g}; most of it by {blamed}. The model does not tell all that the torques hold "
-            "(friction, gains, a payload), or the sigmas are too small"
+            "no physically consistent inertias within the estimate's uncertainty: the nearest are "
+            f"{found.nearest:.3g} σ away (limit {found.allowed:.3g}), mostly by {blamed}: unmodelled friction, gains "
+            "or a payload, or σ too small"
         )
     return [*lines, *found.notes]
 
@@ -98,7 +131,7 @@ def mass_notes(given: IdentifiedRobot) -> list[str]:
                 f"{', '.join(unlike)}; torques tell sums of masses, not each"
             )
     if wrong := impossible_bodies(given.chain):
-        notes.append(f"THE ROBOT'S DESCRIPTION CANNOT BE: {'; '.join(wrong)}")
+        notes.append(f"the robot's own description is not physically consistent: {'; '.join(wrong)}")
     return notes
 
 

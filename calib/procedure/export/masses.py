@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.dynamics import pseudo_inertia, rigid_body
 from calib.errors import RobotError
+from calib.folders import MJCF
 from calib.procedure.export import geometry
 from calib.procedure.export.identified import IdentifiedRobot
 from calib.robot.chain import Chain, random_joints
@@ -18,7 +19,6 @@ from calib.robot.formats.urdf_tree import UrdfTree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert
 
-MJCF = "robot.xml"
 SAME = 1e-9  # of poses [m, and as a rotation matrix] and of torques, relative to the largest
 
 

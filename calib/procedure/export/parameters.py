@@ -10,8 +10,6 @@ import numpy as np
 from calib.procedure.export.identified import IdentifiedRobot
 from calib.robot.calibrated import nominal_of
 
-PARAMETERS = "parameters.json"
-
 
 def parameters(given: IdentifiedRobot) -> dict[str, Any]:
     """Return the content of ``parameters.json``."""

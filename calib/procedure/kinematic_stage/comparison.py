@@ -102,6 +102,11 @@ class Comparison:
     placed_by: tuple[int, int] | None = None
     intervals: Intervals | None = None
 
+    @property
+    def of_urdf(self) -> Comparison:
+        """The nominal arm beside what a URDF holds: no corrections, nor the errors that were expected with them."""
+        return self if self.alone is None else replace(self, errors=(self.errors[0], self.alone), intervals=None)
+
     def table(self) -> dict[str, object]:
         """Return the comparison as ``metrics.json`` holds it."""
         arms = ("nominal", "calibrated")

@@ -89,6 +89,8 @@ class Commands:
         beyond: (m, n) joints outside the range that was measured for the fit; none where that is not known.
         dof: 6, 5 or 3.
         notes: which frames were meant, and what is odd.
+        own: (m, 2) of ``before`` what is the arm's own, its base placed where it fits the measurements best; None where
+            ``before`` is that, or where nobody knows.
     """
 
     q: np.ndarray
@@ -102,6 +104,7 @@ class Commands:
     beyond: np.ndarray
     dof: int
     notes: tuple[str, ...]
+    own: np.ndarray | None = None
 
 
 def read(folder: str | Path) -> Fitted:
@@ -155,11 +158,16 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
     return one, two
 
 
+def _is_placed(fitted: Fitted) -> bool:
+    """Say whether it is known where the nominal robot stood."""
+    return bool(len(fitted.nominal.stations)) and set(fitted.cell.station_names) <= set(fitted.nominal.station_names)
+
+
 def _station(fitted: Fitted, frame: str) -> int:
     names = fitted.cell.station_names
     if frame not in ("nominal", *names):
         raise UsageError(f"frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
-    if set(names) - set(fitted.nominal.station_names):
+    if not _is_placed(fitted):
         raise UsageError(
             f"{fitted.folder} does not say where the nominal robot stood (it was fitted from an earlier fit's folder, "
             "by an earlier version, or without an instrument): frame 'base' is left"
@@ -244,7 +252,13 @@ def compensate(
     if count == 3:
         sigma[:, 1] = np.nan
     words = (_frame_words(fitted, frame), _tool_words(tool), *notes, *_turn_words(fitted, count))
-    return Commands(q, q0, reached, reason, left, missed, sigma, expected, beyond, count, words)
+    own = None
+    if frame == "base" and _is_placed(fitted):
+        placed, real = placements(fitted, "nominal", tool)
+        held = np.clip(q0, lower, upper)
+        goal = Goal(real, count, lower, upper, torques_of(fitted))
+        own = _sizes(inverse.differences(goal, held, see(placed, held).poses()))
+    return Commands(q, q0, reached, reason, left, missed, sigma, expected, beyond, count, words, own)
 
 
 def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, tuple[str, ...]]:
@@ -361,7 +375,7 @@ def _frame_words(fitted: Fitted, frame: str) -> str:
         "base": "targets are in the calibrated robot's base, as robot.toml has it (frame 'base')",
         "nominal": "targets are in the nominal robot's base where it fits the measurements best (frame 'nominal')",
     }[frame]
-    if set(fitted.cell.station_names) - set(fitted.nominal.station_names) or not len(fitted.nominal.stations):
+    if not _is_placed(fitted):
         return words
     between = invert(fitted.nominal.stations[0]) @ fitted.cell.stations[0]
     other = {"base": "the nominal robot's best base", "nominal": "the calibrated robot's base"}[frame]

@@ -63,8 +63,12 @@ def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:
     result += [f"not reached: {int((~good).sum()) - SHOWN} more"] if (~good).sum() > SHOWN else []
     errors = (commands.before, commands.left, commands.sigma)
     before, left, sigma = (_pair(np.sqrt(np.mean(each[good] ** 2, axis=0))) for each in errors)
+    apart = ""
+    if commands.own is not None:
+        own = _pair(np.sqrt(np.mean(commands.own[good] ** 2, axis=0)))
+        apart = f" ({own} are the arm's own, the rest is where its base stands: --frame nominal leaves that out)"
     result += [
-        f"by the calibrated model, rms over {int(good.sum())} targets: {before} without compensation, "
+        f"by the calibrated model, rms over {int(good.sum())} targets: {before} without compensation{apart}, "
         f"{left} with it; sigma of the model {sigma}"
     ]
     result += [_expectation(commands, fitted), *_extrapolation(commands, fitted)]

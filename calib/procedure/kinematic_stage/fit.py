@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -56,8 +56,7 @@ class Outcome:
         unclear: what the data cannot tell, in words.
         findings: what the fit says of itself.
         assessment: both arms on fitted and on unseen rows, and the verdict.
-        seed: that reproduces it.
-        tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+        wanted: how it was fitted and judged.
         expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
         predicted_sigmas: sigmas that were predicted when the poses were chosen, beside those that this fit states.
     """
@@ -69,8 +68,7 @@ class Outcome:
     unclear: tuple[str, ...]
     findings: Findings
     assessment: Assessment
-    seed: int = 0
-    tolerance: float | None = None
+    wanted: FitSettings = field(default_factory=FitSettings)
     expected: ErrorModel | None = None
     predicted_sigmas: tuple[SigmaComparison, ...] = ()
 
@@ -160,7 +158,7 @@ def run(
     expected = learn_errors(found, inputs.fit, torques, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
-    result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)
+    result = assess(arms, inputs, findings, settings, replace(wanted, model=asked))
     return Outcome(
         inputs,
         found,
@@ -169,8 +167,7 @@ def run(
         tuple(map(remark, unidentified(found.fit))),
         findings,
         result,
-        seed,
-        wanted.tolerance,
+        wanted,
         expected,
         () if selection is None else _compared(selection, found.fit),
     )
@@ -186,10 +183,7 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
     settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     fits = outcome.selection
     arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
-    asked = wanted.model or options.model
-    result = assess(
-        arms, inputs, outcome.findings, settings, asked=asked, tolerance=outcome.tolerance, seed=outcome.seed
-    )
+    result = assess(arms, inputs, outcome.findings, settings, replace(wanted, model=wanted.model or options.model))
     return replace(outcome, inputs=inputs, assessment=result)
 
 
@@ -215,6 +209,7 @@ def _found_of(
         notes=(*((said,) if said else ()), *notes, *_blind_note(found.folds.blind)),
         blind=found.folds.blind,
         odd=settled(odd, accepted),
+        rigid_cross_validated=found.rigid_cross_validated,
     )
 
 

@@ -6,7 +6,6 @@ A fit's folder is written whole, beside its place, then moved there. Nothing els
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
-from calib.records import read_record, shielded
+from calib.records import read_json, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
 from calib.robot.chain import Joint
@@ -139,6 +138,13 @@ class FitFolder:
 
 
 @dataclass(frozen=True)
+class _Schema:
+    """By which version a JSON file was written."""
+
+    schema: int = 1
+
+
+@dataclass(frozen=True)
 class _EarlyReport:
     """What ``report.json`` of schema 1 holds of the findings."""
 
@@ -178,25 +184,16 @@ class ValidationFolder:
         files.write_json(self.judged, found.table() | {"schema": SCHEMA})
         return self.metrics()
 
-    def take_over(self, fit: FitMetrics) -> ValidationMetrics:
-        """Write the fit's own verdict, where no validation was asked for."""
-        found = ValidationMetrics({}, fit.verdict, fit.reason, fit.warnings, SCHEMA)
-        files.write_json(self.judged, asdict(found))
-        return found
-
     def metrics(self) -> ValidationMetrics:
         """Read numbers and verdict; of schema 1 the warnings are without the fit's."""
         return _read(ValidationMetrics, self.judged)
 
 
 def _read(kind: type[T], path: Path) -> T:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(content, Mapping) and content.get("schema", 1) > SCHEMA:
-            raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
-        return read_record(kind, content)
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
+    schema = read_json(path, "fit again", _Schema).schema
+    if schema > SCHEMA:
+        raise UsageError(f"{path}: schema {schema} of a later version, this one reads up to {SCHEMA}")
+    return read_json(path, "fit again", kind)
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -244,7 +241,7 @@ def metrics(outcome: Outcome) -> dict[str, object]:
     return {
         "schema": SCHEMA,
         "fit": {"parameters": len(outcome.selection.fit.free), **outcome.fit.table()},
-        "validation": outcome.assessment.table()["validation"],
+        **outcome.assessment.table(),
         "model": outcome.selection.chosen,
         "ladder": [
             {
@@ -253,15 +250,13 @@ def metrics(outcome: Outcome) -> dict[str, object]:
                 "cross_validated_mm": 1e3 * rung.cross_validated,
                 "kept": rung.kept,
                 "note": rung.note,
+                "corrections": rung.corrections,
             }
             for rung in outcome.selection.rungs
         ],
-        "seed": outcome.seed,
+        "seed": outcome.wanted.seed,
         "status": outcome.selection.fit.solution.status.name.lower(),
-        "verdict": outcome.verdict.level,
-        "reason": outcome.verdict.reason,
-        "tolerance_mm": None if outcome.tolerance is None else 1e3 * outcome.tolerance,
-        "warnings": list(outcome.warnings),
+        "tolerance_mm": None if outcome.wanted.tolerance is None else 1e3 * outcome.wanted.tolerance,
         "not_identifiable": list(outcome.unclear),
         "outliers": [
             {
@@ -288,8 +283,8 @@ def _record(outcome: Outcome) -> dict[str, object]:
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],
         "model": outcome.selection.chosen,
-        "seed": outcome.seed,
-        "verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}",
+        "seed": outcome.wanted.seed,
+        **({"verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}"} if outcome.verdict.level else {}),
         "covariance": COVARIANCE,
     }
 

@@ -28,7 +28,6 @@ from calib.robot.deflection import Deflection
 from calib.robot.description_checks import remarks
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.kinematics import forward
 from calib.robot.load import load, resolve
 
 
@@ -249,7 +248,7 @@ def _checked(
 ) -> list[PoseMeasurements]:
     blocks = [complete_camera(chain, each, like) if isinstance(each, Pixels) else each for each in blocks]
     for block in blocks:
-        check_scale(block, forward(chain, block.q))  # unseen files, too: the fit looks at its own only
+        check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
     return blocks
 

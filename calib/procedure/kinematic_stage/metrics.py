@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from calib.geometry.uncertainty.error_model import Discrepancy
-from calib.procedure.findings import Finding
+from calib.procedure.findings import Finding, Verdict
 from calib.procedure.sigma_comparison import SigmaComparison
 
 
@@ -112,16 +112,21 @@ class ComparedRows:
     parameters: int = 0
     interval95: _IntervalCoverage | None = None
 
+    def judged(self, deliverable: str) -> _ArmErrors:
+        """Return the errors of what is to be delivered."""
+        return self.calibrated if deliverable != "urdf" or self.urdf_alone is None else self.urdf_alone
+
 
 @dataclass(frozen=True)
 class LadderStep:
-    """One model tried, with its error on rows left out."""
+    """One model tried, with its error on held-out rows; of its parameters `corrections` are shrunk by a ridge."""
 
     model: str
     parameters: int
     cross_validated_mm: float | None
     kept: bool
     note: str = ""
+    corrections: int = 0
 
 
 @dataclass(frozen=True)
@@ -150,6 +155,7 @@ class Findings:
         loss: that was used; empty where it is not known.
         notes: what a user should know of the fit, whatever the unseen rows are.
         blind: stations whose rows were left out by regions only, since the others do not tell where their tool is.
+        rigid_cross_validated: the error of the best model without joint corrections [m].
         discrepancy: what makes an error at a pose likely, learnt on rows left out; None where nothing was.
         odd: what cannot be of this arm, see `calib.procedure.kinematic_stage.plausibility`.
     """
@@ -165,17 +171,25 @@ class Findings:
     blind: tuple[str, ...] = ()
     odd: tuple[Finding, ...] = ()
     discrepancy: Discrepancy | None = None
+    rigid_cross_validated: float | None = None
 
 
 @dataclass(frozen=True)
 class ValidationMetrics:
-    """What holding a fit against unseen rows came to: their errors, the verdict, what to know."""
+    """What holding a fit against unseen rows came to: their errors, the verdict, what to know.
+
+    Attributes:
+        deliverables: the verdict on each of `calib.procedure.kinematic_stage.settings.DELIVERABLES` that there is.
+        deliverable: which of them `verdict` and `reason` are about; empty in files of earlier versions.
+    """
 
     validation: Mapping[str, ComparedRows]
     verdict: str
     reason: str
     warnings: tuple[str, ...]
     schema: int = 1
+    deliverables: Mapping[str, Verdict] = field(default_factory=dict)
+    deliverable: str = ""
 
 
 @dataclass(frozen=True)
@@ -196,6 +210,8 @@ class FitMetrics:
     findings: Findings | None = None
     predicted_sigmas: tuple[SigmaComparison, ...] = ()
     schema: int = 1
+    deliverables: Mapping[str, Verdict] = field(default_factory=dict)
+    deliverable: str = ""
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:

@@ -11,6 +11,7 @@ from calib.data.poses.fit_options import FINEST, LOSSES, MODELS
 from calib.errors import UsageError
 from calib.procedure.measuring.run import DEFAULT_RUN, RunSettings
 
+DELIVERABLES = ("urdf", "corrections")  # what a verdict is about: robot.urdf alone, or with joint_corrections.csv
 Place = Annotated[float, Within(-100.0, 100.0)]  # of a target in the tip's frame [m]
 Sigma = Annotated[float, Within(least=FINEST, most=10.0)]  # [m or rad]
 
@@ -34,6 +35,8 @@ class FitSettings:
         holdout: share of each file's poses kept from the fit: the last of ``default_rng(seed).permutation(poses)``.
         refit_frames: validation files get a base and tool placement of their own.
         tolerance: largest rms on unseen poses that is good enough [m]; None: none is stated.
+        deliverable: what the verdict is about: ``urdf`` (robot.urdf alone) or ``corrections`` (with the joint
+            corrections, where there are any).
         seed: of everything random.
 
     Raises:
@@ -48,6 +51,7 @@ class FitSettings:
     holdout: float = 0.0
     refit_frames: bool = False
     tolerance: float | None = None
+    deliverable: str = DELIVERABLES[0]
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -56,6 +60,7 @@ class FitSettings:
             ("loss", (None, *LOSSES)),
             ("stations", ("each", "one")),
             ("tools", ("one", "each")),
+            ("deliverable", DELIVERABLES),
         ):
             _refuse_other(option, getattr(self, option), allowed)
         if not 0.0 <= self.holdout < 1.0:

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,14 @@ from calib.procedure.kinematic_stage.comparison import (
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, judge
 from calib.robot.chain import Chain
 from calib.transforms import invert
 
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 GROSS = 8.0  # our choice
+ARM = {"urdf": "URDF alone", "corrections": "with joint corrections"}
 PLACES = tuple(
     f"{name} [{unit}]"
     for head, unit in (("", "m"), ("to_nominal_", "mm"), ("to_calibrated_", "mm"))
@@ -66,14 +69,18 @@ class Assessment:
     Attributes:
         fit: on the fit's rows.
         validation: on unseen rows, by file name.
-        verdict: pass, marginal or fail, with its reason.
+        verdict: on what is to be delivered, with its reason.
         warnings: what a user should know, of the inputs, the fit and the unseen rows.
+        deliverables: the verdict on each deliverable that there is (`DELIVERABLES`).
+        deliverable: which of them `verdict` is about.
     """
 
     fit: Comparison
     validation: Mapping[str, Comparison]
     verdict: Verdict
     warnings: tuple[str, ...]
+    deliverables: Mapping[str, Verdict]
+    deliverable: str
 
     def table(self) -> dict[str, Any]:
         """Return the unseen rows, the verdict and the warnings as ``metrics.json`` holds them."""
@@ -82,6 +89,8 @@ class Assessment:
             "verdict": self.verdict.level,
             "reason": self.verdict.reason,
             "warnings": list(self.warnings),
+            "deliverables": {name: asdict(one) for name, one in self.deliverables.items()},
+            "deliverable": self.deliverable,
         }
 
 
@@ -90,10 +99,7 @@ def assess(
     inputs: Inputs,
     findings: Findings,
     settings: Settings,
-    *,
-    asked: str,
-    tolerance: float | None = None,
-    seed: int = 0,
+    wanted: FitSettings,
 ) -> Assessment:
     """Compare both arms on fitted and on unseen rows, and judge.
 
@@ -102,35 +108,62 @@ def assess(
         inputs: the rows.
         findings: what the fit says of itself.
         settings: of the fit, as asked for; the loss is the one that the fit chose.
-        asked: the model asked for.
-        tolerance: largest rms on unseen poses that is good enough [m].
-        seed: of the pairs whose distances are compared.
+        wanted: the model asked for, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
     both, settings = (arms.nominal, arms.calibrated), settings.combine(loss=findings.loss or settings.loss)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
-    fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
+    fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, wanted.seed, alone=alone)
     validation = {
-        name: compare_unseen(*both, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone, arms.expected)
+        name: compare_unseen(
+            *both, unseen, lambda b: gravity_of(inputs.chain, b), settings, wanted.seed, alone, arms.expected
+        )
         for name, unseen in inputs.unseen.items()
     }
-    verdict = judge(
-        fitted, validation, model=findings.model, asked=asked, cross_validated=findings.cross_validated,
-        outlier_share=findings.outlier_share, unexplained=findings.unexplained, tolerance=tolerance,
-        nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach, blind=findings.blind,
-    )  # fmt: skip
-    verdict = verdict.held_by(findings.odd)
+    judged = judge_deliverables(fitted, validation, findings, wanted)
     if copies := _copies(inputs):
-        verdict = replace(verdict, reason=f"not unseen: {', '.join(copies)}; {verdict.reason}")
-    clause, loud = urdf_alone(fitted, validation)
-    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
+        seen = f"not unseen: {', '.join(copies)}"
+        judged = {name: replace(one, reason=f"{seen}; {one.reason}") for name, one in judged.items()}
+    chosen = wanted.deliverable if wanted.deliverable in judged else "urdf"
+    verdict = judged[chosen]
+    for other in judged.keys() - {chosen}:
+        said = f"{ARM[other]} {1e3 * _worst(validation, findings, other):.3f} mm: {judged[other].level}"
+        verdict = replace(verdict, reason=f"{verdict.reason}; {said}")
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     warnings = (
-        *loud, *(one.told for one in findings.odd),
+        *(one.told for one in findings.odd),
         *inputs.notes, *(note for block in blocks for note in block.notes), *_elsewhere(fitted, validation),
         *findings.notes, *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
     )  # fmt: skip
-    return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
+    return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)), judged, chosen)
+
+
+def judge_deliverables(
+    fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, wanted: FitSettings
+) -> dict[str, Verdict]:
+    """Return the verdict on each deliverable: on robot.urdf alone and, where there are any, with joint corrections."""
+    common = partial(
+        judge, model=findings.model, asked=wanted.model or "auto", outlier_share=findings.outlier_share,
+        unexplained=findings.unexplained, tolerance=wanted.tolerance, reach=findings.reach, blind=findings.blind,
+        nominal_cross_validated=findings.nominal_cross_validated,
+    )  # fmt: skip
+    if fit.alone is None:
+        found = {"urdf": common(fit, validation, cross_validated=findings.cross_validated)}
+    else:
+        bare = {name: each.of_urdf for name, each in validation.items()}
+        found = {
+            "urdf": common(fit.of_urdf, bare, cross_validated=findings.rigid_cross_validated, arm=ARM["urdf"]),
+            "corrections": common(fit, validation, cross_validated=findings.cross_validated, arm=ARM["corrections"]),
+        }
+    return {name: one.held_by(findings.odd) for name, one in found.items()}
+
+
+def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
+    """Return the largest rms error of a deliverable on unseen rows; without any, that by cross-validation [m]."""
+    alone = deliverable == "urdf"
+    sizes = [_rms((each.of_urdf if alone else each).errors[1]) for each in validation.values() if each.proves]
+    by_folds = findings.rigid_cross_validated if alone else findings.cross_validated
+    return max(sizes, default=np.nan if by_folds is None else by_folds)
 
 
 def _copies(inputs: Inputs) -> list[str]:
@@ -152,29 +185,6 @@ def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
     """Return the nominal arm, corrections that came with it included, base and tool placement fitted for it."""
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings, torques).cell
-
-
-def urdf_alone(fit: Comparison, validation: Mapping[str, Comparison]) -> tuple[str, list[str]]:
-    """Say what the URDF without joint corrections leaves, and warn where that is worse than the nominal arm.
-
-    Returns:
-        A clause for the verdict, empty where there are no corrections; and warnings.
-    """
-    proofs = {name: each for name, each in validation.items() if each.proves and each.alone is not None}
-    sets = {f"on {name}, unseen": each for name, each in proofs.items()} or {"on the fitted poses": fit}
-    words, warnings = [], []
-    for where, each in sets.items():
-        if each.alone is None:
-            continue
-        bare, before = _rms(each.alone), _rms(each.errors[0])
-        words.append(f"{1e3 * bare:.3f} mm {where}")
-        if bare > before:
-            warnings.append(
-                f"THE URDF ALONE IS WORSE THAN THE NOMINAL ARM {where}: rms {1e3 * bare:.3f} mm against "
-                f"{1e3 * before:.3f} mm; use robot_for_corrections.urdf with joint_corrections.csv, or the nominal one"
-            )
-    there = words[0].removesuffix(f" {next(iter(sets))}") if len(sets) == 1 and proofs and words else ", ".join(words)
-    return (f"its URDF alone, without joint_corrections.csv, leaves {there}" if words else ""), warnings
 
 
 def _elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:

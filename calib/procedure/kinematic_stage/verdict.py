@@ -29,10 +29,11 @@ class _Proof:
     before: float
     after: float
     where: str
+    arm: str
 
     @property
     def both(self) -> str:
-        return f"rms {1e3 * self.before:.3f} mm nominal, {1e3 * self.after:.3f} mm calibrated"
+        return f"rms {1e3 * self.before:.3f} mm nominal, {1e3 * self.after:.3f} mm {self.arm}"
 
     @property
     def small_gain(self) -> bool:
@@ -52,6 +53,7 @@ def judge(
     reach: float = np.inf,
     tolerance: float | None = None,
     blind: Sequence[str] = (),
+    arm: str = "calibrated",
 ) -> Verdict:
     """Judge a calibration by the rows it has not seen.
 
@@ -93,13 +95,14 @@ def judge(
         reach: of the arm [m].
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
         blind: stations that could not be left out as a whole.
+        arm: what is judged, in a word or two.
     """
     proofs = {name: comparison for name, comparison in validation.items() if comparison.proves}
     own = _rms(fit.errors[1].main)
     nominal = _rms(fit.errors[0].main) if nominal_cross_validated is None else nominal_cross_validated
-    found = [*_of_files(proofs)]
+    found = [*_of_files(proofs, arm)]
     if not found and cross_validated is not None:
-        found = [_Proof(nominal, cross_validated, "by cross-validation only")]
+        found = [_Proof(nominal, cross_validated, "by cross-validation only", arm)]
     for verdict in (
         _elsewhere(proofs, reach),
         _turned({"the fitted poses": fit, **proofs}),
@@ -160,10 +163,10 @@ def _intervals_broken(proofs: Mapping[str, Comparison]) -> str:
     return ""
 
 
-def _of_files(proofs: Mapping[str, Comparison]) -> Iterator[_Proof]:
+def _of_files(proofs: Mapping[str, Comparison], arm: str) -> Iterator[_Proof]:
     for name, comparison in proofs.items():
         before, after = (_rms(found.main) for found in comparison.errors)
-        yield _Proof(before, after, f"on {name}, unseen")
+        yield _Proof(before, after, f"on {name}, unseen", arm)
 
 
 def _turned(sets: Mapping[str, Comparison]) -> Verdict | None:

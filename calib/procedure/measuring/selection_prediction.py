@@ -7,7 +7,6 @@ reads it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -20,7 +19,7 @@ from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.sigma_comparison import SigmaComparison, compare_sigmas
-from calib.records import read_record
+from calib.records import read_json
 from calib.units import SMALL
 
 SUFFIX = "_prediction.json"
@@ -64,7 +63,7 @@ def beside(poses: Path) -> Path:
 
 def left_by_select(path: Path) -> bool:
     """Tell whether a file is a prediction as `write` leaves it."""
-    return set(json.loads(path.read_text(encoding="utf-8"))) == {field.name for field in fields(SelectionPrediction)}
+    return set(read_json(path)) == {field.name for field in fields(SelectionPrediction)}
 
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:
@@ -93,10 +92,7 @@ def read(selection: Path) -> SelectionPrediction:
         raise UsageError(
             f"there is no {path}: give the CSV that calib select wrote, its prediction beside it, or their folder"
         )
-    try:
-        return read_record(SelectionPrediction, json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); choose the poses again") from error
+    return read_json(path, "choose the poses again", SelectionPrediction)
 
 
 def compared_with_fit(

@@ -12,8 +12,8 @@ from calib.dynamics.shapes import V0
 from calib.errors import RobotError, UsageError
 from calib.identification.model_file import MODEL
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model
-from calib.procedure.excitation.parallel import ParallelDesign, design_parallel
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
+from calib.procedure.parallel_stage.design import ParallelDesign, design_parallel
 from calib.procedure.parallel_stage.robots import FoundRobot
 
 DRIVES = ("Ia", "Fv", "Fc", "off")

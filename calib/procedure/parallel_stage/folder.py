@@ -26,13 +26,14 @@ from calib.identification.scores import Score
 from calib.mechanism import parallel_files
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import PLANNED
-from calib.procedure.excitation.parallel import ParallelDesign
+from calib.procedure.parallel_stage.design import ParallelDesign
 from calib.procedure.parallel_stage.fit import ParallelFit
 from calib.procedure.parallel_stage.identify import ParallelOutcome
 from calib.procedure.parallel_stage.plan import ParallelPlan, plan_metrics
 from calib.procedure.parallel_stage.robots import FoundRobot
 from calib.robot.calibrated import ROBOT
 from calib.robot.tables import dumps
+from trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,10 +105,13 @@ def write_designed(robot: FoundRobot, design: ParallelDesign, rate: float, out: 
         parts.append(design.robot.torques(x, v, a))
         header += [f"tau_{n}" for n in known.joint_names]
 
+    limits = design.bounds.lines()
+    design.bounds.check(Setpoints(rate, motion.posture.q[:, own], motion.v[:, own], motion.a[:, own]))
+
     def write(folder: Path) -> None:
         _write_robot(robot, folder)
-        files.write_table(folder / PLANNED, header, np.hstack(parts).tolist())
-        series = coefficients.table(_actuators_series(design, rate), ROBOT)
+        files.write_numbers(folder / PLANNED, header, np.hstack(parts), notes=limits)
+        series = coefficients.table(_actuators_series(design, rate), ROBOT, limits)
         files.write(folder / coefficients.NAME, dumps(series))
         files.write_json(folder / METRICS, design_metrics(robot, design))
 
@@ -124,9 +128,11 @@ def write_planned(planned: ParallelPlan, out: Path) -> Path:
         parts.append(track.tau)
         header += [f"tau_{n}" for n in robot.joint_names]
 
+    planned.bounds.check(track)
+
     def write(folder: Path) -> None:
         _write_robot(planned.robot, folder)
-        files.write_table(folder / PLANNED, header, np.hstack(parts).tolist())
+        files.write_numbers(folder / PLANNED, header, np.hstack(parts), notes=planned.bounds.lines())
         files.write_json(folder / METRICS, plan_metrics(planned))
 
     return write_staged(out, MOVED, write)
@@ -160,6 +166,7 @@ def design_metrics(robot: FoundRobot, design: ParallelDesign) -> dict[str, Any]:
             {"limit": one.name, "of": one.label, "margin": float(one.margin), "unit": one.unit}
             for one in design.proof.margins
         ],
+        "limits": design.bounds.lines(),
     }
 
 
@@ -219,9 +226,10 @@ def designed_lines(robot: FoundRobot, design: ParallelDesign) -> list[str]:
         lines.append("peak torques: " + ", ".join(f"{name} {peak:.3g}" for name, peak in pairs))
     worst = min(design.proof.margins, key=lambda one: one.share)
     label = worst.label
-    for k, name in enumerate(robot.known.robot.freedom if worst.name != "torque" else ()):
+    for k, name in enumerate(robot.known.robot.freedom if worst.name in ("position", "acceleration") else ()):
         label = label.replace(f"joint {k + 1} ", f"platform {name} ")
-    return [*lines, f"closest limit: {worst.name} of {label}, {worst.margin:.3g} {worst.unit} left"]
+    closest = f"closest limit: {worst.name} of {label}, {worst.margin:.3g} {worst.unit} left"
+    return [*lines, closest, *design.bounds.lines()]
 
 
 def _write_robot(robot: FoundRobot, folder: Path) -> None:

@@ -19,8 +19,9 @@ from calib.errors import MeasurementError, UsageError
 from calib.mechanism.closure import ClosedRobot, NoPosture, coordinates_of
 from calib.mechanism.distribution import distributed
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model
-from calib.procedure.excitation.limits import check_stated
+from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
+from calib.procedure.parallel_stage.design import actuator_bounds
 from calib.procedure.parallel_stage.excite import read_model
 from calib.procedure.parallel_stage.fit import read_coordinates, read_rows
 from calib.procedure.parallel_stage.robots import FoundRobot
@@ -83,6 +84,7 @@ class ParallelPlan:
 
     Attributes:
         robot: with its file.
+        bounds: what limits its actuators, and where that is stated.
         timings: one for all waypoints, or one per straight line.
         track: of the actuators at the controller's rate, with torques where a model is known.
         coordinates: (N, r) of the platform along it [m, rad].
@@ -90,6 +92,7 @@ class ParallelPlan:
     """
 
     robot: FoundRobot
+    bounds: MotionBounds
     timings: tuple[Timing, ...]
     track: Setpoints
     coordinates: np.ndarray
@@ -128,7 +131,8 @@ def plan_parallel(
     if limits is not None or drives is not None:
         raise UsageError("limits and drives are in a parallel robot's own file (velocity, effort) and in its model")
     law, notes = _law(robot, model, settings)
-    bounds, unlimited = _bounds(known, law)
+    bounds = actuator_bounds(known, law is not None)
+    kept = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)
     points = _read_waypoints(waypoints, known)
     say("the path")
     paths = _paths(known, points, settings.lines)
@@ -136,10 +140,10 @@ def plan_parallel(
         check_within(path, known.robot.lower, known.robot.upper, points)
     own = [_of_actuators(known, path) for path in paths]
     say("timing")
-    timings = tuple(time_optimal(path, bounds, law, rate=settings.rate) for path in own)
+    timings = tuple(time_optimal(path, kept, law, rate=settings.rate) for path in own)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
-    return ParallelPlan(robot, timings, motion, coordinates_of(known, known.locate(motion.q)), (*notes, *unlimited))
+    return ParallelPlan(robot, bounds, timings, motion, coordinates_of(known, known.locate(motion.q)), notes)
 
 
 def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
@@ -172,7 +176,7 @@ def _law(
         model = make_parallel_model(robot.known, ("",))
         values = model.known_parameters()
         if values is None:
-            return None, ("the robot's masses are not known: torques are not limited",)
+            return None, ()
         return _PlatformDynamics(model, values), (
             "friction not known (no model): planned without, a real robot needs more torque",
         )
@@ -183,21 +187,6 @@ def _law(
         )
     terms = tuple(replace(one, settings=(SHARP,)) if one.shape == "sign" else one for one in model.terms)
     return _PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()
-
-
-def _bounds(known: ClosedRobot, law: _PlatformDynamics | None) -> tuple[TimingLimits, list[str]]:
-    """Return the limits of timing, and in words which are not known."""
-    joints = known.robot.joints
-    torque = np.array([joint.effort if law is not None else np.inf for joint in joints])
-    velocity = np.array([joint.velocity for joint in joints])
-    counting = {"velocity": velocity} | ({} if law is None else {"effort": torque})
-    notes = check_stated(joints, counting, known.robot.name, file=False)
-    if not (np.isfinite(torque).any() or np.isfinite(velocity).any()):
-        raise UsageError(
-            f"robot '{known.robot.name}' has no limits of speed or torque; state velocity or effort of its actuated "
-            "joints in its file"
-        )
-    return TimingLimits(velocity, np.full(len(joints), np.inf), torque), notes
 
 
 def _paths(known: ClosedRobot, points: np.ndarray, lines: bool) -> list[JointPath]:
@@ -229,7 +218,7 @@ def plan_lines(planned: ParallelPlan) -> list[str]:
             share = 1.0 - np.min(used, axis=0)
             named = ", ".join(f"{name} {100 * x:.0f} %" for name, x in zip(robot.joint_names, share))
             lines.append(f"most {unit} in use: {named}")
-    return [*lines, *planned.notes]
+    return [*lines, *planned.bounds.lines(), *planned.notes]
 
 
 def plan_metrics(planned: ParallelPlan) -> dict[str, object]:
@@ -245,5 +234,6 @@ def plan_metrics(planned: ParallelPlan) -> dict[str, object]:
         },
         "peak_torque": None if tau is None else np.abs(tau).max(axis=0).tolist(),
         "peak_speed": np.abs(planned.track.v).max(axis=0).tolist(),
+        "limits": planned.bounds.lines(),
         "notes": list(planned.notes),
     }

@@ -20,6 +20,8 @@ from calib.folders import CERTIFICATE
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.metrics import FitMetrics
+from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report import fit_report, geometry_section
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Page, Picture, Section, Table, Text
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
     import jinja2
 
 FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
-WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
 LISTED = 6  # files on the first sheet
@@ -121,11 +122,12 @@ def unseen_role(role: str, seen: bool, judged: str) -> str:
     return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
 
 
-def tolerance(millimetres: float | None) -> str:
-    """Return what a verdict of pass means, in words."""
+def tolerance(millimetres: float | None, found: FitMetrics) -> str:
+    """Return what a verdict of pass means, and of which deliverable, in words."""
+    of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
     if not millimetres:
-        return "none was given: pass means better than the nominal robot on unseen poses, or nothing to gain"
-    return f"{millimetres:g} mm rms on unseen poses"
+        return f"none was given: pass means better than the nominal robot on unseen poses, or nothing to gain{of}"
+    return f"{millimetres:g} mm rms on unseen poses{of}"
 
 
 @cache
@@ -139,7 +141,7 @@ def versions() -> str:
 def render(page: Page) -> str:
     """Return the page as HTML."""
     style = resources.files("calib.procedure.report").joinpath("certificate.css").read_text(encoding="utf-8")
-    return _template().render(page=page, style=style, words=WORDS)
+    return _template().render(page=page, style=style)
 
 
 @cache
@@ -153,18 +155,20 @@ def _template() -> jinja2.Template:
     return environment.from_string(source)
 
 
-def write_fit(outcome: Outcome, folder: Path, plots: bool = True) -> None:
+def write_fit(outcome: Outcome, folder: Path, plots: bool = True, page: bool = True) -> None:
     """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder.
 
     Args:
         plots: whether there are to be figures; the certificate is written without them, too.
+        page: whether there is to be a certificate.
     """
     report = fit_report.collect(outcome)
     fit_report.write(report, FitFolder(folder).report)
     drawn = draw(report) if plots else {}
     for name, figure in drawn.items():
         files.write(folder / f"plot_{name}.png", figure.png)
-    files.write(folder / CERTIFICATE, render(of_fit(report, drawn, outcome.inputs)))
+    if page:
+        files.write(folder / CERTIFICATE, render(of_fit(report, drawn, outcome.inputs)))
 
 
 def draw(report: Report) -> Mapping[str, Picture]:
@@ -186,7 +190,7 @@ def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None =
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
         *named,
         ("model", report.metrics.model),
-        ("tolerance", tolerance(report.metrics.tolerance_mm)),
+        ("tolerance", tolerance(report.metrics.tolerance_mm, report.metrics)),
         ("seed", str(report.metrics.seed)),
         ("toolkit", versions()),
     )

@@ -9,9 +9,10 @@ from rich.console import RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
+from calib.procedure.findings import LEVELS
 from calib.procedure.report.page import Block, Section, Table, Text
 
-COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
+COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
 
 
 def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:

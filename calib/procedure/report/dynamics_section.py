@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,7 @@ from calib.procedure.dynamic_stage.metrics import (
 )
 from calib.procedure.dynamic_stage.tracking import KEYS
 from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text, relative_sigma
-from calib.records import read_record, read_rows, typed_rows
+from calib.records import read_json, read_record, read_rows, typed_rows
 from calib.units import small
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
@@ -78,8 +77,8 @@ def read(folder: Path) -> DynamicReport:
     effects = folder / geometry_tables.EFFECTS
     try:
         place = IdentificationFolder(folder)
-        metrics = model_metrics(json.loads(place.numbers.read_text(encoding="utf-8")))
-        unseen = json.loads(place.unseen.report.read_text(encoding="utf-8"))
+        metrics = model_metrics(read_json(place.numbers))
+        unseen = read_json(place.unseen.report)
         if unseen.get("schema") != UNSEEN:
             found = f"schema {unseen.get('schema')}, this version reads {UNSEEN}"
             raise UsageError(f"{place.unseen.report}: {found}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from calib.procedure.report import geometry_figures
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.page import Picture, Pictures
 from calib.procedure.report.style import HALF, WIDE, picture
-from calib.records import read_record
+from calib.records import read_json
 
 if TYPE_CHECKING:  # the figures of a fit are drawn without loading the dynamics' modules
     from calib.procedure.dynamic_stage.metrics import UnseenReport
@@ -175,7 +174,7 @@ def _excitation(excitation: Path) -> list[Picture]:
     motion = coefficients.read(folder)
     t = np.linspace(0.0, motion.period, DRAWN)
     q, v, _ = motion.orders(t)
-    made = read_record(DesignMetrics, json.loads((folder / METRICS).read_text(encoding="utf-8")))
+    made = read_json(folder / METRICS, "design the motion again", DesignMetrics)
     margins = ", ".join(f"{name} {one.share:.1%} of its scale" for name, one in made.margins.items())
     words = (
         f"The training motion, one period of {made.setting.period:g} s: condition number "

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,7 @@ from calib.procedure.kinematic_stage.folder import metrics
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
 from calib.procedure.measuring.image_findings import ImageCoverage, image_coverage
-from calib.records import read_record
+from calib.records import read_json, read_record
 from calib.transforms import invert
 
 SCHEMA = 2
@@ -66,7 +65,7 @@ class RowErrors:
         name: of the set; ``fit``, or a validation file's.
         unseen: whether the fit had not seen them.
         poses: how many robot poses.
-        nominal, calibrated: by nature, the errors of that arm [m, rad].
+        nominal, calibrated, urdf_alone: by nature, the errors of that arm [m, rad].
         expected: radius within which 95 % of the calibrated arm's errors are to be [m]; empty where none is known.
         q: (rows, n) joints, and points (rows, 3) in the arm's base, where there is one error per row.
     """
@@ -79,6 +78,7 @@ class RowErrors:
     q: tuple[tuple[float, ...], ...] = ()
     points: tuple[tuple[float, ...], ...] = ()
     expected: tuple[float, ...] = ()
+    urdf_alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,11 @@ class Report:
             verdict=found.verdict,
             reason=found.reason,
             warnings=found.warnings,
+            deliverables=found.deliverables,
+            deliverable=found.deliverable,
         )
-        return replace(self, metrics=metrics, sets=(*self.sets, *sets))
+        fresh = {one.name for one in sets}
+        return replace(self, metrics=metrics, sets=(*(one for one in self.sets if one.name not in fresh), *sets))
 
 
 def fit_metrics(outcome: Outcome) -> FitMetrics:
@@ -164,12 +167,12 @@ def collect(outcome: Outcome) -> Report:
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     """Return one set of rows: sizes of errors, and where they were measured if there is one error per row."""
-    nominal, calibrated = (
-        {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature)) is not None}
-        for found in comparison.errors
+    nominal, calibrated, alone = (
+        {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
+        for found in (*comparison.errors, comparison.alone)
     )
     q = np.concatenate([block.q for block in comparison.blocks])
-    rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated)
+    rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated, urdf_alone=alone)
     if len(comparison.errors[1].main) != len(q):
         return rows
     expected = () if comparison.intervals is None else _plain(comparison.intervals.radius)
@@ -224,10 +227,7 @@ def read(path: Path) -> Report:
     Raises:
         UsageError: where it is missing or made by another version.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("schema") not in READ:
-            raise UsageError(f"{path}: schema {content.get('schema')}, this version reads {SCHEMA}; fit again")
-        return read_record(Report, content)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: {error}; fit again") from error
+    schema = read_json(path, "fit again").get("schema")
+    if schema not in READ:
+        raise UsageError(f"{path}: schema {schema}, this version reads {SCHEMA}; fit again")
+    return read_json(path, "fit again", Report)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,21 @@ import numpy as np
 from calib.geometry.accuracy import rms_sigma
 from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.metrics import ComparedRows, ErrorStatistics, FitMetrics, OutlierRow, RepeatedPose
+from calib.procedure.kinematic_stage.metrics import (
+    ComparedRows,
+    ErrorStatistics,
+    FitMetrics,
+    LadderStep,
+    OutlierRow,
+    RepeatedPose,
+)
+from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text, relative_sigma
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
-ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "its URDF alone"}
+ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "URDF alone"}
 MOST_ROWS = 60  # parameters beyond which joint corrections are not listed
 MOST_POSES = 30  # repeated poses that are listed
 MOST_OUTLIERS = 20
@@ -94,26 +103,37 @@ def _key_figures(report: Report) -> list[KeyFigure]:
     Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
     """
     metrics, proofs = report.metrics, report.metrics.proofs
-    if not proofs and (left := _left_out(metrics)):
-        return [left]
-    name, proof = max(proofs.items(), key=lambda item: _main_rms(item[1]), default=("fit", metrics.fit))
+    if not proofs and (folds := _left_out(metrics)):
+        return [folds]
+    left = {name: rows.judged(metrics.deliverable).main for name, rows in proofs.items()}
+    worst = {found.rms: name for name, found in left.items() if found}
+    name = worst[max(worst)] if worst else next(iter(proofs), "fit")
+    proof = proofs.get(name, metrics.fit)
     own = next((rows for rows in report.sets if rows.name == name), None)
     basis = f"{proof.poses} {'unseen' if proofs else 'fitted'} poses"
+    arms = (
+        {"calibrated": ""}
+        if proof.urdf_alone is None
+        else {"urdf_alone": ARM["urdf"], "calibrated": ARM["corrections"]}
+    )
+    if metrics.deliverable == "corrections":
+        arms = dict(reversed(arms.items()))
     result = []
-    for key, (label, unit) in KINDS.items():
-        before, after = (_errors(proof, arm, key) for arm in ("nominal", "calibrated"))
+    for (key, (label, unit)), (arm, words) in product(KINDS.items(), arms.items()):
+        before, after = _errors(proof, "nominal", key), _errors(proof, arm, key)
         if before is None or after is None:
             continue
-        factor = ERRORS[label][0]
-        sizes = None if own is None else own.calibrated.get(label)
-        sigma = np.nan if sizes is None else factor * rms_sigma(np.array(sizes))
+        sizes = None if own is None else (own.urdf_alone if arm == "urdf_alone" else own.calibrated).get(label)
+        sigma = np.nan if sizes is None else ERRORS[label][0] * rms_sigma(np.array(sizes))
         spread = f"± {sigma:.2g} {unit}" if np.isfinite(sigma) else ""
         judged = metrics.tolerance_mm and before is proof.nominal.main
         allowed = f"{metrics.tolerance_mm:g} mm" if judged else ""
+        what = f"{label} {words}".strip()
         result.append(
-            KeyFigure(f"{label}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
+            KeyFigure(f"{what}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
         )
-        result.append(KeyFigure(f"{label}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
+        if arm == next(iter(arms)):
+            result.append(KeyFigure(f"{what}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
     return result
 
 
@@ -125,12 +145,9 @@ def _left_out(metrics: FitMetrics) -> KeyFigure | None:
     before = nominal.rms if found.nominal_cross_validated is None else 1e3 * found.nominal_cross_validated
     label = "position" if metrics.fit.nominal.position_mm else "distance"
     allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else ""
-    after = _size(1e3 * found.cross_validated, "mm")
+    alone = metrics.fit.judged(metrics.deliverable) is metrics.fit.urdf_alone
+    after = _size(1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated), "mm")
     return KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "rows left out in turn", allowed)
-
-
-def _main_rms(rows: ComparedRows) -> float:
-    return rows.calibrated.main.rms if rows.calibrated.main else 0.0
 
 
 def _size(value: float, unit: str) -> str:
@@ -181,9 +198,31 @@ def _ladder_table(metrics: FitMetrics) -> Table:
         error = step.cross_validated_mm
         if step.kept:
             strong.add(len(rows))
-        rows.append((step.model, str(step.parameters), "" if error is None else f"{error:.4f}", step.note))
+        rows.append((step.model, _counted(step), "" if error is None else f"{error:.4f}", step.note))
     header = ("model", "parameters", "cross-validated rms [mm]", "remark")
-    return Table("Ladder of models", header, rows, f"Chosen: {metrics.model}.", frozenset(strong), (1, 2))
+    note = f"Chosen: {metrics.model}, {parameter_words(metrics)}."
+    return Table("Ladder of models", header, rows, note, frozenset(strong), (1, 2))
+
+
+def _counted(step: LadderStep) -> str:
+    """Return how many parameters a model has: of the geometry, and the small joint corrections beside them."""
+    rigid = step.parameters - step.corrections
+    return f"{rigid} + {step.corrections}" if step.corrections else str(rigid)
+
+
+def parameter_words(metrics: FitMetrics) -> str:
+    """Return how many parameters a fit has, of what kind: a ridge lets corrections outnumber the poses."""
+    last = [step for step in metrics.ladder if step.kept][-1:]
+    corrections = last[0].corrections if last else 0
+    words = f"{metrics.fit.parameters - corrections} geometric parameters (base and tool placement included)"
+    return words + (f" + {corrections} small joint corrections, shrunk by a ridge" if corrections else "")
+
+
+def error_words(metrics: FitMetrics) -> str:
+    """Return the rms errors on the fitted poses in a line."""
+    arms = {ARMS[arm]: getattr(metrics.fit, arm) for arm in ARMS}
+    sizes = [f"{found.main.rms:.3f} mm {arm}" for arm, found in arms.items() if found and found.main]
+    return f"rms {', '.join(sizes)} on {metrics.fit.poses} fitted poses"
 
 
 def _parameter_table(report: Report) -> Table:

@@ -7,7 +7,6 @@ All points are in the base of the arm that is drawn.
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError
 from calib.geometry import installation_file
 from calib.geometry.installation import Installation, see
+from calib.identification import model_file
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
@@ -283,7 +283,7 @@ def _rehearsed(path: Path, chain: Chain) -> Played:
 
 def _played(path: Path, folder: Path) -> Played:
     table = read_table(path)
-    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), _block(table, "v"))
+    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), table.block("v"))
 
 
 def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
@@ -291,9 +291,7 @@ def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
     measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
     t = table.cells[table.index("t")]
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
-    return Torques(
-        _name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, _block(table, "q")
-    )
+    return Torques(_name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, table.block("q"))
 
 
 def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -301,7 +299,7 @@ def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[st
     for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
         if chain is None or not folder.model.is_file():
             continue
-        table = json.loads(folder.model.read_text(encoding="utf-8"))
+        table = model_file.read_table(folder.path)
         rows, unit = ROWS.get(table.get("kind", ""), MOTOR), table.get("unit", "N m")
         if rows.count(chain.n) == count:
             kind = f"{' motor' if rows.motors_alone else ''} {'torque' if unit == 'N m' else 'current'}"
@@ -313,15 +311,9 @@ def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[st
     return tuple(f"{name} torque" for name in names), ("N m or N",) * count
 
 
-def _block(table: Table, letter: str) -> np.ndarray | None:
-    """Return columns letter1, letter2, … as (N, n); None without any."""
-    names = [name for name in table.header if name.startswith(letter) and name[len(letter) :].isdigit()]
-    return np.column_stack([table.numbers(name) for name in names]) if names else None
-
-
 def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
     """Return columns letter1, letter2, … as (N, n), which the file has to hold."""
-    found = _block(table, letter)
+    found = table.block(letter)
     if found is None:
         raise UsageError(f"{path} has no columns {letter}1, {letter}2, …; was it written by this toolkit?")
     return found

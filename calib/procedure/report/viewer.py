@@ -6,6 +6,8 @@ one by one, motions, torques; poses last `EACH`, motions as long as they are. Po
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, command_line
 from calib.procedure.report import scene as viewing
 from calib.procedure.report.scene import Measured, Played, Scene, Torques
 from calib.robot.chain import Chain
@@ -83,7 +85,14 @@ def write_beside(folder: str | Path) -> str:
 
 
 def spawn(folder: str | Path, robot: str | None = None) -> Scene:
-    """Open Rerun's window on what a folder holds."""
+    """Open Rerun's window on what a folder holds.
+
+    Raises:
+        UsageError: where no display is there, as over SSH.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        saved = command_line("view", folder, "--save", FILE)
+        raise UsageError(f"no display is here to open a window on; {saved} writes a file that rerun shows elsewhere")
     scene = viewing.read(folder, robot)
     rr = _rerun()
     recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib import files
@@ -21,8 +20,8 @@ from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, read_state
-from calib.procedure.session.geometry_steps import measured_files, robot_file
-from calib.records import read_record
+from calib.procedure.session.geometry_steps import chain_of, measured_files, robot_file
+from calib.records import read_json, read_lines
 
 Say = Callable[[str], None]
 ROLES = {
@@ -37,10 +36,12 @@ def certify(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import dynamics_section, geometry_section
 
     say("drawing" if session.plots else "writing")
-    whole = _whole_report(session)
-    section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
-    judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
-    notes = [f"geometry {section.verdict}: {section.reason}"]
+    judged, setup = [], _dynamic_robot(session)
+    if session.geometric:
+        whole = _whole_report(session)
+        section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
+        judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
+        setup = _measured_setup(session, whole)
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session).notes("export")
@@ -52,13 +53,15 @@ def certify(session: Session, say: Say) -> list[str]:
             drawn = draw_dynamics(dynamics, session.identification.path, motions)
         tolerance = session.settings.dynamics.tolerance_percent
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
+        own = session.verdicts().stages["dynamics"]
+        section = replace(section, verdict=own.level, reason=own.reason)
         judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
-        notes.append(f"dynamics {section.verdict}: {section.reason}")
+    notes = [f"{section.title.lower()} {section.verdict}: {section.reason}" for section in judged]
     lines = _simulated(session)
     page = certificate.certificate(
         f"{'Simulated calibration' if lines else 'Calibration'} of {session.settings.name}",
         f"{'SIMULATED: ' if lines else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
-        _setup(session, whole),
+        [*lines, *setup, *_made_by(session)],
         judged,
         listed(session),
     )
@@ -74,15 +77,14 @@ def _whole_report(session: Session) -> fit_report.Report:
     if found.schema >= SCHEMA:
         return fit_report.read(place.report)
     fit = fit_report.read(session.fit.report)
-    content = json.loads(place.rows.read_text()) if place.rows.exists() and found.validation else []
-    whole = replace(found, warnings=(*fit.metrics.warnings, *found.warnings))
-    return fit.with_unseen(whole, read_record(tuple[RowErrors, ...], content))
+    known = place.rows.exists() and found.validation
+    rows = read_json(place.rows, "validate again", tuple[RowErrors, ...]) if known else ()
+    return fit.with_unseen(replace(found, warnings=(*fit.metrics.warnings, *found.warnings)), rows)
 
 
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
-    path = session.path(f"{place}/{CHECKED}")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    lines = read_lines(session.path(f"{place}/{CHECKED}"))
     files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
     said = read_state(session).notes(unseen)
     names = tuple(f"{each.name}: " for each in files_there)
@@ -98,32 +100,45 @@ def _with_arrival(section: Section, lines: list[str]) -> Section:
 
 def _simulated(session: Session) -> list[tuple[str, str]]:
     """Return lines under Setup of a session whose files a simulated cell brought; none of a real one."""
-    path = session.path(MARK)
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [("simulated", line) for line in lines if line.strip()]
+    return [("simulated", line) for line in read_lines(session.path(MARK)) if line.strip()]
 
 
-def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
-    """Return what stands under Setup on the certificate."""
+def _dynamic_robot(session: Session) -> list[tuple[str, str]]:
+    """Return what stands under Setup of a session that takes the geometry as it is described."""
+    chain = chain_of(session)
+    return [
+        ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"),
+        ("description", f"{session.settings.robot.given}, taken as calibrated"),
+        ("session made", session.settings.created.replace("T", " ")),
+    ]
+
+
+def _made_by(session: Session) -> list[tuple[str, str]]:
+    """Return the lines under Setup that every session has."""
+    return [
+        *_dynamic_setup(session),
+        ("seed", str(session.settings.seed)),
+        ("command", command_line("next", session.folder.name)),
+        ("toolkit", certificate.versions()),
+    ]
+
+
+def _measured_setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
+    """Return what stands under Setup on the certificate of a fit."""
     settings, fitted = session.settings, measured_files(session)
     instrument = settings.instrument
     stated = f", σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else ", σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
     return [
-        *_simulated(session),
         ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
         ("description", settings.robot.given),
         ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
         ("measurements", _named([*fitted[0], *fitted[1]])),
-        ("pose plan", _session_plan(session)),
+        ("pose plan", _session_plan(session).words),
         *_pose_checks(session),
         ("model", found.metrics.model),
-        ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
-        *_dynamic_setup(session),
-        ("seed", str(settings.seed)),
-        ("command", command_line("next", session.folder.name)),
-        ("toolkit", certificate.versions()),
+        ("tolerance", certificate.tolerance(settings.fit.tolerance_mm, found.metrics)),
     ]
 
 
@@ -161,12 +176,20 @@ def _named(paths: list[Path]) -> str:
     return ", ".join(path.name for path in paths)
 
 
-def _session_plan(session: Session) -> str:
-    """Return in a few words how the poses were chosen."""
+@dataclass(frozen=True)
+class _Plan:
+    """What ``selection.json`` says for people: how the poses were chosen, what they were held against, what not."""
+
+    words: str = "chosen by hand"
+    checked: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
+
+
+def _session_plan(session: Session) -> _Plan:
     path = session.path(SELECTION)
     if not session.settings.poses.plan or not path.exists():
-        return "poses not planned here"
-    return str(json.loads(path.read_text()).get("words", "chosen by hand"))
+        return _Plan("poses not planned here")
+    return read_json(path, "calib redo makes it again", _Plan)
 
 
 def _filed(paths: list[Path]) -> list[Path]:
@@ -179,11 +202,8 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 def _pose_checks(session: Session) -> list[tuple[str, str]]:
     """Return lines on what the planned poses were held against, and what was not known."""
-    path = session.path(SELECTION)
-    if not session.settings.poses.plan or not path.exists():
-        return []
-    found = json.loads(path.read_text())
-    rows = [("poses kept", found.get("checked")), ("poses NOT checked for", found.get("unchecked"))]
+    found = _session_plan(session)
+    rows = [("poses kept", found.checked), ("poses NOT checked for", found.unchecked)]
     return [(words, ", ".join(names)) for words, names in rows if names]
 
 
@@ -201,9 +221,10 @@ def listed(session: Session) -> list[FileRow]:
         if session.settings.dynamics.plan:  # else other motions were played
             wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]
-    wanted += [*session.fit.tables, *exported[1:]]
+    wanted += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
     made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
-    rows, seen = [], [name for name, found in session.validation.metrics().validation.items() if not found.unseen]
+    judged = session.validation.metrics().validation if session.geometric else {}
+    rows, seen = [], [name for name, found in judged.items() if not found.unseen]
     for path in wanted:
         name = path.relative_to(session.folder)
         role = ROLES[name.parts[0]]

@@ -22,9 +22,10 @@ from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
+from calib.procedure.session.folder import VERDICT, Session, create, locked, open_session
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import (
+    NOTHING,
     DynamicsSection,
     FitSection,
     InstrumentSection,
@@ -59,7 +60,7 @@ class NewSession:
 
     Attributes:
         robot: see `calib.robot.load`.
-        instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`.
+        instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`; ``none``: the geometry is taken as it is.
         poses, validation: how many to choose.
         seed: of everything random.
         base, tip: of a URDF, empty for its own.
@@ -89,8 +90,10 @@ def begin(folder: Path, wanted: NewSession) -> Session:
         raise UsageError(f"{words}: at least one pose, and no fewer than 0")
     check_keys(wanted.motion, [key.name for key in fields(DynamicsSection)], "keys of [dynamics]")
     device, source = instrument_named(wanted.instrument), resolve(wanted.robot)
+    if device.measures == NOTHING and not wanted.dynamics:
+        raise UsageError("nothing is measured and no dynamics are wanted: nothing is left to be done")
     chain = load(wanted.robot, wanted.base or None, wanted.tip or None)
-    copied, named = _limits(wanted.limits, chain, source)
+    copied, named = _limits(wanted.limits, chain, source, wanted.dynamics)
     measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
     if wanted.tool is not None:
         x, y, z = (float(value) for value in wanted.tool)
@@ -103,12 +106,15 @@ def begin(folder: Path, wanted: NewSession) -> Session:
     return create(folder, source, settings, copied | meshes_beside(source))
 
 
-def _limits(stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path) -> tuple[dict[str, Path | str], str]:
+def _limits(
+    stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
+) -> tuple[dict[str, Path | str], str]:
     """Return what is to be copied of stated limits, which are read once to see that they can be, and its name."""
     if stated is None:
         return {}, ""
     if isinstance(stated, Path):
-        read_motion_limits(stated, chain, source)
+        if motions:
+            read_motion_limits(stated, chain, source)
         read_limits(stated, targets_of(chain), source)
         return {LIMITS: stated, **beside(stated)}, LIMITS
     told = parse(ConstraintsFile, stated, "the cell")
@@ -140,17 +146,18 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
         state = steps.run_next(session, say, progress, command)
     if state is not None:
         return _Stop(("", *instructions.asks(session, state)))
-    return _Stop(_ending(session), verdict_of(session))
+    return _Stop(_ending(session), session.verdicts().level)
 
 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
-    level = verdict_of(session)
+    level = session.verdicts().level
     if level == "fail":
         return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
-    held = "" if level == "pass" else f" (verdict {level}: {robot.parent.name}/README.txt says why)"
-    return ("", f"done; certificate: {page}", f"robot: {robot}{held}")
+    why = VERDICT if session.path(VERDICT).exists() else f"{robot.parent.name}/README.txt"
+    held = "" if level == "pass" else f" (verdict {level}: {why} says why)"
+    return ("", f"done; certificate: {page}", f"robot: {robot}{held}" if robot.exists() else "no robot was exported")
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:

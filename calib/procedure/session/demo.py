@@ -23,7 +23,8 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import NewSession, begin
-from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
+from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
+from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.load import load
 from calib.simulation.cells import camera_files, measured_files
@@ -115,7 +116,9 @@ def run(
         return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
     before, after = _compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started
-    return DemoResult(session, verdict_of(session), _results(session), seconds, (), before, after, _largest_memory())
+    return DemoResult(
+        session, session.verdicts().level, _results(session), seconds, (), before, after, _largest_memory()
+    )
 
 
 def _largest_memory() -> float:
@@ -157,6 +160,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
     ]
+    truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
     if bare > after:
         lines[0] += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
     notes = [cell.note]
@@ -169,12 +173,14 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         true = true_base(dynamics.model, cell, arm, session.settings.seed, middle)
         within, count = share_within(true, read_estimate(session.identification.path))
         notes.append(arm.note)
+        truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
         lines.append(
             "hidden truth, on a motion nobody has seen: noise-free torques are predicted to "
             f"{torques.identified:.2f} % ({torques.nominal:.1f} % behind the gears by the nominal masses, with the "
             f"true friction); of {count} base parameters {within:.0%} are within two sigmas of the truth"
         )
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
+    files.write_json(session.path("truth.json"), truth)
     for line in lines:
         say(line)
     return before, after
@@ -248,7 +254,7 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
 def _mark(session: Session, note: str) -> None:
     """Write down in the session that its files are a simulated cell's; the certificate says so."""
     path, line = session.path(MARK), SIMULATED.format(note=note)
-    known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    known = read_lines(path)
     files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
 
 

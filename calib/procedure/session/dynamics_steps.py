@@ -5,11 +5,9 @@ The same functions as `calib excite` and `calib identify`; only the files are th
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,12 +21,15 @@ from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.validation import assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.findings import UNJUDGED
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
+from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
+Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
 SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
 SHORTER, OTHER = (
     0.8,
@@ -108,7 +109,8 @@ def excite(session: Session, say: Say) -> list[str]:
             f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "
             f"normalised, {len(designed.inputs.model.exact.names)} columns; every limit is kept"
         )
-        notes += [f"{name}: {note}" for note in designed.notes if first]
+        told = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [f"{name}: {note}" for note in told if first]
     if limits is None:
         notes.append("only the robot's own limits were kept: watch for collisions, or name a limits file")
     return notes
@@ -144,7 +146,8 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
         arrival.check_torques(recording, chain)
     motions = designed_motions(session)
     if name not in motions:
-        return None, notes
+        whole = [float(recording.t[0]), float(recording.t[-1])]
+        return whole if session.settings.dynamics.holdout else None, notes
     others = {other: motion for other, motion in motions.items() if other != name}
     found, loose = arrival.check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
     worst = max(found.tracking)
@@ -163,10 +166,23 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
     return {name: coefficients.read(folder) for name, folder in folders.items() if folder.exists()}
 
 
-def _cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:
+def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
     """Return paths with the cut that holds the motion."""
     marked = {path: cuts.get(path.name) for path in paths}
     return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
+
+
+def _divided(session: Session) -> tuple[list[str], list[str]]:
+    """Return the recordings to learn from, and what is held out of them, as paths with cuts."""
+    cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
+    share = session.settings.dynamics.holdout
+    training = recordings(session)[0]
+    if not share:
+        return _cut_paths(training, cuts), []
+    middle = {name: stop - share * (stop - start) for name, (start, stop) in cuts.items()}
+    learnt = {name: (start, middle[name]) for name, (start, _) in cuts.items()}
+    held = {name: (middle[name], stop) for name, (_, stop) in cuts.items()}
+    return _cut_paths(training, learnt), _cut_paths(training, held)
 
 
 def identify(session: Session, say: Say) -> list[str]:
@@ -176,12 +192,12 @@ def identify(session: Session, say: Say) -> list[str]:
     draw = None
     if session.plots:
         from calib.procedure.report.dynamics_figures import write as draw
-    cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
     given = inputs.gather(
-        session.fit.path, _cut_paths(recordings(session)[0], cuts), options=options_of(session),
+        session.fit.path, _divided(session)[0], options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
+    outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED))
     say("writing")
     identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
     found = outcome.found
@@ -200,15 +216,15 @@ def identify(session: Session, say: Say) -> list[str]:
 
 def predict(session: Session, say: Say) -> list[str]:
     """Hold the identified model against motion it has not seen, and judge."""
-    cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
-    training, unseen = recordings(session)
+    training, held = _divided(session)
+    unseen = recordings(session)[1]
     notes, aside = [], {}
     for path in unseen:
         aside[path.name], told = _check_recording(session, path, "validation")
         notes += told
     say("predicting unseen motion")
     given = inputs.gather(
-        session.fit.path, _cut_paths(training, cuts), _cut_paths(unseen, aside), options=options_of(session),
+        session.fit.path, training, [*held, *_cut_paths(unseen, aside)], options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     place, tolerance = session.identification, session.settings.dynamics.tolerance_percent
@@ -216,4 +232,4 @@ def predict(session: Session, say: Say) -> list[str]:
     place.unseen.write(given, found)
     known = place.metrics().warnings
     fresh = [words for words in found.warnings if words not in known]
-    return [*notes, f"verdict {found.verdict.level}: {found.verdict.reason}", *fresh]
+    return [*notes, str(found.verdict), *fresh]

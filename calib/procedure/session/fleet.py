@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -15,16 +14,18 @@ from rich.table import Table
 from rich.text import Text
 
 from calib import bug_reports, files
-from calib.errors import CalibError, TaskLost, UsageError, exit_code
+from calib.errors import CalibError, TaskLost, UsageError, complaint
 from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.findings import LEVELS
+from calib.procedure.report import console
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import SETTINGS, locked, open_session, verdict_of
-from calib.records import read_record
+from calib.procedure.session.folder import SETTINGS, locked, open_session
+from calib.records import read_json
 from calib.workers import Workers
 
 LOG = "run.log"
 DONE, WAITS, FAILED = "done", "waits", "failed"
-COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red", DONE: "green", WAITS: "yellow", FAILED: "red"}
+COLOURS = {**console.COLOURS, DONE: "green", WAITS: "yellow", FAILED: "red"}
 
 
 @dataclass(frozen=True)
@@ -103,10 +104,10 @@ def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> Fle
     try:
         outcome = _go_on(folder, said.append, command, plots)
     except Exception as error:  # a robot that fails must not stop the others
-        code = exit_code(error)
-        words = str(error) if code is not None else bug_reports.report(error, command.split()[1:], folder)
+        foreseen = complaint(error)
+        words, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
         said.append(f"failed: {words}")
-        outcome = FleetRow(str(folder), FAILED, words=words, code=bug_reports.CODE if code is None else code)
+        outcome = FleetRow(str(folder), FAILED, words=words, code=code)
     if (folder / SETTINGS).exists():
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")
@@ -123,14 +124,16 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
             say(words)
         words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         return FleetRow(str(folder), WAITS, words=words, asks=asks)
-    verdict = verdict_of(session)
-    pairs = [(one.nominal.main, one.calibrated.main) for one in session.validation.metrics().validation.values()]
+    verdict = session.verdicts().level
+    found = session.validation.metrics() if session.geometric else None
+    sets = found.validation.values() if found else ()
+    pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in sets if found]
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
-        unseen = read_record(UnseenReport, json.loads(session.identification.unseen.report.read_text(encoding="utf-8")))
-        sets = (unseen.validation or unseen.fit).values()
-        torque = max((one.raw.relative_error_percent.total or 0.0 for one in sets), default=None)
+        unseen = read_json(session.identification.unseen.report, "identify again", UnseenReport)
+        scores = (unseen.validation or unseen.fit).values()
+        torque = max((one.raw.relative_error_percent.total or 0.0 for one in scores), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 
@@ -158,7 +161,7 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line on all of them."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
-    judged = {level: sum(one.verdict == level for one in outcomes) for level in ("pass", "marginal", "fail")}
+    judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
     words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
     parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
     parts += [f"{counts[state]} {words}" for state, words in ((WAITS, "waiting"), (FAILED, "failed")) if counts[state]]

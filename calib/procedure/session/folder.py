@@ -12,8 +12,11 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
                  name starts with validation; a file whose name holds a payload's label was recorded with it on board:
                  `calib formats recordings`
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
-9-export/  certificate.html
-                 Without dynamics there are no 6 to 8, and the export is 6-export.
+9-export/        the calibrated robot in the forms other programs read; README.txt says which file is for whom
+certificate.html
+verdict.json     the verdict of the session, of each stage, and of each exported file
+                 Without dynamics there are no 6 to 8, and the export is 6-export. Where nothing is measured there are
+                 no 2 to 5: 1-robot/as_given holds the geometry that dynamics are identified on.
 state.json       which step was made from which files (SHA-256), when, by which version; written whole or not at all
 simulated.txt    there where a simulated cell brought files (calib demo); the certificate then says that it is simulated
 session.lock     there while a command works on the session
@@ -37,17 +40,20 @@ from calib import files
 from calib.config import parse
 from calib.config_types import Text
 from calib.errors import CalibError, SessionError, command_line
-from calib.folders import CERTIFICATE, METRICS
+from calib.folders import CERTIFICATE, METRICS, PARAMETERS
+from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
-from calib.procedure.session.settings import SCHEMA, SessionSettings, check_schema, read_settings, written
+from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
+from calib.robot.calibrated import ROBOT
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
-VERDICTS = ("pass", "marginal", "fail")  # from good to bad
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
-SETTINGS, CHECKED = "session.toml", "checked.txt"
+AS_GIVEN = "1-robot/as_given"  # the robot as it is described, where its geometry is not fitted
+CHECKED, VERDICT = "checked.txt", "verdict.json"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
 PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
@@ -104,9 +110,14 @@ class Session:
         return self.settings.dynamics.wanted
 
     @property
+    def geometric(self) -> bool:
+        """Whether the geometry is fitted; else it is taken as it is described."""
+        return self.settings.instrument.measures != NOTHING
+
+    @property
     def fit(self) -> FitFolder:
-        """What the geometric fit leaves."""
-        return FitFolder(self.folder / IN_SESSION)
+        """What the geometric fit leaves; without one the robot as it is described."""
+        return FitFolder(self.folder / (IN_SESSION if self.geometric else AS_GIVEN))
 
     @property
     def validation(self) -> ValidationFolder:
@@ -129,19 +140,15 @@ class Session:
         steps = {name: asdict(record) for name, record in state.steps.items()}
         files.write_json(self.path("state.json"), {"schema": SCHEMA, "steps": steps, **running})
 
-    def verdicts(self) -> dict[str, tuple[str, str]]:
-        """Return verdict and reason of each stage."""
-        geometry = self.validation.metrics()
-        found = {"geometry": (geometry.verdict, geometry.reason)}
-        if self.dynamic:
-            dynamics = self.identification.unseen.verdict()
-            found["dynamics"] = (dynamics.verdict, dynamics.reason)
-        return found
-
-
-def verdict_of(session: Session) -> str:
-    """Return the worse of the stages' verdicts."""
-    return max((verdict for verdict, _ in session.verdicts().values()), key=VERDICTS.index)
+    def verdicts(self) -> Verdicts:
+        """Return the verdict of each stage; dynamics that were not exported are good for prediction only."""
+        geometry = self.validation.metrics() if self.geometric else None
+        judged = {"geometry": geometry, "dynamics": self.identification.unseen.verdict() if self.dynamic else None}
+        found = {stage: Verdict(one.verdict, one.reason) for stage, one in judged.items() if one}
+        out = self.path(self.export)
+        if self.dynamic and (out / ROBOT).exists() and not any(out.rglob(PARAMETERS)):
+            found["dynamics"] = found["dynamics"].for_prediction("the dynamics could not be exported")
+        return Verdicts(found, geometry.deliverables if geometry else {})
 
 
 def create(
@@ -168,8 +175,8 @@ def create(
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise SessionError(f"{folder} is not empty; give a new folder")
         shutil.rmtree(staging, ignore_errors=True)
-        wanted = settings.dynamics.wanted
-        for name in (*FOLDERS, *(DYNAMIC if wanted else ()), EXPORT[wanted]):
+        wanted, measured = settings.dynamics.wanted, settings.instrument.measures != NOTHING
+        for name in (*(FOLDERS if measured else FOLDERS[:1]), *(DYNAMIC if wanted else ()), EXPORT[wanted]):
             (staging / name).mkdir(parents=True)
         for name, source in (copied or {}).items():
             (staging / name).parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,9 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, filled_in, read_poses, write_poses
 from calib.errors import RobotError, UsageError
+from calib.folders import write_staged
 from calib.geometry.weighing import Settings
+from calib.procedure.findings import UNJUDGED
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
@@ -30,9 +33,12 @@ from calib.procedure.measuring.selection_prediction import SelectionPrediction, 
 from calib.procedure.measuring.selection_prediction import read as read_prediction
 from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.procedure.report import certificate, fit_report
+from calib.procedure.report.geometry_section import error_words, parameter_words
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, WAYS, Session
+from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, VERDICT, WAYS, Session
+from calib.robot import calibrated
 from calib.robot.chain import Chain
+from calib.robot.load import load_calibrated
 from calib.units import JOINT
 
 Say = Callable[[str], None]
@@ -107,7 +113,13 @@ def describe(session: Session, say: Say) -> list[str]:
     lines += ["", "elements, base to tip [m, rad]"]
     lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]
     files.write(session.path(SUMMARY), "\n".join(lines) + "\n")
-    return [lines[0]]
+    if session.geometric:
+        return [lines[0]]
+    robot = session.settings.robot
+    known = load_calibrated(robot_file(session), robot.base or None, robot.tip or None)
+    session.fit.path.mkdir(exist_ok=True)
+    calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
+    return [lines[0], "nothing is measured: this geometry is taken as calibrated"]
 
 
 def select(session: Session, say: Say) -> list[str]:
@@ -205,7 +217,8 @@ def _fit_settings(session: Session) -> FitSettings:
     model, loss = (None if value == "auto" else value for value in (wanted.model, wanted.loss))
     return FitSettings(
         model=model, loss=loss, stations=wanted.stations, tolerance=_tolerance_of(session),
-        refit_frames=wanted.validation_frames == "own", seed=session.settings.seed,
+        refit_frames=wanted.validation_frames == "own", seed=session.settings.seed, holdout=wanted.holdout,
+        deliverable=wanted.deliverable,
     )  # fmt: skip
 
 
@@ -223,10 +236,11 @@ def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
     selection = _selection_prediction(session)
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
-    draw = partial(certificate.write_fit, plots=session.plots)
+    outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED, deliverables={}))
+    draw = partial(certificate.write_fit, plots=session.plots, page=False)
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
-    count = len(outcome.selection.fit.free)
-    notes = [f"model {outcome.selection.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+    metrics = session.fit.metrics()
+    notes = [f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}", *outcome.warnings]
     notes += [
         f"σ of {row.kind}: {row.predicted:.3g} {row.unit} predicted when the poses were chosen, {row.stated:.3g} "
         f"{row.unit} stated"
@@ -247,9 +261,6 @@ def validate(session: Session, say: Say) -> list[str]:
     chain, unseen, notes = chain_of(session), measured_files(session)[1], []
     fit, out = session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
-    if not session.settings.poses.validation and not unseen:
-        fit_report.write(report.with_unseen(out.take_over(before), []), out.report)
-        return ["no validation asked for: judged by cross-validation only"]
     plan = _planned(session, chain, "validation")
     like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
     for path in unseen:
@@ -257,47 +268,56 @@ def validate(session: Session, say: Say) -> list[str]:
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
     settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
-    found = assess(
-        fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model or options.model,
-        tolerance=wanted.tolerance, seed=wanted.seed,
-    )  # fmt: skip
+    asked = replace(wanted, model=wanted.model or options.model)
+    found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
     written = out.write(found, given, [asdict(each) for each in rows])
     fit_report.write(report.with_unseen(written, rows), out.report)
     fresh = [words for words in found.warnings if words not in before.warnings]
-    return [*notes, f"verdict {found.verdict.level}: {found.verdict.reason}", *fresh]
+    return [*notes, str(found.verdict), *fresh]
 
 
 def export(session: Session, say: Say) -> list[str]:
-    """Put the calibrated robot into the forms others read; of one that does not pass the files say so."""
-    from calib.procedure.export.delivery import mark
+    """Put the calibrated robot into the forms others read, with a verdict on each, and on the session as a whole."""
+    from calib.procedure.export.delivery import by_file, mark, prediction
 
     out = session.path(session.export)
     lines = _exported(session, out, say)
-    return [*mark(out, session.verdicts()), *lines]
+    found = session.verdicts()
+    judged = {name: one.table() for name, one in by_file(out, found).items() if one.level}
+    whole = {"schema": 1, **found.table(), "deliverable": session.settings.fit.deliverable, "files": judged}
+    known = prediction(out)
+    files.write_json(session.path(VERDICT), whole | {"exported_prediction": known and asdict(known)})
+    return [*mark(out, found), *lines]
 
 
 def _exported(session: Session, out: Path, say: Say) -> list[str]:
-    from calib.procedure.export.delivery import DYNAMICS, deliver
+    from calib.procedure.export.delivery import USES, deliver
 
     source = robot_file(session)
-    lines = deliver(session.fit.path, source, out)
+    if session.geometric:
+        lines = deliver(session.fit.path, source, out)
+    else:
+        lines = [calibrated.ROBOT]
+        write_staged(out, USES, partial(_copy, session.fit.robot))
     if not session.dynamic:
         return lines
     from calib.procedure.export.dynamics import deliver_dynamics
 
     say("all parameters of possible bodies")
-    corrected = (out / outputs.CORRECTED_URDF).exists()  # identified on another geometry than robot.urdf's
-    place = out / DYNAMICS if corrected else out
+    for name in USES:  # a second robot.urdf, by earlier versions
+        (out / "dynamics" / name).unlink(missing_ok=True)
+    with suppress(OSError):  # not there, or not empty
+        (out / "dynamics").rmdir()
     try:
-        found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, place)
+        found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
     except (RobotError, UsageError) as error:  # the geometry stands by itself
         return [*lines, f"the dynamics were not exported: {error}"]
-    return [
-        *lines,
-        *([f"in {place.name}, on the geometry that joint corrections belong to:"] if corrected else []),
-        *found,
-    ]
+    return [*found, *(lines[1:] if session.geometric else lines)]
+
+
+def _copy(source: Path, folder: Path) -> None:
+    files.write(folder / source.name, source.read_bytes())
 
 
 def clear_staging(session: Session) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from calib.data.csv_table import read_table
 from calib.data.poses.pixels import Pixels
 from calib.errors import SessionError, command_line
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -34,7 +35,7 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
     device = session.settings.instrument.name
     if not session.settings.poses.plan or not path.exists():
         return f"Measure the target's {what} with the {device} at poses all over the workspace."
-    count = sum(1 for _ in path.open()) - 1
+    count = len(read_table(path))
     return (
         f"Drive the {count} poses of {path}{_in_order(session) if name == 'poses' else ''}"
         f"{_and_validation(session) if both else ''}, let the arm settle, measure the "
@@ -48,7 +49,7 @@ def _take_images(session: Session, path: Path, both: bool) -> str:
     """Say how images are to be taken."""
     where = "poses all over the workspace that see the board from near and far, and tilted"
     if session.settings.poses.plan and path.exists():
-        where = f"the {sum(1 for _ in path.open()) - 1} poses of {path}{_and_validation(session) if both else ''}"
+        where = f"the {len(read_table(path))} poses of {path}{_and_validation(session) if both else ''}"
     return (
         f"Drive {where}; at each let the arm settle for a second, take an image of the board (focus, zoom and exposure "
         "fixed, no automatic ones, no image turned or scaled), and log the joint angles read back."
@@ -66,7 +67,7 @@ def _and_validation(session: Session) -> str:
     path = session.path(f"2-poses/{UNSEEN}")
     if not session.settings.poses.validation or not path.exists():
         return ""
-    return f" and, into a file of their own, the {sum(1 for _ in path.open()) - 1} of {path} (never fitted)"
+    return f" and, into a file of their own, the {len(read_table(path))} of {path} (never fitted)"
 
 
 def _form(session: Session, target: str, both: bool) -> str:

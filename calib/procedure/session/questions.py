@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.errors import UsageError
 from calib.procedure.measuring.cell_answers import CAMERA, UNKNOWN, cell_tables
-from calib.procedure.session.settings import TORQUES
+from calib.procedure.session.settings import NOTHING, TORQUES
 from calib.robot import library
 from calib.robot.load import resolve
 
@@ -47,6 +47,7 @@ INSTRUMENTS = {
     "camera-poses": InstrumentPreset(
         "camera and board", "pose", 0.0, 0.0, "poses by another program; estimated from the residuals"
     ),
+    "none": InstrumentPreset("no instrument", NOTHING, 0.0, 0.0, "dynamics alone"),
     "other-pose": InstrumentPreset("instrument", "pose", 0.0, 0.0, "estimated from the residuals"),
     "other-position": InstrumentPreset("instrument", "position", 0.0, 0.0, "estimated from the residuals"),
 }
@@ -92,6 +93,11 @@ class Answers:
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}
 
     @property
+    def by_nothing(self) -> bool:
+        """Whether the geometry is taken as it is described."""
+        return self.instrument in INSTRUMENTS and INSTRUMENTS[self.instrument].measures == NOTHING
+
+    @property
     def by_camera(self) -> bool:
         """Whether images are taken: where the camera is takes more than a place."""
         return self.instrument in INSTRUMENTS and INSTRUMENTS[self.instrument].measures == "pixels"
@@ -117,7 +123,7 @@ def _of_the_cell(name: str) -> Callable[[Answers], bool]:
 
     def is_open(given: Answers) -> bool:
         told = not known or known in cell_tables(given.instrument_at)
-        asked = name != "instrument_at" or not given.by_camera
+        asked = name != "instrument_at" or not (given.by_camera or given.by_nothing)
         return given.limits is None and getattr(given, name) is None and told and asked
 
     return is_open
@@ -140,7 +146,7 @@ QUESTIONS = (
     _Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
     _Question(
         "tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05",
-        lambda given: given.tool is None and not given.by_camera,
+        lambda given: given.tool is None and not (given.by_camera or given.by_nothing),
     ),
     _Question(
         "limits", "file that states the cell: instrument, obstacles, speeds (none: asked for now)", "none",
@@ -189,7 +195,10 @@ QUESTIONS = (
         "obstacles", "what stands there: table box 1.2,0.8,0.05 at 0.7,0,-0.03; … [m], middles (unknown; none)",
         "unknown", _of_the_cell("obstacles"),
     ),
-    _Question("dynamics", "identify the dynamics, too (yes, no)", "yes", _unanswered("dynamics")),
+    _Question(
+        "dynamics", "identify the dynamics, too (yes, no)", "yes",
+        lambda given: given.dynamics is None and not given.by_nothing,
+    ),
     _Question(
         "torques", "torques in the log (motor, link, both)", "motor",
         lambda given: given.dynamics is not False and given.torques is None,

@@ -6,7 +6,7 @@ Lengths in m, angles in rad. Every key, what it may be, its default and its comm
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
 from textwrap import wrap
@@ -36,15 +36,15 @@ from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, HARMONICS
-from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings
+from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, DELIVERABLES, FitSettings
 from poses.indices import Index
 from poses.select import Method
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
 TORQUES = ("motor", "link", "both")
+NOTHING = "nothing"  # is measured: the geometry is taken as it is described
 MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
-LATER = {("fit", "tolerance_mm")}  # keys that sessions made before do not have
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
 COLUMN, WIDTH = 41, 118  # where comments begin and end
 _HEAD = (
@@ -81,7 +81,9 @@ class InstrumentSection:
 
     name: Text
     measures: Annotated[
-        str, OneOf(("pose", "position", "pixels")), About("pose (with orientation), position or pixels")
+        str,
+        OneOf(("pose", "position", "pixels", NOTHING)),
+        About("pose (with orientation), position or pixels; nothing: the geometry is taken as it is described"),
     ]
     sigma_position: Annotated[MetresOrZero, About("of one measurement, per axis; 0: to be estimated")] = 0.0
     sigma_orientation: RadiansOrZero = 0.0
@@ -130,6 +132,16 @@ class FitSection:
             "only means better than the nominal robot"
         ),
     ] = 0.0
+    deliverable: Annotated[
+        str,
+        OneOf(DELIVERABLES),
+        About("what the verdict is about: robot.urdf alone, or corrections: with joint_corrections.csv"),
+    ] = FitSettings.deliverable
+    holdout: Annotated[
+        float,
+        Real(least=0.0, most=0.9, words="a share from 0 to 0.9"),
+        About("share of the measured poses that is not fitted but judged on, for want of a validation file; 0: none"),
+    ] = FitSettings.holdout
 
 
 @strict
@@ -159,6 +171,11 @@ class DynamicsSection:
     ] = IdentificationSettings.friction
     method: Annotated[str, OneOf(tuple(METHODS)), About("or ols, irls, tls")] = IdentificationSettings.method
     options: Annotated[Beside, About("a TOML file beside this one; see `calib formats identify-options`")] = ""
+    holdout: Annotated[
+        float,
+        Real(least=0.0, most=0.9, words="a share from 0 to 0.9"),
+        About("share of each recording, its end, that is not learnt from but judged on, for want of another; 0: none"),
+    ] = 0.0
     tolerance_percent: Annotated[
         NotNegative, About("largest torque error on unseen motion that is good enough; 0: none")
     ] = 0.0
@@ -192,7 +209,7 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; one of schema 1 gets no dynamics, missing keys of [dynamics] their defaults.
+    """Read ``session.toml``; one of schema 1 gets no dynamics, missing keys their defaults.
 
     Raises:
         SessionError: where it was made by a newer version, is damaged, or a value cannot be.
@@ -202,10 +219,6 @@ def read_settings(path: Path) -> SessionSettings:
     if table["schema"] == 1:
         table.setdefault("dynamics", {"wanted": False})
     found = parse(SessionSettings, table, str(path), SessionError)
-    for section in ("robot", "instrument", "poses", "fit"):
-        for key in fields(getattr(found, section)):
-            if key.name not in table[section] and (section, key.name) not in LATER:
-                raise SessionError(f"{path}: {section}.{key.name} is missing; its default is {key.default!r}")
     for key in FILES:
         name = attrgetter(key)(found)
         if name and (path.parent / name).is_dir():
@@ -229,6 +242,13 @@ def check_schema(path: Path, found: Any) -> None:
     raise SessionError(
         f"{path}: schema {shown(found)} is not known to this version, which reads {known}; make a new session"
     )
+
+
+def default_keys(section: str) -> dict[str, Any]:
+    """Return the keys of a section that have defaults, with these; of a key outside sections nothing."""
+    kind = get_type_hints(SessionSettings).get(section)
+    keys = fields(kind) if is_dataclass(kind) else ()
+    return {key.name: key.default for key in keys if key.default is not MISSING}
 
 
 def written(settings: SessionSettings) -> str:

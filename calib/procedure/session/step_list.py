@@ -11,6 +11,7 @@ from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import certificate, dynamics_steps, geometry_steps
 from calib.procedure.session.folder import (
+    AS_GIVEN,
     CUTS,
     MARK,
     MOTION_CHECKED,
@@ -21,6 +22,7 @@ from calib.procedure.session.folder import (
     SELECTION,
     SUMMARY,
     UNSEEN,
+    VERDICT,
     WAYS,
     Session,
 )
@@ -38,7 +40,7 @@ class SessionStep:
         inputs: the files it reads, as they are now.
         make: runs it; returns what is to be said.
         outputs: names or patterns, relative to the session, of what it makes.
-        dynamic: whether only sessions with dynamics have it.
+        stage: ``geometry`` or ``dynamics``, where only sessions with that have it.
     """
 
     name: str
@@ -47,7 +49,7 @@ class SessionStep:
     inputs: Callable[[Session], list[Path]]
     make: Callable[[Session, Say], list[str]]
     outputs: tuple[str, ...]
-    dynamic: bool = False
+    stage: str = ""
 
 
 def _robot(session: Session) -> list[Path]:
@@ -125,15 +127,18 @@ def _files_of(paths: list[Path]) -> list[Path]:
 
 
 def _exported(session: Session) -> list[Path]:
-    own = [*_robot(session), session.fit.robot, session.fit.urdf]
-    own.append(session.validation.judged)  # a failed robot's files say so
+    own = [*_robot(session), session.fit.robot]
+    if session.geometric:
+        own += [session.fit.urdf, session.validation.judged]  # a failed robot's files say so
     found = session.identification
     return own + ([found.model, *found.tables, found.unseen.report] if session.dynamic else [])
 
 
 def _certified(session: Session) -> list[Path]:
-    made = [session.fit.report, session.validation.judged, session.path(f"{session.export}/{URDF}")]
-    made += [session.path(SELECTION), session.path(POSES_CHECKED)]
+    made = [session.path(VERDICT)]
+    if session.geometric:
+        made = [session.fit.report, session.validation.judged, session.path(f"{session.export}/{URDF}")]
+        made += [session.path(SELECTION), session.path(POSES_CHECKED)]
     if session.dynamic:
         found = session.identification
         made += [session.path(MOTION_CHECKED), found.numbers, found.tables[0], found.unseen.report]
@@ -141,7 +146,7 @@ def _certified(session: Session) -> list[Path]:
 
 
 PLAN = "plan validation period harmonics rate starts evaluations limits"
-MODEL = "torques friction method options payloads"
+MODEL = "torques friction method options payloads holdout"
 
 
 def _keys(names: str) -> tuple[str, ...]:
@@ -149,43 +154,45 @@ def _keys(names: str) -> tuple[str, ...]:
 
 
 STEPS = (
-    SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY,)),
+    SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY, f"{AS_GIVEN}/*")),
     SessionStep(
         "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
         (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED, PREDICTION),
+        "geometry",
     ),
     SessionStep(
         "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,
-        (POSES_CHECKED,),
+        (POSES_CHECKED,), "geometry",
     ),
     SessionStep(
         "fit", "fit the geometry", ("robot", "instrument", "fit", "seed"), _fitted, geometry_steps.fit, ("4-fit/*",),
+        "geometry",
     ),
     SessionStep(
         "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
         geometry_steps.validate,
-        ("5-validation/*",),
+        ("5-validation/*",), "geometry",
     ),
     SessionStep(
         "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamics_steps.excite,
-        ("6-excitation/*/*",), True,
+        ("6-excitation/*/*",), "dynamics",
     ),
     SessionStep(
-        "record", "check what was recorded", _keys("plan repeats torques options payloads"), _recorded,
-        dynamics_steps.record, (MOTION_CHECKED, CUTS), True,
+        "record", "check what was recorded", _keys("plan repeats torques options payloads holdout"), _recorded,
+        dynamics_steps.record, (MOTION_CHECKED, CUTS), "dynamics",
     ),
     SessionStep(
         "identify", "identify the dynamics", (*_keys(MODEL), "seed"), _identified, dynamics_steps.identify,
-        ("8-dynamics/*",), True,
+        ("8-dynamics/*",), "dynamics",
     ),
     SessionStep(
         "predict", "hold it against unseen motion",
         (*_keys(f"plan validation repeats tolerance_percent {MODEL}"), "seed"), _predicted, dynamics_steps.predict,
-        ("8-dynamics/unseen/*",), True,
+        ("8-dynamics/unseen/*",), "dynamics",
     ),
     SessionStep(
         "export", "write the calibrated robot", ("robot",), _exported, geometry_steps.export,
-        ("6-export/*", "9-export/*", "9-export/dynamics/*"),
+        ("6-export/*", "9-export/*", VERDICT),
     ),
     SessionStep(
         "certificate", "print the certificate",

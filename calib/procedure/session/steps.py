@@ -29,6 +29,7 @@ from calib.procedure.session.folder import (
     StepRecord,
     read_state,
 )
+from calib.procedure.session.settings import default_keys
 from calib.procedure.session.step_list import STEPS, SessionStep
 
 Say = Callable[[str], None]
@@ -47,7 +48,8 @@ class State:
 
 def _steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session."""
-    return tuple(step for step in STEPS if session.dynamic or not step.dynamic)
+    left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric}
+    return tuple(step for step in STEPS if not left_out.get(step.stage))
 
 
 def find(session: Session, name: str) -> SessionStep:
@@ -60,10 +62,9 @@ def find(session: Session, name: str) -> SessionStep:
     for number, step in enumerate(own, 1):
         if name in (step.name, str(number)):
             return step
-    if name in (step.name for step in STEPS):
-        raise SessionError(
-            f"this session is about geometry only; for '{name}' write wanted = true under [dynamics] in session.toml"
-        )
+    if stage := next((step.stage for step in STEPS if step.name == name), ""):
+        key = "wanted = true under [dynamics]" if stage == "dynamics" else "what measures under [instrument]"
+        raise SessionError(f"this session leaves the {stage} out; for '{name}' write {key} in session.toml")
     raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in own)}")
 
 
@@ -116,13 +117,14 @@ def _missing(session: Session, step: SessionStep) -> str:
     fit, unseen = geometry_steps.measured_files(session)
     if step.name == "measure" and not fit:
         return "a file of measured poses"
-    if step.name == "validate" and session.settings.poses.validation and not unseen:
+    if step.name == "validate" and session.settings.poses.validation and not (unseen or session.settings.fit.holdout):
         return "a file of measured validation poses"
     if step.name in ("record", "predict"):
         training, unseen = dynamics_steps.recordings(session)
         if step.name == "record" and not training:
             return "a recording of the training motion"
-        if step.name == "predict" and session.settings.dynamics.validation and not unseen:
+        wanted = session.settings.dynamics
+        if step.name == "predict" and wanted.validation and not (unseen or wanted.holdout):
             return "a recording of the validation motion"
     absent = [path for path in step.inputs(session) if not path.exists()]
     own = [path for path in absent if not path.name.startswith(PLANS)]
@@ -146,20 +148,31 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
 def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say what differs between two sets of fingerprints."""
     changed = [name for name in now if name in before and not _same(name, before[name], now[name])]
-    added, gone = sorted(set(now) - set(before)), sorted(set(before) - set(now))
+    added = [name for name in sorted(set(now) - set(before)) if not _same(name, "{}", now[name])]
+    gone = sorted(set(before) - set(now))
     parts = [f"{name} has changed" for name in changed]
     parts += [f"{name} is new" for name in added] + [f"{name} is gone" for name in gone]
     return ", ".join(parts)
 
 
 def _same(name: str, before: str, now: str) -> bool:
-    """Compare two fingerprints; those of settings by value, so that 3 is 3.0."""
+    """Compare two fingerprints; of settings by value: 3 is 3.0, and a key that was not there had its default.
+
+    A single key that was not there is ``{}`` before.
+    """
     if before == now or not name.startswith(SETTINGS):
         return before == now
+    section, _, key = name.removeprefix(f"{SETTINGS} [").partition("]")
     try:
-        return json.loads(before) == json.loads(now)
+        values = [json.loads(mark) for mark in (before, now)]
     except ValueError:
         return False
+    if key:
+        values = [{} if mark == "{}" else {key.strip(): value} for mark, value in zip((before, now), values)]
+    if not all(isinstance(value, dict) for value in values):
+        return values[0] == values[1]
+    defaults = default_keys(section)
+    return defaults | values[0] == defaults | values[1]
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:

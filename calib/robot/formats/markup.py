@@ -53,8 +53,11 @@ def text(path: str | Path) -> tuple[str, str]:
     declared = _DECLARED.match(data)
     encoding = declared[1].decode() if declared else "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
     try:
-        return data.decode(encoding), encoding
-    except (LookupError, UnicodeDecodeError) as error:
+        found = data.decode(encoding)
+        for way in ("utf-8", encoding):  # Python knows encodings that are no way back
+            found.encode(way)
+        return found, encoding
+    except (LookupError, UnicodeError) as error:
         raise RobotError(f"{path}: not readable as {encoding}: {error}") from error
 
 

@@ -281,3 +281,22 @@ def test_a_multi_turn_joint_passes_within_its_limits(write, good):
     rows = [[row[0], row[1], 5 * row[2], *row[3:]] for row in good]
     assert len(read(write(POSE, rows), limits=([-3, -3, -20], [3, 3, 20]))) == 10
     assert len(read(write(POSE, rows), kinds=("revolute", "revolute", "continuous"))) == 10
+
+
+@pytest.mark.parametrize(
+    "names, euler, turn",
+    [
+        ("rx,ry,rz", "vector", lambda q: q.as_rotvec()),
+        ("A,B,C", "zyx moving", lambda q: q.as_euler("ZYX")),
+        ("roll,pitch,yaw", "xyz fixed", lambda q: q.as_euler("xyz")),
+    ],
+)
+def test_orientations_in_angles_are_those_of_the_stated_convention(write, good, names, euler, turn):
+    quaternion = np.array(good, dtype=float)[:, 6:]
+    rows = [[*row[:6], *angles] for row, angles in zip(good, turn(Rotation.from_quat(quaternion)))]
+    path = write(f"q1,q2,q3,x,y,z,{names}", rows)
+    found = Rotation.from_quat(read(path, FileOptions(euler=euler)).quaternion)
+    assert (found * Rotation.from_quat(quaternion).inv()).magnitude().max() < 1e-7
+    with pytest.raises(MeasurementError, match="look like an orientation"):
+        read(path)
+    assert read(path, FileOptions(kind="position")).kind == "position"

@@ -8,7 +8,7 @@ import pytest
 from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, UsageError
 
 
 def falling(back: bool) -> dict[str, np.ndarray]:
@@ -60,3 +60,30 @@ def test_a_file_that_is_no_recording_is_told_why(tmp_path):
         read_recording(tmp_path / "text.npz")
     with pytest.raises(MeasurementError, match=r"a cut is written log\.npz@0:9\.4"):
         read_recording(tmp_path / "log.npz@abc")
+
+
+@pytest.mark.parametrize("mark", [" ", ";", "|", ","])
+@pytest.mark.parametrize(
+    "names", ["actual_q_{} actual_current_{}", "state.q[{}] state.current[{}]", "J{}_pos J{}_current"]
+)
+def test_logs_of_controllers_are_read_whatever_parts_the_columns(tmp_path, mark, names):
+    series = falling(True)
+    q, current = names.split()
+    head = ["timestamp", *(q.format(k) for k in (0, 1)), *(current.format(k) for k in (0, 1))]
+    rows = np.column_stack([series["t"], series["q"], series["tau"]])
+    lines = [mark.join(head), *(mark.join(f"{x:.9g}" for x in row) for row in rows)]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    found = read_recording(tmp_path / "log.csv")
+    assert found.kind == "current" and np.abs(found.q - series["q"]).max() < 1e-8
+
+
+def test_unknown_names_are_asked_for_with_the_line_to_write(tmp_path):
+    series = falling(True)
+    np.savez(tmp_path / "log.npz", t=series["t"], enc_position=series["q"], motor_amps=series["tau"])
+    with pytest.raises(MeasurementError, match=r'names = \{ q = "enc_position", current = "motor_amps" \}'):
+        read_recording(tmp_path / "log.npz")
+
+
+def test_a_cut_before_the_start_is_refused():
+    with pytest.raises(UsageError, match="before the recording"):
+        read_recording("log.npz@-1:2")

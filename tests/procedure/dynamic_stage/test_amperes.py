@@ -46,7 +46,7 @@ def amperes(robot: Path) -> Path:
 def test_a_model_in_amperes_says_so_in_every_file(amperes):
     metrics, dynamics = (json.loads((amperes / name).read_text()) for name in ("metrics.json", "dynamics.json"))
     assert metrics["unit"] == dynamics["unit"] and dynamics["unit"].startswith("A of joint")
-    assert "not in N m" in metrics["warnings"][0] and "failure" in metrics["tracking"]
+    assert "torques are in amperes, scaled to joint 2" in metrics["warnings"][0] and "failure" in metrics["tracking"]
     units = {row["unit"] for row in csv.DictReader((amperes / "estimate.csv").open())}
     assert units and all("A" in unit.split()[0] or unit.endswith("A/(N m)") for unit in units)
     assert not {"N m", "kg m²"} & {term["unit"] for term in dynamics["terms"]}

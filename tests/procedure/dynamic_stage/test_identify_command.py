@@ -176,6 +176,14 @@ def test_options_are_held_against_what_exists(robot, tmp_path, capsys, text, sai
     assert not (tmp_path / "out").exists()
 
 
+def test_a_payload_of_unknown_centre_on_unseen_motion_alone_is_refused(robot, tmp_path, capsys):
+    train, unseen = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
+    identify_options = tmp_path / "options.toml"
+    identify_options.write_text('[payload.tool]\nmass = 2.0\n[files."other.npz"]\npayload = ["tool"]')
+    code = run(robot, train, "--validate", unseen, "--options", identify_options, "--out", tmp_path / "out")
+    assert code == 2 and "other.npz carries 'tool'" in capsys.readouterr().err
+
+
 def test_other_folders_are_not_overwritten(robot, tmp_path, capsys):
     train, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "out"
     out.mkdir()

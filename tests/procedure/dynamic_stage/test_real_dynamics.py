@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from without_figures import run
 
+from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage.gains import find_gains
-from calib.procedure.dynamic_stage.inputs import read_motion
+from calib.procedure.dynamic_stage.inputs import gather, read_motion
+from calib.procedure.dynamic_stage.plausibility import EXCHANGED, UNTOLD
 from calib.robot.load import load
 
 
@@ -320,6 +323,36 @@ def test_tiago_prismatic_torso_and_signed_gains(data, tmp_path):
     with (tmp_path / "out" / "estimate.csv").open() as file:
         units = {row["name"]: row["unit"] for row in csv.DictReader(file)}
     assert units["Fc1"] == "N" and units["Fc2"] == "N m"
+
+
+LOGS = {
+    "franka_panda_inria/traj1_first60pct.npz": (0.0, 6.3, 12.6),
+    "staubli_tx40/tx40_first_5p4s.npz": (0.0, 2.0, 5.4),  # its coupled wrist passed for joints 4 and 6 exchanged
+    "kuka_kr300_tuk/traj_A.npz": (0.0, 5.0, 10.0),
+    "kuka_lwr4plus_iit/measurements_1.npz": (2.5, 12.5, 25.0),
+    "tiago_laas/dynamic.npz": (0.0, 40.0, 80.0),
+    "ur10e_innopolis/ur-20_02_10-30sec_12harm.npz": (7.0, 21.0, 35.0),
+}
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_no_sign_and_no_order_of_a_sound_recording_is_called_wrong(data, log):
+    robot, (start, middle, end) = (data / log).parent / "model.urdf", LOGS[log]
+    for part in ((start, end), (start, middle), (middle, end)):
+        (case,) = gather(robot, [f"{data / log}@{part[0]}:{part[1]}"]).cases
+        other = compare_sizes(case, load(robot)).other
+        assert signs_of(case, load(robot)) is None
+        assert other is None or other.quarters or other.factor > EXCHANGED or other.left > UNTOLD
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_a_reversed_sign_of_a_panda_is_named(data, joint):
+    robot = data / "franka_panda_inria" / "model.urdf"
+    (case,) = gather(robot, [f"{robot.parent / 'traj1_first60pct.npz'}@0:8.5"]).cases
+    signs = np.where(np.arange(7) == joint, -1.0, 1.0)
+    found = signs_of(replace(case, target=case.target * signs), load(robot))
+    assert found is not None and found.joints == (joint,)
+    assert found.before[0] > 2.0 * found.after[0]
 
 
 @pytest.mark.parametrize("clash", ["kuka_kr300_tuk/traj_A.npz", "ur10e_innopolis/ur-20_01_17-p1.npz"])

@@ -45,7 +45,9 @@ def test_an_excitation_has_the_rigid_geometry(robot: CalibratedChain, folder: Pa
 def test_a_plan_has_the_rigid_geometry(robot: CalibratedChain, folder: Path) -> None:
     way = folder / "way.csv"
     way.write_text("x [m],y [m],z [m]\n0.4,0.2,0.4\n0.3,-0.3,0.5\n")
-    one, two = (planning.plan(each, way) for each in (robot, folder))
+    limits = folder / "limits.toml"
+    limits.write_text("[acceleration]\nall = 5.0\n")
+    one, two = (planning.plan(each, way, limits=limits) for each in (robot, folder))
     np.testing.assert_array_equal(one.track.q, two.track.q)
     for found in (one, two):
         np.testing.assert_array_equal(found.chain.values, robot.chain.values)

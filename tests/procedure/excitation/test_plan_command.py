@@ -20,7 +20,6 @@ from calib.dynamics.bodies import STANDARD
 from calib.errors import CalibError
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation import planning
-from calib.procedure.excitation.folder import plan_lines
 from calib.procedure.excitation.settings import PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.robot import description
@@ -68,7 +67,7 @@ def plan(*more: str) -> int:
 
 def columns(path: Path) -> dict[str, np.ndarray]:
     with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+        rows = list(csv.DictReader(line for line in file if line[0] != "#"))
     return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
 
 
@@ -262,8 +261,10 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
     "change, message",
     [
         ({"M": -2.0}, "body behind A4: a negative mass"),
-        ({"velocity": 0.0}, "joint 'A4': velocity 0 is no limit"),
-        ({"effort": 0.0}, "joint 'A4': effort 0 is no limit"),
+        ({"velocity": 0.0}, "nothing limits the speed of A4 (velocity 0 is no limit)"),
+        ({"velocity": 1e8}, "nothing limits the speed of A4 (velocity 1e+08 is no limit)"),
+        ({"velocity": np.inf}, "nothing limits the speed of A4, and"),
+        ({"effort": 0.0}, "nothing limits the acceleration of A4 (effort 0 is no limit)"),
     ],
 )
 def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, message):
@@ -278,9 +279,37 @@ def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, messag
     if "velocity" in change:
         limits.write_text('[velocity]\nA4 = "90 deg/s"\n')
         assert planning.plan(CalibratedChain(wrong), Path("way.csv"), limits=limits).limits.velocity[3] == np.pi / 2
-        told = planning.plan(CalibratedChain(replace(wrong, joints=CHAIN.joints)), Path("way.csv"))
-        assert not any("NOT limited" in note for note in told.notes)
-        free = replace(joints[3], unstated=())
-        told = planning.plan(CalibratedChain(replace(wrong, joints=(*joints[:3], free, *joints[4:]))), Path("way.csv"))
-        assert any("no velocity limit is known of A4" in note for note in told.notes)
-        assert "none that is known is crossed" in plan_lines(told)[0]
+
+
+@pytest.mark.parametrize("stated", ["", '[velocity]\nall = "30 deg/s"\n', "[acceleration]\nq1 = 5.0\n"])
+def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
+    """Masses are not known of a UR10e, so nothing but the limits file can say how fast its joints may gather speed."""
+    write_waypoints([[0, -1.6, 1.6, -1.6, -1.6, 0], [0.7, -1.2, 1.4, -1.7, -1.6, 0.3]], header="q1,q2,q3,q4,q5,q6")
+    Path("limits.toml").write_text(stated)
+    words = ("plan", "ur10e", "--waypoints", "way.csv", "--limits", "limits.toml", "--out", "out")
+    assert run(*words) == 2
+    said = capsys.readouterr().err
+    assert "nothing limits the acceleration of" in said and "such as [acceleration] all = 5.0" in said
+    assert said.count("\n") == 1 and not Path("out").exists()
+    with pytest.raises(CalibError, match="nothing limits the acceleration"):
+        planning.plan("ur10e", Path("way.csv"))
+    Path("limits.toml").write_text(stated.replace("q1", "all") + "[acceleration]\nall = 5.0\n" * ("q1" not in stated))
+    assert run(*words) == 0
+    head = [line for line in Path("out/motion.csv").read_text().splitlines() if line.startswith("#")]
+    assert any("acceleration limits: 5 rad/s² all joints (limits.toml)" in line for line in head)
+    assert Path("out/trajectory.yaml").read_text().splitlines()[: len(head)] == head
+    motion = columns(Path("out/motion.csv"))
+    assert max(np.abs(motion[f"a{j}"]).max() for j in range(1, 7)) <= 5.0 * (1 + 1e-9)
+
+
+def test_a_motion_beyond_its_bounds_is_not_written(room):
+    planned = planning.plan("lwr4plus", room / "way.csv")
+    with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .* and it is not written"):
+        motion_folder.write_plan(replace(planned, track=replace(planned.track, v=2 * planned.track.v)), room / "out")
+    assert not (room / "out").exists()
+
+
+def test_torque_limits_that_no_robot_has_limit_no_acceleration(room):
+    joints = tuple(replace(joint, effort=1e4) for joint in CHAIN.joints)
+    with pytest.raises(CalibError, match=r"the acceleration of joint\d reaches \d+ in this motion, beyond 3000"):
+        planning.plan(CalibratedChain(replace(CHAIN, joints=joints)), room / "way.csv")

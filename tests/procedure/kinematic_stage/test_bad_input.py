@@ -238,7 +238,8 @@ def test_a_number_that_is_not_finite_is_never_written(tmp_path):
 
 
 def test_poses_copied_ten_times_are_twenty_poses(cell, calib):
-    code, out, err = calib("fit", "ur5", cell.write("a.csv", 10 * cell.measure(20)), "--no-plots", "--out", "o")
+    file, judged = cell.write("a.csv", 10 * cell.measure(20)), ("--deliverable", "corrections")
+    code, out, err = calib("fit", "ur5", file, *judged, "--no-plots", "--out", "o")
     assert (code, "180 rows" in out, "verdict: pass" in out) == (0, True, False), err
 
 

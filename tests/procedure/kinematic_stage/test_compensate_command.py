@@ -161,12 +161,16 @@ def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     """Placed where it fits best, the nominal robot is off by what the fit reports as its error, and by no more."""
     write(here / "t.csv", Q, drawn(cell, 200, 7))
     metrics = json.loads((fitted / "metrics.json").read_text())["validation"]["seen.csv"]
-    sizes = {}
+    sizes, said = {}, {}
     for frame in ("base", "nominal"):
-        assert calib("compensate", fitted, "t.csv", "--frame", frame, "--tool", "tool", "--out", "commands.csv")[0] == 0
+        where = ("--frame", frame, "--tool", "tool", "--out", "commands.csv")
+        code, said[frame], _ = calib("compensate", fitted, "t.csv", *where)
+        assert code == 0
         sizes[frame] = np.sqrt(np.mean(numbers(commands(), ["before [mm]"]) ** 2))
     assert sizes["nominal"] == pytest.approx(metrics["nominal"]["position_mm"]["rms"], rel=0.2)
     assert sizes["nominal"] < sizes["base"]
+    own = " ".join(said["nominal"].split()).split(" without compensation")[0].rpartition("targets: ")[2]
+    assert f"({own} are the arm's own" in " ".join(said["base"].split()) and "the arm's own" not in said["nominal"]
 
 
 def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):

@@ -221,7 +221,8 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     # a URDF alone is the best rigid geometry, beside the one that the corrections belong to
     alone = metrics["fit"]["urdf_alone"]["position_mm"]["rms"]
     assert metrics["fit"]["calibrated"]["position_mm"]["rms"] <= alone < metrics["fit"]["nominal"]["position_mm"]["rms"]
-    assert "without joint_corrections.csv, leaves" in metrics["reason"]
+    left = [1e3 * metrics["findings"][f"{head}cross_validated"] for head in ("rigid_", "")]
+    assert f"{left[0]:.3f} mm URDF alone; with joint corrections {left[1]:.3f} mm: pass" in metrics["reason"]
     some = q[:20] / 2
     with_corrections = forward(urdf.read("done/robot_for_corrections.urdf"), some)
     assert np.abs(with_corrections - forward(load("done"), some)).max() < 1e-9
@@ -229,7 +230,7 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     assert np.abs(forward(rigid, some) - forward(calibrated.read("done").chain, some)).max() < 1e-9
     Path("ur5.urdf").write_text(write_new(load("ur5")))
     said = calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf")[1]
-    assert f"the URDF alone leaves {alone:.3f} mm rms" in said
+    assert f"{left[0]:.3f} mm URDF alone" in said
     assert np.abs(forward(urdf.read("new.urdf"), some) - forward(rigid, some)).max() < 1e-9
     assert calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf", "--for-corrections")[0] == 0
     assert np.abs(forward(urdf.read("new.urdf"), some) - with_corrections).max() < 1e-9

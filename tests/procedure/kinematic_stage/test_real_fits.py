@@ -37,6 +37,25 @@ def test_ur5_tracker(data, calib, here):
     assert 0.1 < geometry["cross_validated_mm"] < 0.14
 
 
+def test_a_tolerance_holds_for_each_file_that_is_delivered(data, calib, here):
+    """0.107 mm by the URDF alone, 0.060 mm with joint corrections."""
+    folder = data / "ur5_gts3800"
+    given = (folder / "model.urdf", folder / "grid_800.csv", "--holdout", "0.25", "--tolerance", "0.1", "--no-plots")
+    for deliverable, level in (("urdf", "fail"), ("corrections", "pass")):
+        found, _ = metrics_of(calib, *given, "--deliverable", deliverable)
+        assert found["verdict"] == level
+        assert {name: one["level"] for name, one in found["deliverables"].items()} == {
+            "urdf": "fail",
+            "corrections": "pass",
+        }
+        code, out, _ = calib("export", "done", "--into", "out")
+        assert (code == 1) == (level == "fail") and "URDF alone, above the tolerance of 0.1 mm" in out
+    assert "<!-- verdict fail" in Path("out/robot.urdf").read_text()
+    assert "verdict" not in Path("out/robot_for_corrections.urdf").read_text()
+    for more, code in (((), 1), (("--for-corrections",), 0)):
+        assert calib("export", "done", "--urdf", folder / "model.urdf", "--out", "one.urdf", *more)[0] == code
+
+
 def test_ur10_pose(data, calib, here):
     """0.44 mm with the plain geometry; 0.12 mm is the goal."""
     folder = data / "ur10_ipa"

@@ -36,7 +36,7 @@ def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.Mo
     monkeypatch.setattr(geometric_fit, "CRAWLS", 1)
     chosen = found.selection
     arms = Arms(chosen.nominal.cell, chosen.fit.cell, found.rigid.cell.chain, found.expected)
-    again = assess(arms, given, found.findings, Settings(limit=1), asked="offsets")
+    again = assess(arms, given, found.findings, Settings(limit=1), wanted)
     assert not again.validation[name].settled and not again.validation[name].proves
     assert any(f"{name} is not scored: base and tool placement did not settle" in line for line in again.warnings)
     assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason

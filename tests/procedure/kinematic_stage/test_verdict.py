@@ -7,7 +7,9 @@ import pytest
 
 from calib.geometry.accuracy import Errors
 from calib.procedure.kinematic_stage.comparison import Comparison
-from calib.procedure.kinematic_stage.validation import urdf_alone
+from calib.procedure.kinematic_stage.metrics import Findings
+from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.kinematic_stage.validation import judge_deliverables
 from calib.procedure.kinematic_stage.verdict import judge
 
 
@@ -84,11 +86,17 @@ def test_rules(unseen, changes, level, words):
     assert (found.level, words in found.reason) == (level, True), found
 
 
-def test_what_a_urdf_alone_leaves_is_said_and_a_bad_one_loudly():
-    fit = rows(1.0, 0.1, False, alone=0.5)
-    assert urdf_alone(rows(1.0, 0.1, False), {"a": rows(1.0, 0.1)}) == ("", [])
-    words, warnings = urdf_alone(fit, {"a": rows(1.0, 0.1, alone=0.6)})
-    assert "without joint_corrections.csv, leaves 0.600 mm" in words and not warnings
-    words, warnings = urdf_alone(fit, {"a": rows(1.0, 0.1, alone=1.2)})
-    assert "WORSE THAN THE NOMINAL ARM on a, unseen" in warnings[0]
-    assert "0.500 mm on the fitted poses" in urdf_alone(fit, {})[0]
+def test_each_deliverable_has_a_verdict_of_its_own():
+    findings = Findings("geometry + harmonics", 1e-4, None, 0.0, "", 1.0, rigid_cross_validated=2e-4)
+    fit, unseen = rows(1.0, 0.05, False, alone=0.1), {"a": rows(1.0, 0.06, alone=0.107)}
+
+    def levels(fit, unseen, **wanted):
+        found = judge_deliverables(fit, unseen, findings, FitSettings(**wanted))
+        return {name: one.level for name, one in found.items()}
+
+    assert levels(fit, unseen, tolerance=1e-4) == {"urdf": "fail", "corrections": "pass"}
+    assert levels(fit, unseen, tolerance=1.1e-4) == {"urdf": "pass", "corrections": "pass"}
+    assert levels(fit, {}, tolerance=1.5e-4) == {"urdf": "fail", "corrections": "pass"}, "by cross-validation"
+    worse = {"a": rows(1.0, 0.06, alone=1.2)}
+    assert levels(fit, worse) == {"urdf": "fail", "corrections": "pass"}, "worse than the nominal arm"
+    assert levels(rows(1.0, 0.05, False), {"a": rows(1.0, 0.06)}) == {"urdf": "pass"}, "without corrections"

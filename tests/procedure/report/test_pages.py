@@ -10,6 +10,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.report import certificate, console
 from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
 
@@ -83,11 +84,11 @@ def sheet(written: str) -> str:
     return " ".join("".join(Reader("article", written).found).split())
 
 
-@pytest.mark.parametrize("verdict", ["pass", "marginal", "fail"])
+@pytest.mark.parametrize("verdict", ["pass", PREDICTION_ONLY, "marginal", "fail"])
 def test_the_first_sheet_stands_alone(verdict):
     files = [(f"file{k}.csv", "measured", "10", f"{k:064x}") for k in range(20)]
     first = sheet(certificate.render(page_of(judged(verdict, "because", [TABLE]), files=files)))
-    word = certificate.WORDS[verdict]
+    word = "PASS (prediction only)" if verdict == PREDICTION_ONLY else verdict.upper()
     wanted = (
         "Calibration of x",
         word,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
 from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import NewSession, begin
-from calib.procedure.session.folder import Session, open_session, verdict_of
+from calib.procedure.session.folder import Session, open_session
 from calib.simulation.cells.truth import torque_errors
 from calib.simulation.cells.virtual_cells import virtual_cell
 
@@ -109,8 +110,19 @@ def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> 
 @pytest.mark.slow
 def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     assert set(kinds(whole).values()) == {steps.DONE}
-    given = {path.name for folder in ("9-export", "9-export/dynamics") for path in whole.path(folder).glob("*")}
-    assert {"robot.urdf", "robot.xml", "drives.csv", "parameters.json"} <= given
+    given = {path.name for path in whole.path("9-export").rglob("*")}
+    assert {
+        "robot.urdf",
+        "robot.xml",
+        "drives.csv",
+        "parameters.json",
+        "README.txt",
+    } <= given and "dynamics" not in given
+    joints = [
+        re.findall("(?m)^    <origin .*", whole.path(f"{place}/robot.urdf").read_text())
+        for place in ("4-fit", "9-export")
+    ]
+    assert joints[0] == joints[1], "the calibrated geometry"
     page = whole.path("certificate.html").read_text()
     for words in (
         "Torque errors",
@@ -125,7 +137,7 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     own = found["validation"]["validation.csv"]
     assert "<inertia " in whole.path("9-export/robot.urdf").read_text() and whole.path("9-export/robot.xml").exists()
     assert "What was exported" in page
-    assert own["evidence"] and verdict_of(whole) == "marginal"  # errors that no model holds remain
+    assert own["evidence"] and whole.verdicts().level == "marginal"  # errors that no model holds remain
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -15,6 +16,7 @@ from sessions import edit, go_on, quiet
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
+from calib.procedure.findings import UNJUDGED
 from calib.procedure.session import certificate, instructions, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.markup import with_comment
@@ -201,7 +203,6 @@ def test_what_arrives_is_checked(measured: Session, change, message: str, capsys
         ("schema = 2", "schema = 0", "not known"),
         ('model = "auto"', "model = 3", r"fit.model: expected one of auto, .*, found 3"),
         ('loss = "auto"', 'los = "auto"', r"fit: there is no key 'los' \(did you mean 'loss'\?\)"),
-        ('loss = "auto"', "", "fit.loss is missing; its default is 'auto'"),
         ("[poses]", "[poses", "is no TOML"),
         ("seed = 1", 'seed = "one"', "seed"),
     ],
@@ -224,11 +225,40 @@ def test_a_tolerance_of_the_session_decides_and_stands_on_the_certificate(finish
     assert "0.01 mm rms on unseen poses" in finished.path("certificate.html").read_text()
 
 
+def test_a_session_has_one_verdict(finished: Session) -> None:
+    whole = json.loads(finished.path("verdict.json").read_text())
+    geometry = whole["geometry"]["verdict"], whole["geometry"]["reason"]
+    assert whole["verdict"] == geometry[0] == whole["files"]["robot.urdf"]["verdict"]
+    others = [path for path in finished.folder.rglob("*.json") if path.name not in ("verdict.json", "state.json")]
+    said = [found for path in others for found in _verdicts(json.loads(path.read_text()))]
+    assert geometry in said and set(said) <= {geometry, ("", UNJUDGED.reason)}
+
+
+def _verdicts(content: Any) -> list[tuple[str, str]]:
+    if not isinstance(content, dict):
+        return []
+    own = [(content["verdict"], content["reason"])] if "verdict" in content else []
+    return own + [each for value in content.values() for each in _verdicts(value)]
+
+
+def test_without_a_validation_file_a_share_of_the_poses_is_held_out(measured: Session) -> None:
+    measured.path("3-measured/validation.csv").unlink()
+    assert go_on(measured) is not None, "waits for the planned validation poses"
+    edit(measured.path("session.toml"), "holdout = 0.0", "holdout = 0.25")
+    assert go_on(measured) is None
+    found = json.loads(measured.path("5-validation/metrics.json").read_text())
+    assert found["validation"]["measured.csv"]["poses"] == 5 and "on measured.csv, unseen: " in found["reason"]
+    assert json.loads(measured.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 15
+
+
 def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, capsys: pytest.CaptureFixture) -> None:
     place, settings = finished.path("6-export"), finished.path("session.toml")
     before = (place / "robot.urdf").read_bytes()
     marginal = (place / "README.txt").read_text()
-    assert marginal.startswith("verdict marginal: geometry: no rigid geometry ") and marginal.strip() in before.decode()
+    assert (
+        marginal.startswith("verdict marginal: geometry: no rigid geometry ")
+        and marginal.splitlines()[0] in before.decode()
+    )
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 1
     said = capsys.readouterr().out.strip().split("\n")[-1]
@@ -240,7 +270,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     edit(settings, "tolerance_mm = 0.001", "tolerance_mm = 0.0")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 0
     assert (place / "robot.urdf").read_bytes() == before and (place / "README.txt").read_text() == marginal
-    assert "(verdict marginal: 6-export/README.txt says why)" in capsys.readouterr().out
+    assert "(verdict marginal: verdict.json says why)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])

@@ -13,10 +13,12 @@ import numpy as np
 
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
+from calib.mechanism.closure import ClosedRobot
 from calib.mechanism.parallel_model import ParallelModel, rows_named
 from calib.mechanism.platform_motion import PlatformRegressor, along
 from calib.mechanism.velocities import LoopMotion, loop_jacobians
 from calib.procedure.excitation.goals import SCALINGS
+from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.settings import COARSE, ExcitationSettings
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
@@ -33,18 +35,19 @@ INSTANTS = 1000  # over the period, at which condition numbers and torques are r
 
 @dataclass(frozen=True, eq=False)
 class _ActuatorLimit:
-    """|τ| ≤ (1 - margin) τ_max of each actuator; a `trajectories.constraints.MotionConstraint`.
+    """|τ| ≤ τ_max, or |q̇| ≤ v_max, of each actuator; a `trajectories.constraints.MotionConstraint`.
 
     Attributes:
-        robot: predicts torques along platform coordinates.
-        names: of the n actuators; limits (n,) τ_max [N m or N], finite.
-        margin: a share of the limits that stays free.
+        of: platform coordinates x, v, a (N, r) -> (N, n).
+        gradient: (x, v, a, G (N, n)) -> slopes of Σ G · of by x, v, a.
+        names: of the n actuators; limits (n,), finite.
+        name, unit: of the limit.
     """
 
-    robot: PlatformRegressor
+    of: Callable[..., np.ndarray]
+    gradient: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
     names: tuple[str, ...]
     limits: np.ndarray
-    margin: float = 0.0
     name: str = "torque"
     unit: str = "N m"
 
@@ -61,12 +64,12 @@ class _ActuatorLimit:
         return np.tile(np.arange(len(self.limits)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
-        torque, bound = self.robot.torques(motion.q, motion.v, motion.a), (1.0 - self.margin) * self.limits
-        return np.concatenate([torque - bound, -torque - bound], axis=1)
+        own = self.of(motion.q, motion.v, motion.a)
+        return np.concatenate([own - self.limits, -own - self.limits], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k, result = len(self.limits), np.zeros((4, *motion.q.shape))
-        result[:3] = self.robot.torques_gradient(motion.q, motion.v, motion.a, weights[:, :k] - weights[:, k:])
+        result[:3] = self.gradient(motion.q, motion.v, motion.a, weights[:, :k] - weights[:, k:])
         return result
 
 
@@ -80,6 +83,7 @@ class ParallelDesign:
         family, found: the Fourier series of the platform's coordinates; proof: margins, checked independently.
         condition: of the observation matrix over `INSTANTS` samples: raw, and with columns of unit norm.
         peak: (n,) largest torque of each actuator [N m or N]; fastest: (r,) largest acceleration of each coordinate.
+        bounds: what limits its actuators, and where that is stated.
     """
 
     robot: PlatformRegressor
@@ -90,6 +94,7 @@ class ParallelDesign:
     condition: dict[str, float]
     peak: np.ndarray | None
     fastest: np.ndarray
+    bounds: MotionBounds
 
     def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s]; it repeats with its period."""
@@ -118,7 +123,7 @@ def design_parallel(
     Args:
         model: of the robot, with what it carries.
         settings: period, harmonics, starts, evaluations, seed, rate.
-        values: (p,) parameters that predict the actuators' torques; None: torques are not limited.
+        values: (p,) parameters that predict the actuators' torques; None: they are not known.
         acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
         margin: share of the torque limits that stays free.
         preload: overconstraint of redundant actuators [N m or N].
@@ -126,18 +131,21 @@ def design_parallel(
             them at home: ``cond`` (both condition numbers), or ``logdet``, which makes the motion large besides.
 
     Raises:
+        UsageError: where nothing limits an actuator's speed or torque.
         NothingFeasible: naming the limit that stands in the way.
     """
     robot = model.known.robot
+    bounds = actuator_bounds(model.known, values is not None)
     exciting = ParallelModel(model.known, model.terms, rows_named(model.known), ())
     base = bases.find(exciting)
     plan = PlatformRegressor(model, _columns(model, base), values, preload)
     constraints: list[MotionConstraint] = [BoxLimit(0, robot.lower, robot.upper)]
     if acceleration is not None:
         constraints.append(BoxLimit(2, -np.asarray(acceleration), np.asarray(acceleration)))
-    effort = np.array([joint.effort for joint in robot.joints])
-    if values is not None and np.isfinite(effort).all():
-        constraints.append(_ActuatorLimit(plan, robot.joint_names, effort, margin))
+    names = robot.joint_names
+    torque = (1.0 - margin) * bounds.torque
+    constraints.append(_ActuatorLimit(plan.torques, plan.torques_gradient, names, torque))
+    constraints.append(_ActuatorLimit(plan.speeds, plan.speeds_gradient, names, bounds.velocity, "velocity", "rad/s"))
     family = fourier_family(settings.harmonics or COARSE, settings.period, robot.r, rate=settings.rate)
     problem = ExcitationProblem(
         family, plan.regressor,
@@ -152,7 +160,22 @@ def design_parallel(
     motion = dense_motion(family, found.x, times)
     condition = condition_numbers(plan.regressor(motion.q, motion.v, motion.a), _sigmas(plan))
     peak = None if values is None else np.abs(plan.torques(motion.q, motion.v, motion.a)).max(axis=0)
-    return ParallelDesign(plan, base, family, found, proof, condition, peak, np.abs(motion.a).max(axis=0))
+    return ParallelDesign(plan, base, family, found, proof, condition, peak, np.abs(motion.a).max(axis=0), bounds)
+
+
+def actuator_bounds(known: ClosedRobot, predicted: bool) -> MotionBounds:
+    """Return what limits the actuators: speeds of the robot's file and, where a model predicts torques, its efforts.
+
+    Raises:
+        UsageError: where nothing limits one.
+    """
+    joints = known.robot.joints
+    velocity, effort = (np.array([getattr(joint, key) for joint in joints]) for key in ("velocity", "effort"))
+    free = np.full(len(joints), np.inf)
+    torque = effort if predicted else free
+    origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
+    place = "in the robot's file: velocity and effort of the actuated joints, and inertias"
+    return MotionBounds(known.robot.name, joints, velocity, free, torque, origin, place)
 
 
 def _sigmas(plan: PlatformRegressor) -> np.ndarray:

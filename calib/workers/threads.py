@@ -1,0 +1,107 @@
+"""Threads of BLAS: one for all that calib computes, whose small matrices lose by more.
+
+Idle threads wait in loops that take processors from others: a fit on two idle cores took twice as long, beside one busy
+process eighteen times. The API, the command, the workers and the tests all limit them here. A caller's own choice wins:
+one of `VARIABLES` in the environment, or fewer threads than the library had before, as threadpoolctl sets them.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
+from functools import cache
+from threading import Lock
+from typing import Any
+
+VARIABLES = tuple(f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "BLIS"))
+
+_changing, _before, _most = Lock(), dict[Any, int](), dict[Any, int]()
+_calls = 0
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Give BLAS one thread while the block runs, and its own number back once no thread runs such a block."""
+    global _calls
+    with _changing:
+        if not _calls:
+            _limit()
+        _calls += 1
+    try:
+        yield
+    finally:
+        with _changing:
+            _calls -= 1
+            if not _calls:
+                _set(_before)
+                _before.clear()
+
+
+def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
+    """Yield what a generator does, with one thread while it works and the caller's own number between."""
+    ended = object()
+    with closing(steps):
+        while True:
+            with one_blas_thread():
+                step = next(steps, ended)
+            if step is ended:
+                return
+            yield step
+
+
+def limit_process() -> None:
+    """Give BLAS one thread in this process for good, as it is loaded and as it will be, unless the user chose."""
+    if not _chosen():
+        _limit_for_good()
+
+
+def limit_worker() -> None:
+    """Give BLAS and numba one thread in this process for good, whatever was chosen: tasks are what runs in parallel."""
+    _limit_for_good()
+    if numba := sys.modules.get("numba"):
+        numba.set_num_threads(1)
+    else:
+        os.environ["NUMBA_NUM_THREADS"] = "1"
+
+
+def _chosen() -> bool:
+    return any(os.environ.get(name) for name in VARIABLES)
+
+
+def _limit() -> None:
+    if _chosen():
+        return
+    import scipy.linalg  # noqa: F401  (with numpy's, the BLAS of all that calib computes)
+
+    for library in _libraries():
+        threads = library.num_threads
+        _most[library] = max(threads, _most.get(library, 1))
+        if threads == _most[library]:
+            _before[library] = threads
+    _set(dict.fromkeys(_before, 1))
+
+
+def _limit_for_good() -> None:
+    os.environ.update(dict.fromkeys(VARIABLES, "1"))
+    if "numpy" in sys.modules:
+        _set(dict.fromkeys(_libraries(), 1))
+
+
+def _set(threads: dict[Any, int]) -> None:
+    """Set the numbers of libraries from whichever thread: threadpoolctl 3.8 heeds one alone until it is cleared."""
+    for library, number in threads.items():
+        clear = getattr(library, "clear_controlling_thread", lambda force: None)
+        clear(force=True)
+        library.set_num_threads(number)
+        clear(force=True)
+
+
+@cache
+def _libraries() -> list[Any]:
+    """Return every BLAS loaded: looking for them takes milliseconds, setting their threads microseconds."""
+    from threadpoolctl import ThreadpoolController
+
+    found = ThreadpoolController().select(user_api="blas").lib_controllers
+    return [library for library in found if library.num_threads]

@@ -1,0 +1,70 @@
+"""Threads of BLAS: one while calib computes, the caller's own number before and after, and wherever one was chosen."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import blas_threads
+import pytest
+
+ROOT = Path(__file__).parents[1]
+COMMAND = """
+import sys
+from calib.cli import main
+try:
+    main()
+except SystemExit:
+    import scipy.linalg
+    from blas_threads import threads
+    print(threads())
+"""
+
+
+def python(*words: str, **chosen: str) -> str:
+    """Return what a Python process prints last that has of the variables of threads only those chosen here."""
+    own = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment = own | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests/support")])} | chosen
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, env=environment, check=True)
+    return done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, Any]:
+    return json.loads(python(blas_threads.__file__))
+
+
+def test_a_call_has_one_thread_and_gives_back_the_callers(found):
+    assert (found["before"], found["call"], found["after"]) == ([3], [1], [3])
+    assert found["nested"] == [[1], [1]]
+
+
+def test_they_are_given_back_after_an_exception(found):
+    assert found["after an exception"] == [3] == found["at the end"]
+
+
+def test_a_generator_has_one_while_it_works_and_the_caller_his_between(found):
+    assert found["steps"] == [[1], [3], [1]] and found["after steps"] == [3]
+
+
+def test_calls_that_overlap_have_one_until_the_last_ends(found):
+    assert found["overlapping"] == [[1], [1], [1], [3]]
+
+
+def test_a_callers_own_limit_counts(found):
+    assert found["caller's limit"] == [[2], [2]]
+
+
+@pytest.mark.parametrize("name", ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"])
+def test_a_variable_of_the_environment_counts(name):
+    chosen = json.loads(python(blas_threads.__file__, **{name: "3"}))
+    assert chosen["call"] == [3] and chosen["steps"] == [[3]] * 3
+
+
+def test_a_command_has_one_unless_the_environment_says_more():
+    assert python("-c", COMMAND, "formats") == "[1]"
+    assert python("-c", COMMAND, "formats", OPENBLAS_NUM_THREADS="2") == "[2]"
