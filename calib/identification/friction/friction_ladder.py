@@ -8,8 +8,8 @@ the time predicts the other: neighbouring blocks judge what holds between them, 
 step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
 
 A coupling is a gear whose motor turns with two joints; it is offered for pairs of joints of which what the standard
-model leaves is explained by the other's motion. Cables are offered where sensors see them behind the gears, apart from friction; by name, anywhere. A term is judged by
-the rows that it acts on, each in units of its own residuals.
+model leaves is explained by the other's motion. Cables are offered where sensors see them behind the gears, apart from
+friction; by name, anywhere. A term is judged by the rows that it acts on, each in units of its own residuals.
 """
 
 from __future__ import annotations
@@ -299,7 +299,7 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return some `SAMPLES` of the rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
+    """Return some `SAMPLES` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
     parts = []
     for part, case in zip(candidates.rows, candidates.cases):
         own = kept(case.motion.segment, candidates.decimator)
