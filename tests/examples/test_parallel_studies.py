@@ -12,9 +12,9 @@ from types import ModuleType
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-# of medians, by table; of three seeds on a processor whose rounding ends the searches at other motions they were 0.03,
-# 0.44, 0.14 and 0.41 away
-BOUNDS = {"| value": 0.05, "| stated": 0.6, "| relative": 0.3, "| |": 0.6}
+# by table, by which the median of three seeds may leave the README's range: on a processor whose rounding ends the
+# searches at other motions it was 0.03, 0.44, 0.14 and 0.41 away from the README's median
+BOUNDS = {"| value": 0.03, "| stated": 0.45, "| relative": 0.15, "| |": 0.45}
 
 
 @pytest.mark.slow
@@ -38,7 +38,7 @@ def test_dualv_is_identified_by_both_models_and_its_payload_weighed(tmp_path):
 
 
 def _check_readme(study: ModuleType, metrics: dict) -> None:
-    """The medians in the README's tables are a fresh run's, as far as another processor's motions leave them alone."""
+    """A fresh run's medians are within the ranges of the README's tables, as far as another processor leaves them."""
     text = (EXAMPLES / "dualv" / "README.md").read_text()
     kept = text.split(study.MARKS[0])[1].split(study.MARKS[1])[0].strip().splitlines()
     fresh = "\n".join(study.readme_rows(metrics)).strip().splitlines()
@@ -48,8 +48,9 @@ def _check_readme(study: ModuleType, metrics: dict) -> None:
         bound = next((most for head, most in BOUNDS.items() if old.startswith(head)), bound)
         for one, two in zip(old.split("|"), new.split("|"), strict=True):
             if " to " in one:
-                told, found = (float(cell.split()[0]) for cell in (one, two))
-                assert abs(found - told) <= bound * abs(told), (old, new)
+                found = float(two.split()[0])
+                least, most = (float(word.strip(" ()")) for word in one.split("(")[1].split(" to "))
+                assert least - bound * abs(least) <= found <= most + bound * abs(most), (old, new)
             else:
                 assert one == two
 
