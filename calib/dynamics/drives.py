@@ -34,7 +34,7 @@ class DriveTerm:
         shape: a key of `SHAPES`.
         acts: pairs (torque row, motion seen there), the motion as pairs (joint, weight); empty for a parameter without
             any effect.
-        settings: as many numbers as the shape asks for.
+        settings: as many numbers as the shape asks for; an ``edge`` may be left out.
         side: "link" or "motor" of a joint torque sensor; without one all is seen from the motor.
         linear: whether the joint is prismatic (units).
     """
@@ -50,6 +50,8 @@ class DriveTerm:
         if self.shape not in SHAPES:
             raise CalibError(f"term '{self.name}': shape '{self.shape}' is none of {', '.join(SHAPES)}")
         wanted = SHAPES[self.shape].settings
+        if wanted[:1] == ("edge",) and len(self.settings) == len(wanted) - 1:
+            object.__setattr__(self, "settings", (math.inf, *self.settings))
         if len(self.settings) != len(wanted):
             raise CalibError(
                 f"term '{self.name}': shape '{self.shape}' needs ({', '.join(wanted)}), not {self.settings}"
@@ -127,20 +129,22 @@ def without_effect(label: str) -> tuple[DriveTerm, ...]:
     )
 
 
-def coupled(first: int, second: int, v0: float = V0, label: str | None = None) -> tuple[DriveTerm, ...]:
-    """Return Iam, Fvm, Fcm of a gear whose motor turns with the sum of two joints (the TX40 wrist: 4, 5).
+def coupled(
+    first: int, second: int, v0: float = V0, label: str | None = None, weight: float = 1.0
+) -> tuple[DriveTerm, ...]:
+    """Return Iam, Fvm, Fcm of a gear whose motor turns with q_first + weight q_second (the TX40 wrist: 4, 5, 1).
 
         tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second), and the other way round
 
-    (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest.)
+    for a weight of 1 (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest); of -1: the difference.
     """
     label = str(second + 1) if label is None else label
-    crossed = ((first, ((second, 1.0),)), (second, ((first, 1.0),)))
-    total: Motion = ((first, 1.0), (second, 1.0))
+    crossed = ((first, ((second, weight),)), (second, ((first, weight),)))
+    total = ((first, ((first, 1.0), (second, weight))), (second, ((first, weight), (second, 1.0))))
     return (
         DriveTerm(f"Iam{label}", "acceleration", crossed),
         DriveTerm(f"Fvm{label}", "velocity", crossed),
-        DriveTerm(f"Fcm{label}", "sign", ((first, total), (second, total)), (v0,)),
+        DriveTerm(f"Fcm{label}", "sign", total, (v0,)),
     )
 
 
@@ -220,22 +224,22 @@ def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], 
     return Joined(x, v, a, load, state)  # type: ignore[arg-type]
 
 
-def asymmetric(joint: int) -> tuple[DriveTerm, ...]:
+def asymmetric(joint: int, edge: float = math.inf) -> tuple[DriveTerm, ...]:
     """Return ``Fva``: viscous friction that differs by direction, tau += Fva abs(v).
 
     Fv ± Fva are the coefficients of the two directions; a Coulomb torque that differs is Fc and off already.
     """
-    return (term(f"Fva{joint + 1}", "speed", joint),)
+    return (term(f"Fva{joint + 1}", "speed", joint, edge),)
 
 
-def cubic(joint: int) -> tuple[DriveTerm, ...]:
+def cubic(joint: int, edge: float = math.inf) -> tuple[DriveTerm, ...]:
     """Return ``Fvc``: tau += Fvc v³, viscous friction that bends with speed."""
-    return (term(f"Fvc{joint + 1}", "cubic", joint),)
+    return (term(f"Fvc{joint + 1}", "cubic", joint, edge),)
 
 
-def root(joint: int, v0: float = V0) -> tuple[DriveTerm, ...]:
+def root(joint: int, v0: float = V0, edge: float = math.inf) -> tuple[DriveTerm, ...]:
     """Return ``Fvr``: tau += Fvr v / sqrt(abs(v) + v0), the root of the speed, regular at rest."""
-    return (term(f"Fvr{joint + 1}", "root", joint, v0),)
+    return (term(f"Fvr{joint + 1}", "root", joint, edge, v0),)
 
 
 def stribeck(joint: int, vs: float, exponent: float = 1.0, v0: float = V0) -> tuple[DriveTerm, ...]:
@@ -243,13 +247,13 @@ def stribeck(joint: int, vs: float, exponent: float = 1.0, v0: float = V0) -> tu
     return (term(f"Fs{joint + 1}", "stribeck", joint, vs, exponent, v0),)
 
 
-def load_dependent(joint: int, v0: float = V0, viscous: bool = False) -> tuple[DriveTerm, ...]:
+def load_dependent(joint: int, v0: float = V0, viscous: bool = False, edge: float = math.inf) -> tuple[DriveTerm, ...]:
     """Return ``Ft`` (and ``Fvt``): tau += Ft abs(load) sign(v) + Fvt abs(load) v.
 
     The load is the torque the gear transmits (Hamon, Gautier, Garrec 2010); measured or predicted, the caller's choice.
     """
     first = term(f"Ft{joint + 1}", "load", joint, v0)
-    return (first, term(f"Fvt{joint + 1}", "load_velocity", joint)) if viscous else (first,)
+    return (first, term(f"Fvt{joint + 1}", "load_velocity", joint, edge)) if viscous else (first,)
 
 
 def presliding(joint: int, widths: Sequence[float], v0: float = V0) -> tuple[DriveTerm, ...]:

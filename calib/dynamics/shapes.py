@@ -5,6 +5,9 @@ torque the joint transmits, and its settings; it says by how much the torque cha
 
 The Coulomb sign is smoothed as s(v) = tanh(v / v0) (v0 = 0: the exact sign; BIRDy's choice is v0 = 0.01 rad/s). It is
 a dead-zone sign where the shape is called ``dead``: 0 where abs(v) <= v0.
+
+Shapes that bend keep their value beyond an ``edge`` [rad/s or m/s], the fastest that was learnt from (infinite where
+it is not given): beyond it, friction goes on linearly.
 """
 
 from __future__ import annotations
@@ -70,6 +73,11 @@ def _sign_slope(v: np.ndarray, v0: float) -> np.ndarray | float:
     return (1.0 - np.tanh(v / v0) ** 2) / v0 if v0 > 0 else 0.0
 
 
+def _held(v: np.ndarray, edge: float) -> np.ndarray:
+    """Return the velocity up to the edge of what was learnt: there a shape that bends keeps its value."""
+    return np.clip(v, -edge, edge)
+
+
 def _stribeck(m: Joined, s: tuple[float, ...]) -> np.ndarray:
     return _smooth_sign(m.v, s[2]) * np.exp(-((np.abs(m.v) / s[0]) ** s[1]))
 
@@ -132,17 +140,17 @@ SHAPES: dict[str, Shape] = {
         dissipative=True,
     ),
     "speed": Shape(
-        lambda m, s: np.abs(m.v), lambda m, s: (0.0, np.sign(m.v), 0.0), VISCOUS, VISCOUS_LINEAR,
-        dissipative=True, of_velocity=True,
+        lambda m, s: np.abs(_held(m.v, s[0])), lambda m, s: (0.0, np.sign(m.v) * (np.abs(m.v) < s[0]), 0.0),
+        VISCOUS, VISCOUS_LINEAR, ("edge",), dissipative=True, of_velocity=True,
     ),
     "cubic": Shape(
-        lambda m, s: m.v**3, lambda m, s: (0.0, 3.0 * m.v**2, 0.0), "N m s³/rad³", "N s³/m³",
-        dissipative=True, of_velocity=True,
+        lambda m, s: _held(m.v, s[0]) ** 3, lambda m, s: (0.0, 3.0 * m.v**2 * (np.abs(m.v) < s[0]), 0.0),
+        "N m s³/rad³", "N s³/m³", ("edge",), dissipative=True, of_velocity=True,
     ),
     "root": Shape(
-        lambda m, s: m.v / np.sqrt(np.abs(m.v) + s[0]),
-        lambda m, s: (0.0, (0.5 * np.abs(m.v) + s[0]) / (np.abs(m.v) + s[0]) ** 1.5, 0.0),
-        "N m (s/rad)^½", "N (s/m)^½", ("v0",), dissipative=True, of_velocity=True,
+        lambda m, s: _held(m.v, s[0]) / np.sqrt(np.abs(_held(m.v, s[0])) + s[1]),
+        lambda m, s: (0.0, (0.5 * np.abs(m.v) + s[1]) / (np.abs(m.v) + s[1]) ** 1.5 * (np.abs(m.v) < s[0]), 0.0),
+        "N m (s/rad)^½", "N (s/m)^½", ("edge", "v0"), dissipative=True, of_velocity=True,
     ),
     "stribeck": Shape(
         _stribeck, _stribeck_slopes, "N m", "N", ("vs", "exponent", "v0"), dissipative=True, of_velocity=True
@@ -152,7 +160,8 @@ SHAPES: dict[str, Shape] = {
         loaded=True, dissipative=True,
     ),
     "load_velocity": Shape(
-        lambda m, s: np.abs(_given(m.load)) * m.v, None, "s/rad", "s/m", loaded=True, dissipative=True
+        lambda m, s: np.abs(_given(m.load)) * _held(m.v, s[0]), None, "s/rad", "s/m", ("edge",),
+        loaded=True, dissipative=True,
     ),
     "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True, dissipative=True),
     "presliding": Shape(

@@ -22,13 +22,15 @@ from calib.estimation.triangles import condition_numbers
 from calib.identification.cases import Case
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.friction.time_folds import estimate
+from calib.identification.left_out.regimes import regimes
+from calib.identification.left_out.tempering import tempered_prior
+from calib.identification.left_out.time_folds import estimate
 from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop, require_robot
 from calib.identification.methods.loop_agreement import LoopDisagreement, disagreement
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
-from calib.identification.prior import FirstFit, Prior, find_prior, residual_inflation, scaled
+from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, residual_inflation, scaled
 from calib.identification.rods import rods
 from calib.identification.rows import (
     ObservationRows,
@@ -112,7 +114,7 @@ def identify(
     found = identify_model(
         model, cases, settings, nominal=nominal, states=states, cad=_known_masses(robot.chain),
         shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(robot.chain, model), 0.0).ravel(),
-        progress=progress,
+        effort=_torque_limits(robot.chain), progress=progress,
     )  # fmt: skip
     return cast(Identification, found)  # its model is the chain's
 
@@ -126,6 +128,7 @@ def identify_model(
     states: States | None = None,
     cad: np.ndarray | None = None,
     shape: np.ndarray | None = None,
+    effort: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Identification[RegressorModel]:
     """Identify the parameters of a model that is linear in them from recordings.
@@ -141,6 +144,7 @@ def identify_model(
         states: to choose base columns over; None: the model's own.
         cad: the first of the model's parameters by the robot's description; None where it holds no masses.
         shape: the same of a robot of one kilogram, where it holds none; None: not known either.
+        effort: (n,) torque limits of the joints, up to a factor; None: not known.
         progress: called with a few words at each stage.
 
     Raises:
@@ -166,7 +170,14 @@ def identify_model(
     _require_enough(rows, base)
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
-    prior = find_prior(model, base, rows, whole, source, noise) if _drawn(method, model, settings, source) else None
+    prior = None
+    if _drawn(method, model, settings, source):
+        prior = tempered_prior(
+            lambda tempering, start: find_prior(
+                model, base, rows, whole, source, noise, start=start, effort=effort, tempering=tempering
+            ),
+            rows, regimes(rows, cases, decimator),
+        )  # fmt: skip
     first = first_fit(rows, noise) if prior is None else prior.first
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
@@ -176,7 +187,8 @@ def identify_model(
     )
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
-        prior = find_prior(model, base, full, whole, prior.source, noise, np.array(friction.groups), prior)
+        groups = np.array(friction.groups)
+        prior = find_prior(model, base, full, whole, source, noise, groups, prior, effort, prior.tempering)
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
@@ -222,6 +234,12 @@ def _known_masses(chain: Chain) -> np.ndarray | None:
     return standard_parameters(chain) if known else None
 
 
+def _torque_limits(chain: Chain) -> np.ndarray | None:
+    """Return the joints' torque limits (n,) by the robot's description; None where one has none."""
+    limits = np.array([joint.effort for joint in chain.joints])
+    return limits if (np.isfinite(limits) & (limits > 0.0)).all() else None
+
+
 def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
     """Tell whether richer friction, which is of single joints' motors, has a place in a model."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
@@ -244,8 +262,10 @@ def _richer_friction(
     plain = Dynamics(model, base.to_standard(values))
     loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
     candidates = FrictionCandidates(
-        cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
+        cases, rows, loads, decimator, std, tau if prior is None else TEMPERING * tau,
+        np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
         None if prior is None else prior.rows, settings.apart, model.torque_rows,
+        frozenset(tuple(sorted({row for row, _ in one.acts})) for one in model.columns if len(one.acts) > 1),
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads
 

@@ -6,20 +6,24 @@ one, u: its CAD, or rods between the joints,
 
     χ = s u + δ,    δ_i ~ N(0, σ_kind²),    s ~ N(0, κ²),
 
-so the base parameters T χ have the prior N(0, T (diag σ² + κ² u uᵀ) Tᵀ). Sizes σ and κ are where the marginal
-likelihood of the data is largest (MacKay 1992, automatic relevance of groups),
+and so are rotor inertia, viscous and Coulomb friction of the drives, with the joints' torque limits in place of u: a
+joint that never reverses has the others' friction, and no offset in its place. The base parameters T χ have the prior
+N(0, T (diag σ² + U diag κ² Uᵀ) Tᵀ), U of these directions. Sizes σ and κ are where the marginal likelihood of the data
+is largest (MacKay 1992, automatic relevance of groups),
 
     log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
 
 with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what
-a kind would be if it alone explained `SHARE` of all torque, within a factor exp(`WIDTH`) (our choice; errors on other
-motion hardly depend on either). Rows are weighed by their joint's residual, which tells as many independent values as
-its autocorrelation lets it, but not fewer than one in `MOST`: residuals of a short record look like one wave whatever
-the model is.
+a kind would be if it alone explained `SHARE` of all torque (offsets: `OFFSET`), within a factor exp(`WIDTH`) (our
+choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that cancel.
+Rows are weighed by their joint's residual, which tells as many independent values as its autocorrelation lets it, but
+not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave whatever the model is. For the
+values, not for their covariance, they count `TEMPERING` times less, or as many more times as regimes left out ask for:
+what the model lacks is no noise, and differs on other motion.
 
 Directions that the motion tells well do not feel the prior; those that it does not tell follow the whole robot. It does
 not make the parameters those of possible bodies: that is the semidefinite fit of another module; but `bounded` keeps
-inertia and friction of the drives from being negative.
+the drives' inertia positive, and lets friction brake at any speed.
 """
 
 from __future__ import annotations
@@ -34,16 +38,21 @@ import scipy.optimize
 
 from calib.arrays import frozen
 from calib.dynamics.base import Base
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
+from calib.estimation.convex.interior_point import minimise
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
 
 SHARE = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
+OFFSET = 0.01  # the same of constant torques: motors have friction rather than offsets (our choice)
 WIDTH = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
+MAX_DEVIATION = 3.0  # of the whole robot's parameters of a kind, rms, or of what explains all torque (our choice)
 NEAREST = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
 WHOLE = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
-MOST = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
+MAX_INFLATION = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
+TEMPERING = 2.0  # times as many count as one for the values, at least: chosen on motion other than learnt from
 EXACT = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
 ROUNDS = 12
@@ -71,6 +80,7 @@ class Prior:
         sizes: kind → σ, and ``whole`` → κ.
         source: of u, ``cad`` or ``sizes``.
         first: the fit with it, of the base parameters alone.
+        tempering: how many times less residuals count for the values than for their covariance.
     """
 
     covariance: np.ndarray
@@ -78,6 +88,7 @@ class Prior:
     sizes: Mapping[str, float]
     source: str
     first: FirstFit
+    tempering: float = TEMPERING
 
     @property
     def rows(self) -> np.ndarray:
@@ -98,13 +109,14 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """Prior standard deviations exp(E t) of p parameters and of s, as a function of the k logarithms t of sizes."""
+    """Prior standard deviations exp(E t) of p parameters and of k directions by the logarithms t of sizes."""
 
     names: tuple[str, ...]
-    member: np.ndarray  # (p + 1,) which size each has
+    member: np.ndarray  # (p + k,) which size each has
     centre: np.ndarray  # (k,) of t
     width: np.ndarray  # (k,)
     least: np.ndarray  # (k,) of t
+    most: np.ndarray  # (k,) of t
 
     def deviations(self, t: np.ndarray) -> np.ndarray:
         return np.exp(np.clip(t, -40.0, 40.0))[self.member]
@@ -119,6 +131,8 @@ def find_prior(
     noise: np.ndarray | None = None,
     groups: np.ndarray | None = None,
     start: Prior | None = None,
+    effort: np.ndarray | None = None,
+    tempering: float = TEMPERING,
 ) -> Prior:
     """Return the prior of the base parameters whose sizes the evidence chose.
 
@@ -128,7 +142,9 @@ def find_prior(
         source: of `whole`: ``cad`` or ``sizes``.
         noise: (rows,) of the torques up to a common factor; None: from the residuals.
         groups: (k,) of the columns of richer friction, each of a size of its own, which serves here alone.
-        start: the prior without that friction, to start from.
+        start: the prior without that friction, or of another tempering, to start from.
+        effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
+        tempering: see `Prior`.
     """
     n = rows[0].target.shape[1]
     data = pool(triangulate(rows), n)
@@ -137,32 +153,36 @@ def find_prior(
     if whole is not None:
         known[: len(whole)] = whole
     more = np.zeros(0, int) if groups is None else groups
-    columns = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(more))))  # by each of χ, and by s
-    columns = np.column_stack([columns, np.append(transform @ known, np.zeros(len(more)))])
-    sizes = _sizes(model, data, columns, known, more)
+    shared = _shared(model, known, effort)
+    columns = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(more))))  # by each of χ, and by each s
+    columns = np.column_stack([columns, np.vstack([transform @ shared, np.zeros((len(more), shared.shape[1]))])])
+    sizes = _sizes(model, data, columns, shared, more)
     squares, count = np.sum(data.factors[:, :, -1] ** 2, axis=1), np.maximum(data.rows, 1)
     std, tau = NOISE * np.sqrt(squares / count), np.full(n, 3.0)
     std = np.maximum(std, EXACT * max(float(std.max()), 1e-300))
     t, values = np.array(sizes.centre), np.zeros(len(columns))
     if start is not None:
         std, tau = start.first.std, start.first.inflation
-        t[[*range(len(start.sizes) - 1), -1]] = np.log([*start.sizes.values()])
+        for name, size in start.sizes.items():
+            t[sizes.names.index(name)] = np.log(size)
     for _ in range(ROUNDS):
-        factor = retriangulate((data.factors / (std * np.sqrt(tau))[:, None, None]).reshape(-1, len(columns) + 1))
+        tempered = tempering * tau
+        factor = retriangulate((data.factors / (std * np.sqrt(tempered))[:, None, None]).reshape(-1, len(columns) + 1))
         t = _most_probable(factor, columns, sizes, t)
         before, (values, covariance) = values, _posterior(factor, columns, sizes.deviations(t))
-        last, (std, tau) = std, weighing(rows, data, values, covariance, std, tau, noise)
+        last, (std, tau) = std, weighing(rows, data, values, covariance, std, tempered, noise)
         still = np.abs(values - before) < SETTLED * np.sqrt(np.diag(covariance))
         if still.all() and (np.abs(std / last - 1.0) < SETTLED).all():
             break
     deviation = sizes.deviations(t)
-    spread, whole_part = transform * deviation[: model.p], columns[: base.b, -1] * deviation[-1]
+    common = slice(-shared.shape[1], None)
+    spread, whole_part = transform * deviation[: model.p], columns[: base.b, common] * deviation[common]
     own = spread @ spread.T
     own[np.diag_indices(base.b)] *= 1.0 + 1e-9
     return Prior(
-        frozen(own + np.outer(whole_part, whole_part)), frozen(np.sqrt(np.diag(own))),
+        frozen(own + whole_part @ whole_part.T), frozen(np.sqrt(np.diag(own))),
         {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name}, source,
-        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])),
+        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])), tempering,
     )  # fmt: skip
 
 
@@ -180,7 +200,7 @@ def weighing(
     """
     columns = data.factors[:, :, :-1]
     taken = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * tau)  # of the parameters, by row
-    tau = np.minimum(residual_inflation(rows, values), MOST)
+    tau = np.minimum(residual_inflation(rows, values), MAX_INFLATION)
     squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
     std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
     size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
@@ -210,25 +230,50 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
     return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
-def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, whole: np.ndarray, more: np.ndarray) -> _Sizes:
+def _shared(model: RegressorModel, whole: np.ndarray, effort: np.ndarray | None) -> np.ndarray:
+    """Return (p, k) directions of what parameters have in common: the whole robot, then drives by their torque limits.
+
+    Args:
+        whole: (p,) of the robot's bodies, up to a factor.
+        effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
+    """
+    columns = {}
+    for k, one in enumerate(model.columns):
+        if one.nonnegative and one.joint is not None:
+            size = 1.0 if effort is None else effort[one.joint]
+            columns.setdefault(_kind(one), np.zeros(model.p))[model.inertial + k] = size
+    return np.column_stack([whole, *(own for own in columns.values() if np.count_nonzero(own) > 1)])
+
+
+def _kind(term: DriveTerm) -> str:
+    return f"{term.shape} [{term.unit}]"
+
+
+def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, more: np.ndarray) -> _Sizes:
     """Return the kinds of parameters, and what is known of their sizes before any data; groups of `more` unnamed."""
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
-    kinds += [f"{one.shape} [{one.unit}]" for one in model.columns]
-    names = tuple(dict.fromkeys(kinds))
+    kinds += [_kind(one) for one in model.columns]
+    own = tuple(dict.fromkeys(kinds))
     found, group = np.unique(more, return_inverse=True)
-    member = np.array([*(names.index(kind) for kind in kinds), *(len(names) + group), len(names) + len(found)], int)
-    names = (*names, *("" for _ in found))
+    common = [f"shared {kinds[np.flatnonzero(column)[0]]}" for column in shared.T[1:]]
+    names = (*own, *("" for _ in found), "whole", *common)
+    single = len(own) + len(found)  # sizes of single parameters; those of directions follow
+    member = np.array([*map(own.index, kinds), *(len(own) + group), *range(single, len(names))], int)
     seen = data.factors[:, :, :-1] @ columns
     squares = np.sum(seen**2, axis=(0, 1))  # of the torque, per unit of each parameter
     total = max(float(np.sum(data.factors[:, :, -1] ** 2)), 1e-300)
-    each = np.bincount(member, squares, len(names) + 1)
+    each = np.bincount(member, squares, len(names))
     least = max(1e-12 * float(each.max()), 1e-300)  # of what no torque tells, nothing is known
     alone = 0.5 * np.log(total / np.maximum(each, least))  # log of the size that explains all torque
-    width = np.append(np.full(len(names), WIDTH), WHOLE)
-    mean_square = np.bincount(member[: model.p], whole**2, len(names) + 1) / np.maximum(np.bincount(member), 1)
-    near = alone[-1] + np.log(NEAREST) + 0.5 * np.log(np.maximum(mean_square, 1e-300))
-    centre = alone + np.append(np.full(len(names), np.log(SHARE)), 0.0)
-    return _Sizes((*names, "whole"), member, np.maximum(centre, near), width, near)
+    count = np.maximum(np.bincount(member, minlength=len(names)), 1)
+    mean_square = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names)) / count
+    body = alone[single] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
+    known = mean_square > 0.0
+    near = np.where(known, body + np.log(NEAREST), -np.inf)
+    far = np.where(known, body, alone) + np.log(MAX_DEVIATION)
+    share = np.array([OFFSET if name.startswith("one ") else 1.0 if name == "whole" else SHARE for name in names])
+    width = np.where([name == "whole" for name in names], WHOLE, WIDTH)
+    return _Sizes(names, member, np.clip(alone + np.log(share), near, far), width, near, far)
 
 
 def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -264,21 +309,25 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         return value, away / sizes.width - np.bincount(sizes.member, told, len(t))
 
     found = scipy.optimize.minimize(
-        lost, np.maximum(start, sizes.least), jac=True, method="L-BFGS-B", bounds=[(one, None) for one in sizes.least],
-        options={"maxiter": 60, "ftol": 1e-8},
+        lost, np.clip(start, sizes.least, sizes.most), jac=True, method="L-BFGS-B",
+        bounds=np.column_stack([sizes.least, sizes.most]), options={"maxiter": 60, "ftol": 1e-8},
     )  # fmt: skip
     return np.asarray(found.x)
 
 
-def bounded(factor: np.ndarray, nonnegative: np.ndarray) -> np.ndarray:
-    """Return argmin ‖R x - z‖² with some parameters (motor inertias, viscous and Coulomb friction) not negative.
+def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return argmin ‖R x - z‖² (p,) under A x >= 0: inertia of motors is positive, and friction brakes.
 
     Args:
         factor: (p + 1, p + 1) triangle of data and prior, whitened.
-        nonnegative: (p,) bool.
+        rows: A (c, p); one of a single entry is kept exactly.
     """
-    p = len(nonnegative)
-    lower = np.where(nonnegative, 0.0, -np.inf)
+    p = rows.shape[1]
+    free = np.asarray(scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p]))
+    if not len(rows) or (rows @ free >= 0.0).all():
+        return free
     norms = np.linalg.norm(factor[:p, :p], axis=0)
-    found = scipy.optimize.lsq_linear(factor[:p, :p] / norms, factor[:p, p], (lower, np.inf), method="bvls")
-    return found.x / norms
+    found = minimise(factor, rows / np.linalg.norm(rows / norms, axis=1, keepdims=True), np.zeros(len(rows))).values
+    alone = rows[np.count_nonzero(rows, axis=1) == 1]
+    held = (alone != 0.0).any(axis=0)
+    return np.where(held, np.maximum(found, 0.0), found)

@@ -1,36 +1,41 @@
 """A ladder of friction, a forward selection, joint by joint, as far as unseen time rewards it.
 
-    standard → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
+    standard → + coupling → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
 
 Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
 others, and the terms stay at the joints whose error on unseen time falls by `GAIN`, and does not grow where one half of
 the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms of a
 step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
 
-Cables are offered where sensors see them behind the gears, apart from friction; by name, anywhere. A term is judged by
-the rows that it acts on, each in units of its own residuals.
+A coupling is a gear whose motor turns with two joints; it is offered for pairs of joints of which what the standard
+model leaves is explained by the other's motion. Cables are offered where sensors see them behind the gears, apart from
+friction; by name, anywhere. A term is judged by the rows that it acts on, each in units of its own residuals.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator
+from calib.data.signals.decimation import Decimator, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
 from calib.identification.cases import Case
-from calib.identification.friction.time_folds import CrossValidation
+from calib.identification.left_out.regimes import regimes
+from calib.identification.left_out.time_folds import CrossValidation
 from calib.identification.rows import ObservationRows, observe_terms, triangulate
 
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
-STEPS = ("load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
+SAMPLES = 3000  # of the rows that couplings are sought in, about
+MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
+STEPS = ("coupling", "load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *STEPS, "ripple")
 
 Progress = Callable[[str], None]
@@ -89,6 +94,7 @@ class FrictionCandidates:
         apart: rows in a unit of their own, which no total holds.
         prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
         torque_rows: which torques the rows are; those of the motors among them.
+        coupled: pairs of joints, from 0, whose coupling is part of the model already.
     """
 
     cases: Sequence[Case]
@@ -102,6 +108,7 @@ class FrictionCandidates:
     prior: np.ndarray | None = None
     apart: tuple[int, ...] = ()
     torque_rows: TorqueRows = MOTOR
+    coupled: frozenset[tuple[int, ...]] = frozenset()
 
     @property
     def n(self) -> int:
@@ -124,6 +131,7 @@ def select_friction(
     sensed = candidates.torque_rows.sensed
     steps_tried = [name for name in STEPS if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
     offered = {name: _terms(candidates, name) for name in steps_tried}
+    offered = {name: terms for name, terms in offered.items() if terms or name == wanted}
     every = [one for terms in offered.values() for one in terms]
     validation, place = _cross_validation(candidates, offered, every)
     base = np.arange(validation.data.parameters - len(every))
@@ -165,38 +173,58 @@ def _try(
     candidates: FrictionCandidates,
 ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
     """Return the columns that stay, the errors with them, and their joints."""
-    joint = {k: every[k - len(base)].acts[0][0] for k in columns}
-    everyone = tuple(sorted(set(joint.values())))
+    joints = {k: _joints(every[k - len(base)]) for k in columns}
+    everyone = tuple(sorted(set(joints.values())))
     side = every[columns[0] - len(base)].side
 
-    def felt(squares: np.ndarray, j: int) -> np.ndarray:
-        """Return the squared errors (blocks,) of the rows that see the terms of a joint, in units of their own."""
-        rows = candidates.torque_rows.of_side(side, j, candidates.n)
+    def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
+        """Return the squared errors (blocks,) of the rows that see the terms of joints, in units of their own."""
+        rows = [row for j in own for row in candidates.torque_rows.of_side(side, j, candidates.n)]
         return np.sum(squares[:, rows] / validation.std[rows] ** 2, axis=1)
 
     if forced:
-        return columns, validation.errors(np.array([*base, *taken, *columns])), everyone
+        return columns, validation.errors(np.array([*base, *taken, *columns])), _flat(everyone)
     half = validation.errors(np.array([*base, *taken]), 2)
+    far = validation.extrapolated(np.array([*base, *taken]))
     at, some = everyone, columns
     for _ in range(2):  # with the joints left that it pays at, once more
         tried = np.array([*base, *taken, *some])
-        new, other = validation.errors(tried), validation.errors(tried, 2)
+        new, other, beyond = validation.errors(tried), validation.errors(tried, 2), validation.extrapolated(tried)
         at = tuple(
-            j for j in at if _pays(felt(error, j), felt(new, j)) and _carries(felt(half, j), felt(other, j))
-        )  # fmt: skip
-        some, before = [k for k in some if joint[k] in at], some
+            own
+            for own in at
+            if _pays(felt(error, own), felt(new, own))
+            and _carries(felt(half, own), felt(other, own))
+            and _extrapolates(felt(far, own), felt(beyond, own))
+        )
+        some, before = [k for k in some if joints[k] in at], some
         if not some:
             return [], error, ()
         if some == before:
             break
     else:
         new = validation.errors(np.array([*base, *taken, *some]))
-    return some, new, at
+    return some, new, _flat(at)
+
+
+def _joints(one: DriveTerm) -> tuple[int, ...]:
+    """Return the joints whose torques a term acts on."""
+    return tuple(sorted({row for row, _ in one.acts}))
+
+
+def _flat(at: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    return tuple(sorted({joint for own in at for joint in own}))
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
     """Say whether a joint's squared errors, one half of the time predicting the other, did not grow by `GAIN`."""
     return bool(after.sum() <= (1.0 + GAIN) ** 2 * before.sum())
+
+
+def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
+    """Say whether a joint's squared errors in the regimes left out (k,) did not grow, in their geometric mean."""
+    used = (before > 0.0) & (after > 0.0)
+    return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
@@ -211,27 +239,75 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
 def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
     """Return a step's terms of all joints."""
     found: list[DriveTerm] = []
+    if name == "coupling":
+        return _couplings(candidates)
     for j in range(candidates.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
-        peak = float(np.quantile(v, 0.98))
+        peak, edge = float(np.quantile(v, 0.98)), float(v.max())
         if peak <= 0.0:
             continue
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
         v0 = float(candidates.v0[j])
         terms = {
-            "load": lambda: drives.load_dependent(j, v0, viscous=True),  # noqa: B023
+            "load": lambda: drives.load_dependent(j, v0, viscous=True, edge=edge),  # noqa: B023
             "cable": lambda: drives.cable(j, travel),  # noqa: B023
             "presliding": lambda: drives.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
             "stribeck": lambda: (
                 *drives.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
                 replace(drives.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
             ),
-            "asymmetric": lambda: drives.asymmetric(j),  # noqa: B023
-            "root": lambda: drives.root(j, v0),  # noqa: B023
-            "cubic": lambda: drives.cubic(j),  # noqa: B023
+            "asymmetric": lambda: drives.asymmetric(j, edge),  # noqa: B023
+            "root": lambda: drives.root(j, v0, edge),  # noqa: B023
+            "cubic": lambda: drives.cubic(j, edge),  # noqa: B023
         }[name]()
         found += [replace(one, linear=bool(candidates.linear[j])) for one in terms]
     return found
+
+
+def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
+    """Return the terms of couplings of neighbours that explain what the standard model leaves of both torques.
+
+    A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
+    """
+    n = candidates.n
+    if not candidates.torque_rows.motors_alone:
+        return []
+    matrix, target, motion = _sampled(candidates)
+    basis = np.linalg.qr((matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2]))[0]
+    y = (target / candidates.std).ravel()
+    left = y - basis @ (basis.T @ y)
+    size = np.sum(left.reshape(-1, n) ** 2, axis=0)
+    found = []
+    for i, j in pairwise(range(n)):
+        if candidates.linear[i] != candidates.linear[j] or (i, j) in candidates.coupled:
+            continue
+        for weight in (1.0, -1.0):
+            terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", weight)
+            columns = np.zeros((len(terms), n, len(target)))
+            drives.fill(terms, columns, [*motion, None], np.zeros((0, len(target))))
+            seen = (columns.transpose(2, 1, 0) / candidates.std[:, None]).reshape(-1, len(terms))
+            seen -= basis @ (basis.T @ seen)
+            rest = left - seen @ np.linalg.lstsq(seen, left, rcond=None)[0]
+            explained = float((left @ left - rest @ rest) / max(size[[i, j]].sum(), 1e-300))
+            if explained > MIN_EXPLAINED:
+                found.append((explained, terms))
+    taken: list[DriveTerm] = []
+    for _, terms in sorted(found, key=lambda one: -one[0]):
+        if not {row for one in taken for row in _joints(one)} & set(_joints(terms[0])):
+            taken += [replace(one, linear=bool(candidates.linear[_joints(one)[0]])) for one in terms]
+    return taken
+
+
+def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return some `SAMPLES` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
+    parts = []
+    for part, case in zip(candidates.rows, candidates.cases):
+        own = kept(case.motion.segment, candidates.decimator)
+        used = part.present.all(axis=1)
+        parts.append([x[used] for x in (part.matrix, part.target, *(getattr(case.motion, key)[own] for key in "qva"))])
+    matrix, target, *motion = (np.concatenate(series) for series in zip(*parts))
+    every = slice(None, None, max(1, len(target) // SAMPLES))
+    return matrix[every], target[every], [series[every].T for series in motion]
 
 
 def _cross_validation(
@@ -248,7 +324,7 @@ def _cross_validation(
     for name, terms in offered.items():
         place[name] = list(range(start, start + len(terms)))
         for k, one in enumerate(terms):
-            if k and one.acts[0][0] != terms[k - 1].acts[0][0]:
+            if k and _joints(one) != _joints(terms[k - 1]):
                 number += 1
             group[start + k] = number
         start += len(terms)
@@ -262,6 +338,7 @@ def _cross_validation(
         candidates.inflation,
         group,
         _padded(candidates.prior, len(every)),
+        regimes(rows, candidates.cases, candidates.decimator),
     ), place
 
 

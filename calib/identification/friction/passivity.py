@@ -6,11 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.dynamics.drives import DriveTerm
+from calib.dynamics.shapes import Joined
 from calib.errors import MeasurementError
 from calib.identification.cases import Case
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import term_columns
 
+SPEEDS = 8  # of each direction at which friction is to brake (our choice)
 LEAST = -0.01  # of the energy that a joint moves: noise and what other columns take over stay above (our choice)
 
 
@@ -35,6 +38,37 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
             for row, values in term_columns(one, case, load):
                 taken[row] += value * float(v[:, row] @ values)
     return np.where(moved > 0.0, taken / np.where(moved > 0.0, moved, 1.0), 0.0)
+
+
+def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarray:
+    """Return the rows A (c, p) of A x >= 0 under which friction of p columns brakes and motors' inertia is positive.
+
+    With and without load apart: the load's share grows without end. Beyond the speeds seen friction is linear
+    (`calib.dynamics.shapes`) but for Stribeck's peak, which fades: ten times the fastest stands for all.
+
+    Args:
+        terms: (p,) behind the columns; None for parameters of bodies.
+        fastest: (n,) speeds seen [rad/s or m/s].
+    """
+    p = len(terms)
+    rows = [row for row, one in zip(np.eye(p), terms) if one is not None and one.nonnegative]
+    groups: dict[tuple[int, str, bool], list[int]] = {}
+    for k, one in enumerate(terms):
+        if one is not None and one.joint is not None and one.form.dissipative and not one.form.remembers:
+            groups.setdefault((one.joint, one.side, one.form.loaded), []).append(k)
+    for (joint, _, _), members in groups.items():
+        if all(one is not None and one.nonnegative for one in (terms[k] for k in members)):
+            continue  # single bounds say it already
+        speeds = fastest[joint] * np.append(np.geomspace(0.02, 1.0, SPEEDS), 10.0)
+        v = np.concatenate([-speeds, speeds])
+        seen = Joined(np.zeros_like(v), v, np.zeros_like(v), np.ones_like(v), None)
+        block = np.zeros((len(v), p))
+        for k in members:
+            one = terms[k]
+            assert one is not None
+            block[:, k] = one.form.values(seen, one.settings) * np.sign(v)
+        rows += list(block)
+    return np.array(rows).reshape(-1, p)
 
 
 def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:

@@ -14,14 +14,15 @@ from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
 from calib.estimation.samples import SampleFit, Samples, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
-from calib.identification.friction.passivity import driving
-from calib.identification.friction.time_folds import estimate
+from calib.identification.friction.passivity import braking, driving
+from calib.identification.left_out.time_folds import estimate
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.parameter_constraints import Constraints, hold
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, bounded, residual_inflation, weighing
 
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
+MAX_COST = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
 ROUNDS = 2  # of weighing rows by the residuals that richer friction leaves
 
 
@@ -54,7 +55,7 @@ class _LeastSquares(Method):
             std, tau = weighed(problem)
             fit = self.solve(problem, std, tau)
             ridges = self.takes_prior and bool((problem.groups >= 0).any())
-            fit, known = _drawn(problem, None, std, tau) if ridges else (fit, None)
+            fit, _, known = _drawn(problem, None, std, tau) if ridges else (fit, None, None)
         else:
             fit, known, std, tau = _settled(problem, prior)
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
@@ -88,10 +89,10 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
 
 def _drawn(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray
-) -> tuple[LinearFit, np.ndarray]:
+) -> tuple[LinearFit, np.ndarray, np.ndarray]:
     """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
 
-    Beside it the rows (k, p) that say both, whitened.
+    Beside it the covariance (p, p) of both, infinite where nothing is known, and the rows (k, p) that say it, whitened.
     """
     pooled, group = problem.pooled, problem.groups
     own, more = problem.base.b, pooled.parameters - problem.base.b
@@ -105,40 +106,54 @@ def _drawn(
     rows = np.zeros((int(finite.sum()), len(ridges)))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
     rows[:, np.flatnonzero(finite)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
-    return fit, rows
+    return fit, covariance, rows
 
 
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
     """Return the fit with a prior, its rows (k, p), and the (rows,) std and inflation that its own residuals say.
 
-    Drive parameters are kept from being negative; the covariance is that without these bounds. Not so the friction of
-    a joint that it drives instead of braking it: that says that something is wrong, and is to be seen.
+    The values count residuals `Prior.tempering` times less than their covariance does; drives' inertia is positive and
+    friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
+    that says that something is wrong, and is to be seen.
     """
     pooled, noise = problem.pooled, problem.noise
-    std, tau = prior.first.std, prior.first.inflation
-    fit, known = _drawn(problem, prior, std, tau)
+    std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
+    fit, covariance, known = _drawn(problem, prior, std, tempering * tau)
     for _ in range(ROUNDS):
-        std, tau = weighing(problem.rows, pooled, fit.estimate.values, fit.estimate.covariance, std, tau, noise)
-        fit, known = _drawn(problem, prior, std, tau)
-    bound = problem.nonnegative & ~_driving(problem, fit.estimate.values)
-    values = bounded(
-        retriangulate(np.vstack([combine(pooled, std * np.sqrt(tau)), np.pad(known, ((0, 0), (0, 1)))])), bound
-    )
-    return replace(fit, estimate=replace(fit.estimate, values=values)), known, std, tau
+        own = fit.estimate
+        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tempering * tau, noise)
+        fit, covariance, known = _drawn(problem, prior, std, tempering * tau)
+    values = _braking(problem, fit.estimate.values, std * np.sqrt(tempering * tau), known)
+    stated = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(tau))
+    return replace(stated, estimate=replace(stated.estimate, values=values)), known, std, tau
+
+
+def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the estimate (p,) whose friction brakes, but for joints at which that costs too much."""
+    fastest = np.max([np.abs(case.motion.v).max(axis=0) for case in problem.cases], axis=0)
+    terms, pooled = problem.terms, problem.pooled
+    factor = retriangulate(np.vstack([combine(pooled, std), np.pad(known, ((0, 0), (0, 1)))]))
+    values = bounded(factor, braking(terms, fastest))
+    wrong = _driving(problem, free)
+    if wrong.any():
+        wrong &= (
+            pooled.residual_squares(values)[-len(wrong) :] > MAX_COST * pooled.residual_squares(free)[-len(wrong) :]
+        )
+    if not wrong.any():
+        return values
+    reversed_ = [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in terms]
+    kept = [None if skipped else one for one, skipped in zip(terms, reversed_)]
+    return bounded(factor, braking(kept, fastest))
 
 
 def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
-    """Return (p,) which columns are friction of a joint that it drives, by an estimate without bounds."""
+    """Return (n,) which joints friction drives, by an estimate without bounds."""
     model, own = problem.model, problem.base.b
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-        return np.zeros(len(values), dtype=bool)
+        return np.zeros(0, dtype=bool)
     richer = model.with_terms(*(one for one in problem.terms[own:] if one is not None))
     standard = np.concatenate([problem.base.to_standard(values[:own]), values[own:]])
-    wrong = driving(Dynamics(richer, standard), problem.cases)
-    return np.array(
-        [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in problem.terms],
-        dtype=bool,
-    )
+    return driving(Dynamics(richer, standard), problem.cases)
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def _information(found: Identification) -> np.ndarray:
     count = len(found.names) - own
     if count:
         group = np.concatenate([np.full(own, -1), found.friction.groups]).astype(int)
-        from calib.identification.friction.time_folds import estimate
+        from calib.identification.left_out.time_folds import estimate
 
         known = None if found.prior is None else _widened(found.prior.rows, count)
         ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, known)[1]

@@ -28,8 +28,8 @@ from calib.estimation.triangles import Triangles
 from calib.estimation.variances import variance_weights
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
-from calib.identification.friction import time_folds
 from calib.identification.identify import Identification, common_decimator
+from calib.identification.left_out import time_folds
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import pool, segmented_states, triangulate
 from calib.identification.uncertainty.torque_uncertainty import estimated_columns, parameter_variances

@@ -216,6 +216,12 @@ def _smooth_sign(scaled):
 
 
 @njit(**JOINED)
+def _held(rate, edge):
+    """Return the velocity up to the edge of what was learnt."""
+    return min(edge, max(-edge, rate))
+
+
+@njit(**JOINED)
 def seen(acts, t, motion):
     """Return what act t sees of a motion (n,): the weighted sum over joints."""
     total = 0.0
@@ -235,16 +241,17 @@ def shape(code, acts, t, memory, q, v):
     """Return what act t is per unit of its parameter, as `calib.dynamics.shapes` says; loads are another's business."""
     rate, last = seen(acts, t, v), acts[t, 7]
     if code == SPEED:
-        return abs(rate)
+        return abs(_held(rate, last))
     if code == CUBIC:
-        return rate * rate * rate
+        return _held(rate, last) ** 3
     if code == ROOT:
+        rate = _held(rate, acts[t, 6])
         return rate / sqrt(abs(rate) + last)
     if code == DEAD:
         wide = EDGE * last
         return 0.5 * (_smooth_sign((rate - last) / wide) + _smooth_sign((rate + last) / wide))
     if code == LOAD_VELOCITY:
-        return rate
+        return _held(rate, last)
     if code in (SIGN, LOAD):
         return _smooth_sign(rate / last)
     if code == STRIBECK:

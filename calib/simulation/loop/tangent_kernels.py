@@ -249,6 +249,8 @@ def _columns(tree, order, find, work, more, ten, out):
 def _act_slopes(code, acts, t, q, v):
     """Return the slopes by place and by rate of act t, per unit of its parameter."""
     rate, last = seen(acts, t, v), acts[t, 7]
+    if (code in (SPEED, CUBIC) and abs(rate) >= last) or (code == ROOT and abs(rate) >= acts[t, 6]):
+        return 0.0, 0.0
     if code == SPEED:
         return 0.0, 1.0 if rate > 0.0 else -1.0 if rate < 0.0 else 0.0
     if code == CUBIC:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.estimation.relevance import Gram, relevance
 from calib.estimation.triangles import Triangles
+from calib.identification.left_out.regimes import Regimes
 from calib.identification.rows import pool
 
 ITERATIONS = 12
@@ -28,6 +29,7 @@ class CrossValidation:
         inflation: (rows,) how many rows count as one.
         group: (p,) ridge group of each column, -1 for none.
         prior: (k, p + 1) rows of [W y] that say what is known beforehand, whitened; None for nothing.
+        regimes: what each torque row's regimes hold, see `calib.identification.left_out.regimes`.
     """
 
     data: Triangles
@@ -37,6 +39,7 @@ class CrossValidation:
     inflation: np.ndarray
     group: np.ndarray
     prior: np.ndarray | None = None
+    regimes: Regimes | None = None
     _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
@@ -57,6 +60,22 @@ class CrossValidation:
             each = [own for run, own in zip(runs, values) for _ in run]
             self._known[key] = self._errors(columns, each)
         return self._known[key].copy()
+
+    def extrapolated(self, columns: np.ndarray) -> np.ndarray:
+        """Return the squared errors (regimes, rows) in each regime of a model with these columns fitted to the rest."""
+        assert self.regimes is not None
+        index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
+        known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
+        rounding = 1e-9 * (weight @ self.regimes.whole.diagonal(axis1=1, axis2=2))[index]
+        result = np.zeros((len(self.regimes.squares), self.rows))
+        for k, (held, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
+            rest = np.tensordot(weight, self.regimes.whole - held, 1).take(index, 0).take(index, 1)
+            rest.flat[:: len(index) + 1] += rounding  # differences are positive definite but for that
+            rest += known
+            rows = int(np.sum((self.regimes.total - counts) / self.inflation))
+            values = np.append(_drawn(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
+            result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
+        return np.maximum(result, 0.0)
 
     def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
         """Return the squared errors of values (k,) per block."""
