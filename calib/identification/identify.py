@@ -197,6 +197,7 @@ def identify_model(
     say("simulating the closed loop" if method.needs_controller else "estimate")
     found = method.estimate(problem)
     values = found.estimate.values
+    friction = friction.fitted(found.estimate.sigma[base.b :])
     if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
     bias = compare_with_loop(problem, found)

@@ -34,6 +34,7 @@ GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this sh
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
 SAMPLES = 3000  # of the rows that couplings are sought in, about
+SWITCHED_OFF = 1e-9  # σ of a term below which its ridge holds it at zero
 MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
 STEPS = ("coupling", "load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *STEPS, "ripple")
@@ -52,6 +53,7 @@ class FrictionTrial:
         joints: the same for each row [%].
         kept_at: joints, from 0, where it stays.
         note: in words.
+        terms: names of those that stay.
     """
 
     model: str
@@ -60,6 +62,7 @@ class FrictionTrial:
     joints: tuple[float, ...]
     kept_at: tuple[int, ...]
     note: str = ""
+    terms: tuple[str, ...] = ()
 
     @property
     def kept(self) -> bool:
@@ -68,11 +71,29 @@ class FrictionTrial:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSelection:
-    """Where forward selection ended: the terms taken, their ridge groups, and the steps tried."""
+    """Where forward selection ended: the terms taken, their ridge groups, and the steps tried.
+
+    Attributes:
+        off: names of terms that the final fit's ridges hold at zero; their rows of ``covariance.csv`` hold the ridges'
+            floor, so that the model's other σ are those without them.
+    """
 
     terms: tuple[DriveTerm, ...]
     groups: tuple[int, ...]
     steps: tuple[FrictionTrial, ...]
+    off: tuple[str, ...] = ()
+
+    def fitted(self, sigma: np.ndarray) -> FrictionSelection:
+        """Return the selection after the final fit, by its terms' σ (k,): what that switched off is not kept."""
+        off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < SWITCHED_OFF)
+        joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
+        steps = []
+        for step in self.steps:
+            left = _flat([joints[name] for name in step.terms if name in joints])
+            if step.terms and left != step.kept_at:
+                step = replace(step, kept_at=left, note="" if left else "switched off by the fit of all steps")
+            steps.append(step)
+        return replace(self, steps=tuple(steps), off=off)
 
     @property
     def chosen(self) -> str:
@@ -150,7 +171,8 @@ def select_friction(
             note = "" if at else "no better on unseen time: left out"
             shown = new if found else validation.errors(np.array([*base, *taken, *columns]))
             count = len(base) + len(taken) + len(found or columns)
-            steps.append(_step(f"+ {name}", count, shown, size, at, candidates.apart, note))
+            names = tuple(every[k - len(base)].name for k in found)
+            steps.append(_step(f"+ {name}", count, shown, size, at, candidates.apart, note, names))
             if found:
                 taken, error = [*taken, *found], new
             else:
@@ -363,9 +385,10 @@ def _step(
     at: tuple[int, ...],
     apart: Sequence[int],
     note: str = "",
+    terms: tuple[str, ...] = (),
 ) -> FrictionTrial:
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
     alike = np.setdiff1d(np.arange(len(size)), apart)
     total = float(100.0 * np.sqrt(error[:, alike].sum() / size[alike].sum()))
-    return FrictionTrial(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)
+    return FrictionTrial(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note, terms)

@@ -31,7 +31,6 @@ from calib.procedure.dynamic_stage.metric_tables import (
     metrics,
     on_bounds,
     report,
-    switched_off,
 )
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -241,7 +240,7 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     estimate = found.fitted.estimate
     words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
     held = on_bounds(found)
-    off = (*switched_off(found.names, found.base.b, estimate.sigma), *held)
+    off = (*found.friction.off, *held)
     words += [
         f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.friction.terms
     ]

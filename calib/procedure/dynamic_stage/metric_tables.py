@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,7 +28,6 @@ from calib.simulation.loop.controllers import Controller
 
 UNSEEN = 1  # schema of the report on unseen motion
 POINTS = 400  # samples per curve of the certificate (our choice)
-OFF = 1e-9  # σ of a friction term below which it is the ridge's floor, not a measurement [N m] (our choice)
 
 
 @dataclass(frozen=True)
@@ -72,14 +70,6 @@ class StoredFindings:
     unlike: LoopDisagreement | None = None
 
 
-def switched_off(names: Sequence[str], base: int, sigma: np.ndarray) -> tuple[str, ...]:
-    """Return terms of richer friction (behind `base` columns) that the ridge holds at zero: their σ is its floor.
-
-    Their rows of ``covariance.csv`` hold that floor, so that the model's other σ are those without the terms.
-    """
-    return tuple(name for name, own in zip(names[base:], sigma[base:]) if own < OFF)
-
-
 def on_bounds(found: Identification) -> tuple[str, ...]:
     """Return parameters that a constraint holds where they are: the data do not tell them, and have no σ of them.
 
@@ -116,7 +106,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "rows": list(found.settings.torque_rows.numbered(outcome.inputs.chain.n)),
         "condition_number": {"raw": finite(found.condition[0]), "normalised": finite(found.condition[1])},
         "friction": found.friction.chosen,
-        "switched_off": list(switched_off(found.names, found.base.b, found.fitted.estimate.sigma)),
+        "switched_off": list(found.friction.off),
         "method": found.fitted.method,
         "method_assumes": METHODS[found.fitted.method].assumes,
         "ladder": [

@@ -12,6 +12,8 @@ import planted_motion as planted
 import pytest
 from without_figures import run
 
+from calib.dynamics import drives
+from calib.identification.friction.friction_ladder import FrictionSelection, FrictionTrial
 from calib.identification.identify import identify
 from calib.identification.settings import IdentificationSettings
 
@@ -118,11 +120,13 @@ def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
     assert first["name"] == "ZZ1" and first["listed"]
 
 
-def test_terms_the_ridge_switched_off_are_named_and_measured_ones_are_not():
-    from calib.procedure.dynamic_stage.metric_tables import switched_off
-
-    sigma = np.array([1e-12, 0.1, 1e-12, 0.02])
-    assert switched_off(("ZZ1R", "Fc1", "Fs1", "Fs2"), 2, sigma) == ("Fs1",)
+def test_a_step_whose_terms_the_final_fit_switched_off_is_not_kept():
+    terms = tuple(drives.stribeck(joint, 0.1)[0] for joint in (0, 1))
+    step = FrictionTrial("+ stribeck", 12, 5.0, (5.0, 5.0), (0, 1), terms=("Fs1", "Fs2"))
+    one = FrictionSelection(terms, (0, 1), (step,)).fitted(np.array([1e-12, 0.02]))
+    assert one.off == ("Fs1",) and one.steps[0].kept_at == (1,) and one.chosen == "standard + stribeck"
+    none = FrictionSelection(terms, (0, 1), (step,)).fitted(np.array([1e-12, 1e-12]))
+    assert not none.steps[0].kept and none.steps[0].note and none.chosen == "standard"
 
 
 def test_totals_of_the_friction_ladder_leave_out_joints_in_units_of_their_own() -> None:
