@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.dynamics.drives import DriveTerm
 from calib.identification.prediction import Dynamics
 
 PLAIN = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
@@ -17,12 +18,16 @@ class Drives:
 
     Attributes:
         values: (n, 4) armature [kg m² or kg], damping [N m s/rad or N s/m], friction, offset [N m or N].
-        sigma: (n, 4) of them; None where no covariance is known.
-        left: names of terms that no such table holds: couplings, richer friction.
+        left: names of terms that no such table holds: richer friction.
+        couplings: (c, 4) the same of motors that turn with two joints (`calib.dynamics.drives.coupled`).
+        pairs: (c,) their joints, from 0, and the weight of the second: 1 the sum, -1 the difference.
+        sigma: (n + c, 4) of all values; None where no covariance is known.
     """
 
     values: np.ndarray
     left: tuple[str, ...]
+    couplings: np.ndarray
+    pairs: tuple[tuple[int, int, float], ...] = ()
     sigma: np.ndarray | None = None
 
 
@@ -42,7 +47,9 @@ def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Dri
         covariance: of all its parameters.
     """
     model = dynamics.model
-    values, left = np.zeros((model.bodies.n, 4)), []
+    n, left = model.bodies.n, []
+    pairs = tuple(dict.fromkeys(pair for one in model.columns if (pair := _pair(one)) is not None))
+    values = np.zeros((n + len(pairs), 4))
     adds = np.zeros((*values.shape, len(dynamics.values)))
     for k, (one, value) in enumerate(zip(model.columns, dynamics.values[model.inertial :]), model.inertial):
         if not one.acts or value == 0.0:
@@ -50,9 +57,21 @@ def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Dri
         if one.shape in PLAIN and one.joint is not None:
             values[one.joint, PLAIN[one.shape]] += value
             adds[one.joint, PLAIN[one.shape], k] = 1.0
+        elif (pair := _pair(one)) is not None:
+            values[n + pairs.index(pair), PLAIN[one.shape]] = value
+            adds[n + pairs.index(pair), PLAIN[one.shape], k] = 1.0
         else:
             left.append(one.name)
     if covariance is None:
-        return Drives(values, tuple(left))
+        return Drives(values[:n], tuple(left), values[n:], pairs)
     variance = np.einsum("nki,ij,nkj->nk", adds, covariance, adds)
-    return Drives(values, tuple(left), np.sqrt(np.clip(variance, 0.0, None)))
+    return Drives(values[:n], tuple(left), values[n:], pairs, np.sqrt(np.clip(variance, 0.0, None)))
+
+
+def _pair(one: DriveTerm) -> tuple[int, int, float] | None:
+    """Return the joints that a term couples and the weight of the second; None for any other term."""
+    if one.shape not in PLAIN or len(one.acts) != 2:
+        return None
+    (first, motion), (second, _) = one.acts
+    weights = dict(motion)
+    return None if second not in weights else (first, second, weights[second])

@@ -6,8 +6,9 @@ robot.urdf            the source with calibrated joint origins, masses and frict
                       as it was. ``<inertial>`` of a link: origin at its centre of mass, axes of the link.
                       ``<dynamics damping friction>``: Fv and Fc. URDF has no place for motor inertia: see drives.csv.
 robot.xml             MJCF for MuJoCo: bodies, armature (Ia), damping (Fv), frictionloss (Fc); no meshes.
-drives.csv            joint, armature, damping, friction, offset, and the sigma of each: for simulators that take them
-                      by hand. A sigma is empty where the model has no such term.
+drives.csv            joint, armature, damping, friction, offset, and the sigma of each: for simulators that take them;
+                      by hand. A sigma is empty where the model has no such term. Then a row per coupling, as
+                      "joint5 + joint6", of a motor that turns with both.
 joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
                       calibration / joints / name / position x y z [m], orientation x y z w.
 parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, what
@@ -98,10 +99,13 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: st
 
 def _export_drives(given: IdentifiedRobot, out: Path) -> Path:
     """Write the drives' table."""
-    rows, values = [], given.drives.values
+    joints, pairs = given.chain.joints, given.drives.pairs
+    named = [(joint.name, joint) for joint in joints]
+    named += [(f"{joints[i].name} {'+' if w > 0 else '-'} {joints[j].name}", joints[i]) for i, j, w in pairs]
+    rows, values = [], np.vstack([given.drives.values, given.drives.couplings])
     sigmas = np.zeros(values.shape) if given.drives.sigma is None else given.drives.sigma
-    for joint, row, sigma in zip(given.chain.joints, values, sigmas):
+    for (name, joint), row, sigma in zip(named, values, sigmas, strict=True):
         linear = joint.kind == "prismatic"
         units = ("kg", "N s/m", "N") if linear else ("kg m²", "N m s/rad", "N m")
-        rows.append((joint.name, *map(float, row), *units, *(float(one) or None for one in sigma)))
+        rows.append((name, *map(float, row), *units, *(float(one) or None for one in sigma)))
     return files.write_table(out, (*TABLE, *SIGMAS), rows)

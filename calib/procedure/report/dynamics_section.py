@@ -275,6 +275,10 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
             f"{100 * one.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on time blocks left out; "
             "not part of the covariance"
         )
+    for step in metrics.ladder:
+        if step.model == "+ coupling":
+            at = step.kept_at_joints
+            lines += [f"joints {i} and {j} are coupled: a motor turns with both" for i, j in zip(at[::2], at[1::2])]
     lines.append(f"method {metrics.method}: takes for granted that {metrics.method_assumes}")
     count, columns = metrics.parameters, metrics.counts
     base = count.standard - columns.without_effect - columns.regrouped
