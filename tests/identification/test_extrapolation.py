@@ -1,0 +1,102 @@
+"""Models go on being right where they never learnt: friction stays bounded and brakes, couplings are found, and what one
+joint's motion does not show follows the others'."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.arrays import frozen
+from calib.data.signals.decimation import design_decimator
+from calib.dynamics import drives
+from calib.dynamics.shapes import Joined
+from calib.identification.cases import Case
+from calib.identification.friction.drive_table import drive_table
+from calib.identification.friction.passivity import braking
+from calib.identification.identify import Identification, identify
+from calib.identification.left_out.regimes import regimes
+from calib.identification.prediction import predict
+from calib.identification.settings import IdentificationSettings
+
+PLAIN = IdentificationSettings(friction="standard", essential="none")
+COUPLED = drives.coupled(1, 2, label="2.3")
+GEARS = {"Iam2.3": 0.08, "Fvm2.3": 0.4, "Fcm2.3": 0.6}
+
+
+def unexplained(found: Identification, case: Case) -> float:
+    """Return 100 |tau - predicted| / |tau| of a case."""
+    return float(100 * np.linalg.norm(case.target - predict(found.dynamics, case)) / np.linalg.norm(case.target))
+
+
+def without_friction(case: Case) -> Case:
+    """Return the case as a sensor behind the gears records it: no friction of joints."""
+    v = case.motion.v
+    friction = np.array(planted.DRIVES["Fv"]) * v + np.array(planted.DRIVES["Fc"]) * np.tanh(v / 0.01)
+    return replace(case, target=frozen(case.target - friction))
+
+
+@pytest.mark.parametrize("one", [drives.cubic(0, 2.0), drives.asymmetric(0, 2.0), drives.root(0, 0.01, 2.0)])
+def test_a_shape_that_bends_keeps_its_value_beyond_the_edge(one):
+    def at(v: float) -> float:
+        state = np.array([0.0]), np.array([v]), np.array([0.0])
+        return float(one[0].form.values(Joined(*state), one[0].settings)[0])
+
+    assert at(6.0) == at(2.0) != at(1.0)
+    assert at(-6.0) == at(-2.0)
+    free = replace(one[0], settings=one[0].settings[1:])  # as files of before say it: no edge
+    assert free.settings[0] == np.inf
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_friction_of_sensors_behind_the_gears_brakes_and_is_small(seed):
+    case = without_friction(planted.case("log", seed, noise=0.2))
+    found = identify(planted.arm(), [case], replace(PLAIN, friction="auto"))
+    terms, values = found.terms, found.fitted.estimate.values
+    assert (braking(terms, np.abs(case.motion.v).max(axis=0)) @ values >= -1e-9).all()
+    own = [abs(value) for one, value in zip(terms, values) if one is not None and one.shape == "sign"]
+    assert max(own) < 0.1 * min(planted.DRIVES["Fc"])
+
+
+def test_a_coupling_is_found_and_written_and_none_where_there_is_none():
+    case = planted.case("log", 0, noise=0.05, terms=COUPLED, values=GEARS)
+    other = planted.case("other", 9, noise=0.05, terms=COUPLED, values=GEARS)
+    found = identify(planted.arm(), [case], replace(PLAIN, friction="auto"))
+    plain = identify(planted.arm(), [case], PLAIN)
+    assert "coupling" in found.friction.chosen
+    assert unexplained(found, other) < 0.5 * unexplained(plain, other)
+    table = drive_table(found.dynamics)
+    assert table.pairs == ((1, 2, 1.0),)
+    np.testing.assert_allclose(table.couplings[0, :3], list(GEARS.values()), rtol=0.1)
+    alone = identify(planted.arm(), [planted.case("log", 0, noise=0.05)], replace(PLAIN, friction="auto"))
+    assert "coupling" not in alone.friction.chosen and drive_table(alone.dynamics).pairs == ()
+
+
+def test_a_joint_that_never_reverses_has_friction_like_the_others_and_no_offset():
+    """Coulomb friction in proportion to the torque limits: joint 1's constant torque is its friction, not an offset."""
+    arm = planted.arm()
+    arm = replace(
+        arm, joints=tuple(replace(one, effort=100.0 * own) for one, own in zip(arm.joints, planted.DRIVES["Fc"]))
+    )
+    case, other = planted.case("log", 0, noise=0.05), planted.case("other", 7, noise=0.05)
+    present = np.array(case.present)
+    present[:, 0] &= case.motion.v[:, 0] > 0.05
+    found = identify(arm, [replace(case, present=frozen(present, bool))], PLAIN)
+    names, values = found.names, found.fitted.estimate.values
+    assert values[names.index("Fc1")] == pytest.approx(planted.DRIVES["Fc"][0], rel=0.2)
+    assert unexplained(found, other) < 5.0
+
+
+def test_regimes_hold_each_joints_extremes_and_with_the_rest_are_everything():
+    case = planted.case("log", 0)
+    found = identify(planted.arm(), [case], PLAIN)
+    rate = design_decimator(case.motion.rate, case.motion.decimator.factor)
+    own = regimes(found.rows, [case], rate)
+    assert own.squares.shape[0] == 6
+    share = own.counts / own.total
+    np.testing.assert_allclose(share[:2], 0.1, atol=0.01)
+    np.testing.assert_allclose(share[2:4], 0.15, atol=0.01)
+    np.testing.assert_allclose(share[4] + share[5], 1.0, atol=0.01)
+    np.testing.assert_allclose(own.squares[4] + own.squares[5], own.whole, rtol=0.02, atol=1e-3 * own.whole.max())
