@@ -1,5 +1,4 @@
-"""Models go on being right where they never learnt: friction stays bounded and brakes, couplings are found, and what one
-joint's motion does not show follows the others'."""
+"""Models hold where they never learnt: friction is bounded and brakes, couplings are found, joints borrow from others."""
 
 from __future__ import annotations
 
