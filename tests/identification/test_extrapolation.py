@@ -1,4 +1,4 @@
-"""Models hold where they never learnt: friction is bounded and brakes, couplings are found, joints borrow from others."""
+"""Models hold where they never learnt: friction is bounded and brakes, couplings are found, joints borrow of others."""
 
 from __future__ import annotations
 
