@@ -263,9 +263,9 @@ def _richer_friction(
     plain = Dynamics(model, base.to_standard(values))
     loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
     candidates = FrictionCandidates(
-        cases, rows, loads, decimator, std, tau if prior is None else TEMPERING * tau,
+        cases, rows, loads, decimator, std, tau if prior is None else tau * prior.tempering / TEMPERING,
         np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
-        None if prior is None else prior.rows, settings.apart, model.torque_rows,
+        None if prior is None else np.sqrt(TEMPERING) * prior.rows, settings.apart, model.torque_rows,
         frozenset(tuple(sorted({row for row, _ in one.acts})) for one in model.columns if len(one.acts) > 1),
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads

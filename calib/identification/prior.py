@@ -17,9 +17,10 @@ with [R z] the triangle of the whitened [W y] and P the prior covariance, times 
 a kind would be if it alone explained `SHARE` of all torque (offsets: `OFFSET`), within a factor exp(`WIDTH`) (our
 choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that cancel.
 Rows are weighed by their joint's residual, which tells as many independent values as its autocorrelation lets it, but
-not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave whatever the model is. For the
-values, not for their covariance, they count `TEMPERING` times less, or as many more times as regimes left out ask for:
-what the model lacks is no noise, and differs on other motion.
+not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave whatever the model is. What the
+model lacks is no noise, and differs on other motion: where sizes are found residuals count `TEMPERING` times less, and
+the prior as many times more for the values than for their covariance; more where regimes left out ask for it
+(`calib.identification.left_out.tempering`).
 
 Directions that the motion tells well do not feel the prior; those that it does not tell follow the whole robot. It does
 not make the parameters those of possible bodies: that is the semidefinite fit of another module; but `bounded` keeps
@@ -52,7 +53,7 @@ MAX_DEVIATION = 3.0  # of the whole robot's parameters of a kind, rms, or of wha
 NEAREST = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
 WHOLE = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
 MAX_INFLATION = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
-TEMPERING = 2.0  # times as many count as one for the values, at least: chosen on motion other than learnt from
+TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
 EXACT = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
 ROUNDS = 12
@@ -80,7 +81,7 @@ class Prior:
         sizes: kind → σ, and ``whole`` → κ.
         source: of u, ``cad`` or ``sizes``.
         first: the fit with it, of the base parameters alone.
-        tempering: how many times less residuals count for the values than for their covariance.
+        tempering: how many times more it counts for the values than for their covariance.
     """
 
     covariance: np.ndarray

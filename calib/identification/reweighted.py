@@ -39,7 +39,7 @@ def estimator(found: Identification) -> _Estimator:
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
     if fitted.beforehand is None:
         return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
-    deviation = deviation * np.sqrt(fitted.inflation * (1.0 if found.prior is None else found.prior.tempering))
+    deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
     known, values = fitted.beforehand, fitted.estimate.values
     pull = factors[:, :p].T @ (factors[:, :p] @ values - factors[:, p]) + known.T @ (known @ values)

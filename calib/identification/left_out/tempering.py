@@ -12,6 +12,7 @@ from calib.identification.prior import TEMPERING, Prior
 from calib.identification.rows import ObservationRows, triangulate
 
 STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
+MIN_GAIN = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
 
 
 def tempered_prior(
@@ -20,7 +21,8 @@ def tempered_prior(
     """Return the prior of the tempering with which the regimes are predicted best by what is learnt from the rest.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
-    one kind of extreme is hard for every prior it decides no more than the others.
+    one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by
+    `MIN_GAIN`.
 
     Args:
         find: tempering and a prior to start from to the prior whose sizes the evidence chose with it.
@@ -38,7 +40,7 @@ def tempered_prior(
         )
         squares = (validation.extrapolated(columns) / std**2).sum(axis=1)
         error = float(np.log(np.maximum(squares, 1e-300)).mean())
-        if best is None or error < best[0]:
+        if best is None or error < best[0] - MIN_GAIN:
             best = error, own
     assert best is not None
     return best[1]

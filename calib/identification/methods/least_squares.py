@@ -88,19 +88,22 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _drawn(
-    problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray
+    problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
     """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
 
     Beside it the covariance (p, p) of both, infinite where nothing is known, and the rows (k, p) that say it, whitened.
+    The prior counts `tempering` times.
     """
     pooled, group = problem.pooled, problem.groups
     own, more = problem.base.b, pooled.parameters - problem.base.b
-    known = None if prior is None else np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
+    known = None
+    if prior is not None:
+        known = np.sqrt(tempering) * np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
     ridges = estimate(pooled, std, tau, group, known)[1]
     covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
     if prior is not None:
-        covariance[:own, :own] = prior.covariance
+        covariance[:own, :own] = prior.covariance / tempering
     fit = ridge(pooled, np.zeros(len(ridges)), covariance, std * np.sqrt(tau))
     finite = np.isfinite(np.diag(covariance))
     rows = np.zeros((int(finite.sum()), len(ridges)))
@@ -112,18 +115,19 @@ def _drawn(
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
     """Return the fit with a prior, its rows (k, p), and the (rows,) std and inflation that its own residuals say.
 
-    The values count residuals `Prior.tempering` times less than their covariance does; drives' inertia is positive and
-    friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
+    The prior counts `Prior.tempering` times more for the values than for their covariance; drives' inertia is positive
+    and friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
     that says that something is wrong, and is to be seen.
     """
     pooled, noise = problem.pooled, problem.noise
     std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
-    fit, covariance, known = _drawn(problem, prior, std, tempering * tau)
+    fit, covariance, known = _drawn(problem, prior, std, tau, tempering)
     for _ in range(ROUNDS):
         own = fit.estimate
-        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tempering * tau, noise)
-        fit, covariance, known = _drawn(problem, prior, std, tempering * tau)
-    values = _braking(problem, fit.estimate.values, std * np.sqrt(tempering * tau), known)
+        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise)
+        fit, covariance, known = _drawn(problem, prior, std, tau, tempering)
+    values = _braking(problem, fit.estimate.values, std * np.sqrt(tau), known)
+    covariance[: problem.base.b, : problem.base.b] *= tempering
     stated = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(tau))
     return replace(stated, estimate=replace(stated.estimate, values=values)), known, std, tau
 

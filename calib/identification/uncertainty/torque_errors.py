@@ -300,8 +300,8 @@ def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> 
     group = np.concatenate([np.full(b, -1), np.asarray(found.friction.groups, dtype=int)])
     prior = None if found.prior is None else np.insert(found.prior.rows, [b] * (len(group) - b), 0.0, axis=1)
     pooled = pool(data, len(fitted.std), blocks)
-    tempering = 1.0 if found.prior is None else found.prior.tempering
-    values, ridges = time_folds.estimate(pooled, fitted.std, tempering * fitted.inflation, group, prior)
+    stronger = None if found.prior is None or prior is None else np.sqrt(found.prior.tempering) * prior
+    values, ridges = time_folds.estimate(pooled, fitted.std, fitted.inflation, group, stronger)
     alive = np.flatnonzero(ridges > 0.0)
     weight = 1.0 / (fitted.std * np.sqrt(fitted.inflation))
     stacked = (pooled.factors[:, :, :-1] * weight[:, None, None]).reshape(-1, len(group))
