@@ -44,18 +44,16 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     q, v, a = (
         np.concatenate([getattr(motion, key)[own] for motion, own in zip(motions, chosen)]) for key in ("q", "v", "a")
     )
-    low, high = np.quantile(q, [FAR, 1.0 - FAR], axis=0)
-    joints = np.stack(
-        [
-            np.abs(v) > np.quantile(np.abs(v), 1.0 - FAST, axis=0),
-            np.abs(a) > np.quantile(np.abs(a), 1.0 - FAST, axis=0),
-            q < low, q > high, v > 0.0, v < 0.0,
-        ]
-    )  # fmt: skip
     rows, p = all_rows[0].matrix.shape[1:]
-    inside = np.tile(joints, rows // q.shape[1])
+    joint = np.arange(rows) % q.shape[1]
+    if rows % q.shape[1]:  # rows of the platform, or the power: of all joints together, and of the one that moves most
+        joint = np.full(rows, np.argmax(np.std(q, axis=0)))
+        v, a = (np.copysign(np.linalg.norm(x / (np.std(x, axis=0) + 1e-12), axis=1)[:, None], x) for x in (v, a))
+    low, high = np.quantile(q, [FAR, 1.0 - FAR], axis=0)
+    fastest, hardest = (np.abs(x) > np.quantile(np.abs(x), 1.0 - FAST, axis=0) for x in (v, a))
+    inside = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
     stacked = [np.concatenate([part.matrix, part.target[:, :, None]], axis=2) for part in all_rows]
-    squares, counts = np.zeros((len(joints), rows, p + 1, p + 1)), np.zeros((len(joints), rows))
+    squares, counts = np.zeros((len(inside), rows, p + 1, p + 1)), np.zeros((len(inside), rows))
     whole, total = np.zeros((rows, p + 1, p + 1)), np.zeros(rows)
     start = 0
     for part, both in zip(all_rows, stacked):
@@ -65,7 +63,7 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
             used = part.present[:, row]
             whole[row] += both[used, row].T @ both[used, row]
             total[row] += used.sum()
-            for k in range(len(joints)):
+            for k in range(len(inside)):
                 held = both[used & inside[k, own, row], row]
                 squares[k, row] += held.T @ held
                 counts[k, row] += len(held)
