@@ -23,14 +23,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib.api.dynamic import DynamicsModel, identify_dynamics
     from calib.api.exporting import export
-    from calib.api.kinematic import (
-        GeometryFit,
-        JointCommands,
-        PoseSelection,
-        compensate,
-        fit_geometry,
-        select_poses,
-    )
+    from calib.api.kinematic import GeometryFit, JointCommands, PoseSelection, compensate, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
     from calib.api.sessions import new_session, run_sessions

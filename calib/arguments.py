@@ -16,10 +16,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 C = TypeVar("C")
-_PLAIN = {
-    int: (Integral,),
-    float: (Real,),
-}
+_PLAIN = {int: (Integral,), float: (Real,)}
 _WORDS = {
     bool: "True or False", int: "a whole number", float: "a number", str: "a text", NoneType: "None", Path: "a path",
 }  # fmt: skip

@@ -20,8 +20,7 @@ def board(
     rows: Annotated[int, typer.Option(help="squares (tags) down")] = 7,
     square: Annotated[float, typer.Option(metavar="MM", help="side of a square (tag), in mm")] = 30.0,
     marker: Annotated[
-        float | None,
-        typer.Option(metavar="MM", help="side of a marker; of apriltag the gap between tags"),
+        float | None, typer.Option(metavar="MM", help="side of a marker; of apriltag the gap between tags")
     ] = None,
     dictionary: Annotated[str | None, typer.Option(help="of the markers: 4x4_50 to 7x7_1000, apriltag_36h11")] = None,
     paper: Annotated[str | None, typer.Option(help="a4, a3, a2, a1 or a0; by default the smallest that fits")] = None,

@@ -114,8 +114,7 @@ def select(
         ),
     ] = None,
     run: Annotated[
-        Path | None,
-        typer.Option(help="CSV of the run: t, pose (0: via-point), joints; calib view rehearses it"),
+        Path | None, typer.Option(help="CSV of the run: t, pose (0: via-point), joints; calib view rehearses it")
     ] = None,
     speed: Annotated[float, typer.Option(help="share of the joints' speeds that the run is driven at")] = 0.3,
     dwell: Annotated[float, typer.Option(help="seconds that each pose takes to settle and be measured")] = 6.0,
@@ -251,8 +250,7 @@ def compensate(
     targets: Annotated[Path, typer.Argument(help="CSV of nominal joints or tool poses: calib formats targets")],
     out: Annotated[Path, typer.Option(help="CSV file of joint commands")],
     frame: Annotated[
-        str,
-        typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station"),
+        str, typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station")
     ] = "base",
     tool: Annotated[
         str, typer.Option(help="what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]")

@@ -116,11 +116,7 @@ def rms_sigma(sizes: np.ndarray) -> float:
 
 
 def pair_errors(
-    cell: Installation,
-    measured: Sequence[PoseMeasurements],
-    torques: Torques = None,
-    limit: int = 20000,
-    seed: int = 0,
+    cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None, limit: int = 20000, seed: int = 0
 ) -> np.ndarray:
     """Return | |p_i - p_j| - |y_i - y_j| | of pairs of measured positions [m]: immune to where the station stands.
 

@@ -32,14 +32,7 @@ from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, residual_inflation, scaled
 from calib.identification.rods import rods
-from calib.identification.rows import (
-    ObservationRows,
-    observe,
-    observe_terms,
-    pool,
-    triangulate,
-    with_blocks,
-)
+from calib.identification.rows import ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, per_joint
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain

@@ -97,10 +97,7 @@ def simulate(
     noise, spread = rng.normal(size=(2, len(x), robot.n))
     read, held = np.empty((2, len(x), robot.n))
     omega = 2.0 * np.pi * controller.frequency
-    state = (
-        np.array(motion.posture.q[0]),
-        np.array(motion.posture.pose[0]),
-    )
+    state = (np.array(motion.posture.q[0]), np.array(motion.posture.pose[0]))
     left = closure_kernels.run(
         _compiled(model), _parameters(model, values, carried), *state, np.array(motion.rate[0]),
         tuple(np.ascontiguousarray(part) for part in plan), controller.encoder * noise,

@@ -209,11 +209,7 @@ def nominal_readings(nominal: np.ndarray, found: GeometricFit, fitted: Any) -> d
     frames = {name: value for name, value in values.items() if name[-1] in "018"}
     arm = lwr4plus.arm(nominal)
     placed = Installation(
-        arm,
-        lwr4plus.station(nominal)[None],
-        lwr4plus.tool(nominal)[None],
-        own.station_names,
-        own.tool_names,
+        arm, lwr4plus.station(nominal)[None], lwr4plus.tool(nominal)[None], own.station_names, own.tool_names
     )
     return {
         "full nominal column": own,

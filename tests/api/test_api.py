@@ -58,40 +58,25 @@ def model(logs: Path) -> calib.DynamicsModel:
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (
-            lambda: calib.fit_geometry("ur5", "a.csv", 0.25),
-            "fit_geometry: settings: expected FitSettings or None",
-        ),
-        (
-            lambda: calib.fit_geometry("ur5", "a.csv", holdout=0.25),
-            "fit_geometry: .*keyword argument 'holdout'",
-        ),
+        (lambda: calib.fit_geometry("ur5", "a.csv", 0.25), "fit_geometry: settings: expected FitSettings or None"),
+        (lambda: calib.fit_geometry("ur5", "a.csv", holdout=0.25), "fit_geometry: .*keyword argument 'holdout'"),
         (lambda: calib.load(5), "load: robot: expected a text or a path, found 5"),
         (lambda: calib.read_poses("a.csv", None), "read_poses: robot: expected a text, a path or CalibratedChain"),
         (lambda: calib.select_poses("ur5", "40"), "select_poses: count: expected a whole number, found '40'"),
         (lambda: calib.select_poses("ur5", True), "select_poses: count: expected a whole number, found True"),
         (lambda: calib.identify_dynamics("ur5", ["a.npz", 3]), "identify_dynamics: recordings: expected"),
         (lambda: calib.compensate("fit", "t.csv", start="0,0"), "compensate: start: expected several, each a number"),
-        (
-            lambda: calib.compensate("fit", "t.csv", tolerance=(1.0,)),
-            "compensate: tolerance: expected 2 values, each",
-        ),
+        (lambda: calib.compensate("fit", "t.csv", tolerance=(1.0,)), "compensate: tolerance: expected 2 values, each"),
         (
             lambda: calib.validate("fit", "b.csv"),
             "validate: result: expected GeometryFit, DynamicsModel, ParallelGeometry or ParallelDynamics",
         ),
         (lambda: calib.new_session("s", "ur5", "cmm", poses=4.5), "new_session: poses: expected a whole number"),
         (lambda: calib.new_session("s", "ur5", "cmm", periode=4.5), "no key 'periode' .did you mean 'period'"),
-        (
-            lambda: calib.ExcitationSettings(period="a"),
-            "ExcitationSettings: period: expected a number above 0",
-        ),
+        (lambda: calib.ExcitationSettings(period="a"), "ExcitationSettings: period: expected a number above 0"),
         (lambda: calib.ExcitationSettings(goals="raw=35"), "ExcitationSettings: goals: expected several, each a text"),
         (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected True or False, found 1"),
-        (
-            lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)),
-            "SelectionSettings: tools: expected several, each",
-        ),
+        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected several, each"),
         (lambda: calib.FitSettings(tolerance="0.1"), "FitSettings: tolerance: expected a number or None, found '0.1'"),
         (lambda: calib.FitSettings(tolerance=0.0), "tolerance 0 mm: expected a length above 0"),
         (lambda: calib.FitSettings(stations="two"), "^stations two: expected one of each, one"),

@@ -42,10 +42,7 @@ def series() -> dict[str, np.ndarray]:
     t = np.arange(2400) / 200
     waves = np.array([[0.4, 0.9, 1.3], [0.3, 0.7, 1.1], [0.5, 0.6, 1.2]])
     q = np.stack([sum(0.4 / f * np.sin(2 * np.pi * f * t + 7 * f) for f in wave) for wave in waves], axis=1)
-    v = np.stack(
-        [sum(0.8 * np.pi * np.cos(2 * np.pi * f * t + 7 * f) for f in wave) for wave in waves],
-        axis=1,
-    )
+    v = np.stack([sum(0.8 * np.pi * np.cos(2 * np.pi * f * t + 7 * f) for f in wave) for wave in waves], axis=1)
     tau = 20 * np.cos(q) + 3 * v + np.random.default_rng(1).normal(0, 0.05, q.shape)
     return {"t": t, "q": q, "dq": v, "tau": tau}
 

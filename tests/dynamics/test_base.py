@@ -63,13 +63,7 @@ def test_tilted_gravity_adds_two():
 
 @pytest.mark.parametrize(
     ("robot", "sets", "count"),
-    [
-        ("lwr4plus", "", 43),
-        ("ur5", "", 36),
-        ("ur5", "Ia", 40),
-        ("tx40", "Ia Fv Fc", 52),
-        ("rv2sq", "Ia Fv Fc", 52),
-    ],
+    [("lwr4plus", "", 43), ("ur5", "", 36), ("ur5", "Ia", 40), ("tx40", "Ia Fv Fc", 52), ("rv2sq", "Ia Fv Fc", 52)],
 )
 def test_counts_of_other_arms(robot, sets, count):
     chain = load(robot)
@@ -150,11 +144,7 @@ def test_gradient_through_the_base_columns():
     smooth = np.array(["Fc" not in name for name in reduced.names])  # tanh(100 v) is too steep for differences
     weights = weights * smooth
     slopes = reduced.regressor_gradient(*x.reshape(3, 1, 7), weights)
-    check(
-        lambda x: np.sum(weights * reduced.regressor(*x.reshape(3, 1, 7))),
-        np.concatenate([g[0] for g in slopes]),
-        x,
-    )
+    check(lambda x: np.sum(weights * reduced.regressor(*x.reshape(3, 1, 7))), np.concatenate([g[0] for g in slopes]), x)
 
 
 @pytest.mark.parametrize("rows", [BOTH, MOTOR])

@@ -9,14 +9,7 @@ import scipy.signal
 from calib.errors import Unidentifiable
 from calib.estimation.convex.constrained import within
 from calib.estimation.convex.definite import Definite
-from calib.estimation.instrumental_variables import (
-    exogeneity,
-    instrument,
-    iv,
-    projected,
-    settled,
-    strength,
-)
+from calib.estimation.instrumental_variables import exogeneity, instrument, iv, projected, settled, strength
 from calib.estimation.linear import ols
 
 TRUTH = np.array([2.0, -1.0, 0.5])

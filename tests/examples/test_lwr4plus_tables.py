@@ -66,12 +66,7 @@ def test_every_table_of_the_study_stands_in_the_readme_and_holds_what_was_run() 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"),
-    [
-        ("geometry", ("--seeds", "0")),
-        ("dynamics", ()),
-        ("consistency", ("--runs", "0")),
-        ("planning", ()),
-    ],
+    [("geometry", ("--seeds", "0")), ("dynamics", ()), ("consistency", ("--runs", "0")), ("planning", ())],
 )
 def test_a_fresh_run_makes_the_readmes_tables(fresh, name: str, options: tuple[str, ...]) -> None:
     found = study_tables.SHOW[name](fresh(name, *options))

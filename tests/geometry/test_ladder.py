@@ -50,11 +50,7 @@ def unseen(found, truth: Installation, known: bool) -> float:
 
 @pytest.mark.parametrize(
     "robot, kind, count",
-    [
-        ("ur5", "position", 150),
-        ("lwr4plus", "pose", 120),
-        pytest.param("ur5", "pose", 600, marks=pytest.mark.slow),
-    ],
+    [("ur5", "position", 150), ("lwr4plus", "pose", 120), pytest.param("ur5", "pose", 600, marks=pytest.mark.slow)],
 )
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed):

@@ -29,10 +29,7 @@ def test_every_format_has_its_documentation(calib):
         ("constraints", ("[target]", "sight", "[[obstacle]]")),
         ("mdh", ("[[joint]]", "alpha", "90 deg")),
         ("robot", ("[[element]]", "[[station]]", "[deflection]")),
-        (
-            "identified",
-            ("metrics.json", "torques_N.csv", "above_band_percent", "standing", "up to 10 %"),
-        ),
+        ("identified", ("metrics.json", "torques_N.csv", "above_band_percent", "standing", "up to 10 %")),
         ("recordings", ("measured_torque", "JointState", "use_range")),
     ],
 )

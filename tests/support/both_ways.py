@@ -82,10 +82,7 @@ def session_with(folder: Path, robot: Path, model: str, *measured: Path) -> Sess
     """Make a session, with the measured files brought to it."""
     session = begin(folder, NewSession(str(robot), "cmm", 4, 1, dynamics=False))
     settings = session.path("session.toml")
-    for old, new in (
-        ("plan = true", "plan = false"),
-        ('model = "auto"', f'model = "{model}"'),
-    ):
+    for old, new in (("plan = true", "plan = false"), ('model = "auto"', f'model = "{model}"')):
         edit(settings, old, new)
     for path in measured:
         shutil.copyfile(path, session.path("3-measured") / path.name)

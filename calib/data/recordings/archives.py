@@ -40,10 +40,7 @@ Ends = tuple[float | None, float | None]
 
 
 def read_archive(
-    path: Path,
-    joints: Joints | None = None,
-    options: RecordingOptions | None = None,
-    ends: Ends = (None, None),
+    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
 ) -> Recording:
     """Return the rows of a NumPy archive (.npz) from ends[0] to ends[1] [s], unchecked but for their shapes."""
     options = options or RecordingOptions()
@@ -59,11 +56,7 @@ def read_archive(
 
 
 def _from_archive(
-    archive: zipfile.ZipFile,
-    path: Path,
-    joints: Joints | None,
-    options: RecordingOptions,
-    ends: Ends,
+    archive: zipfile.ZipFile, path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends
 ) -> Recording:
     if len(archive.infolist()) > MEMBERS:
         raise MeasurementError(f"has {len(archive.infolist())} members: is this a recording?", path)

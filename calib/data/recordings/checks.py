@@ -43,11 +43,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     _check_time(recording.t, recording.rows, recording.file)
     _check_size(recording, joints)
     _check_speed(recording)
-    notes = (
-        *_still(recording),
-        *_effort_notes(recording, joints),
-        *_limit_notes(recording, joints),
-    )
+    notes = (*_still(recording), *_effort_notes(recording, joints), *_limit_notes(recording, joints))
     return replace(_noted(recording, *notes, *_work_notes(recording)), jumps=tuple(_jumps(recording, joints)))
 
 

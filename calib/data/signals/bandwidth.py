@@ -144,10 +144,7 @@ def _position_cutoff(
     if quiet >= 5 * dynamics:
         return 5 * dynamics, f"f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
     lower = min(max(quiet, 2 * dynamics), most)
-    return (
-        lower,
-        f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration",
-    )
+    return (lower, f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration")
 
 
 def _active(q: np.ndarray) -> np.ndarray:

@@ -83,10 +83,7 @@ def _least(nominal: Installation, blocks: Sequence[PoseMeasurements], signs: np.
 
 
 def _rms(
-    nominal: Installation,
-    blocks: Sequence[PoseMeasurements],
-    torques: Sequence[np.ndarray | None],
-    signs: np.ndarray,
+    nominal: Installation, blocks: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None], signs: np.ndarray
 ) -> float:
     """Return what the nominal arm leaves [m], base and tool placed anew, with joints turning as `signs` (n,) say."""
     turned = [replace(block, q=block.q * signs) for block in blocks]

@@ -24,14 +24,7 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import INSTRUMENTAL, write_instrumental
-from calib.procedure.dynamic_stage.metric_tables import (
-    StoredFindings,
-    finite,
-    gain_table,
-    metrics,
-    on_bounds,
-    report,
-)
+from calib.procedure.dynamic_stage.metric_tables import StoredFindings, finite, gain_table, metrics, on_bounds, report
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
 from calib.records import read_json

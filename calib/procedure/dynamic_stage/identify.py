@@ -18,10 +18,7 @@ from calib.identification.uncertainty.two_geometries import GeometryComparison, 
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, assess
-from calib.procedure.dynamic_stage.verdict import (
-    model_warnings,
-    resting_parameters,
-)
+from calib.procedure.dynamic_stage.verdict import model_warnings, resting_parameters
 from calib.procedure.findings import Verdict
 from calib.units import TORQUE
 

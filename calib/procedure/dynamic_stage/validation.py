@@ -25,14 +25,7 @@ from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking, track
-from calib.procedure.dynamic_stage.verdict import (
-    Resting,
-    extrapolates,
-    judge,
-    warnings,
-    with_intervals,
-    with_prior,
-)
+from calib.procedure.dynamic_stage.verdict import Resting, extrapolates, judge, warnings, with_intervals, with_prior
 from calib.procedure.findings import Verdict, settled
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE, without_gains

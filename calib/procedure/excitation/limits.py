@@ -140,11 +140,7 @@ class MotionLimits:
 
 
 def read_motion_limits(
-    path: Path | None,
-    chain: Chain,
-    source: Path | None = None,
-    given_way: bool = False,
-    predicted: bool = False,
+    path: Path | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
 ) -> MotionLimits:
     """Read the limits of a motion; where nothing else is stated it keeps what poses keep (`limits_of`).
 

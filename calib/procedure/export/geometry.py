@@ -84,11 +84,7 @@ def results(folder: Path) -> list[Path]:
 
 
 def export_urdf(
-    robot: CalibratedChain,
-    source: Path,
-    out: Path,
-    for_corrections: bool = False,
-    remark: str = "",
+    robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False, remark: str = ""
 ) -> str:
     """Put the calibrated geometry into the XML of `source`, have others read it back, and write it to `out`.
 

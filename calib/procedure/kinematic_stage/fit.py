@@ -25,10 +25,7 @@ from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict, settled
 from calib.procedure.kinematic_stage import plausibility
-from calib.procedure.kinematic_stage.comparison import (
-    Comparison,
-    gravity_of,
-)
+from calib.procedure.kinematic_stage.comparison import Comparison, gravity_of
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.remarks import Outlier, gross_rows, named_outliers, plateau, remains, remark

@@ -94,13 +94,7 @@ class Assessment:
         }
 
 
-def assess(
-    arms: Arms,
-    inputs: Inputs,
-    findings: Findings,
-    settings: Settings,
-    wanted: FitSettings,
-) -> Assessment:
+def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, wanted: FitSettings) -> Assessment:
     """Compare both arms on fitted and on unseen rows, and judge.
 
     Args:

@@ -90,12 +90,7 @@ def certificate(
     when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
     issued = f"{when}, armature-calib {metadata.version('armature-calib')}"
     return Page(
-        title,
-        subtitle,
-        issued,
-        [(label, _shortened(value, most)) for label, value in first.items()],
-        behind,
-        marks,
+        title, subtitle, issued, [(label, _shortened(value, most)) for label, value in first.items()], behind, marks
     )
 
 

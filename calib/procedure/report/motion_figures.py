@@ -166,11 +166,7 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
 
 def design_figures(designed: Designed) -> dict[str, Figure]:
     """Return the figures of a designed motion by name: motion, tool path, search, front and outlook if any."""
-    figures = {
-        "motion": _motion_figure(designed),
-        "path": _path_figure(designed),
-        "history": _history_figure(designed),
-    }
+    figures = {"motion": _motion_figure(designed), "path": _path_figure(designed), "history": _history_figure(designed)}
     if designed.front is not None and len(designed.front.values):
         figures["front"] = _front_figure(designed.front)
     if (look := designed.outlook) is not None and look.others:

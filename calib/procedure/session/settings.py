@@ -162,9 +162,7 @@ class DynamicsSection:
     evaluations: Annotated[int, Whole(1), About("most per start")] = DEFAULT_DESIGN.evaluations
     limits: Annotated[Beside, About("a TOML file beside this one; see `calib formats limits`")] = ""
     torques: Annotated[
-        str,
-        OneOf(TORQUES),
-        About("motor, link, or both: sensors behind the gears beside the motors' torques"),
+        str, OneOf(TORQUES), About("motor, link, or both: sensors behind the gears beside the motors' torques")
     ] = "motor"
     friction: Annotated[
         str, OneOf(FRICTION), About("or standard, or one rung of the ladder; see calib identify --friction")

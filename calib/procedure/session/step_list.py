@@ -94,12 +94,7 @@ def _excited(session: Session) -> list[Path]:
 
 def _recorded(session: Session) -> list[Path]:
     plan = session.path(f"6-excitation/training/{coefficients.NAME}")
-    return [
-        session.fit.robot,
-        plan,
-        *_reading(session),
-        *_files_of(dynamics_steps.recordings(session)[0]),
-    ]
+    return [session.fit.robot, plan, *_reading(session), *_files_of(dynamics_steps.recordings(session)[0])]
 
 
 def _reading(session: Session) -> list[Path]:

@@ -280,10 +280,7 @@ def simulate_tangents(
     if status != loop_kernels.FINE:
         raise _failure(status, reached * reference.period)
     if not np.abs(slopes[:, -1]).max(initial=0.0) < GROWN:  # saturated torques keep the motion finite, not its slopes
-        raise Diverged(
-            f"the loop is unstable, its slopes grow without bounds: {_LOWER}",
-            None,
-        )
+        raise Diverged(f"the loop is unstable, its slopes grow without bounds: {_LOWER}", None)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
 
@@ -459,7 +456,4 @@ def _failure(status: int, time: float, where: str | None = None) -> NotConverged
             f"{loop_kernels.MOST} steps: "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
-    return Diverged(
-        f"the loop diverged at {time:.4g} s: {_LOWER}",
-        None,
-    )
+    return Diverged(f"the loop diverged at {time:.4g} s: {_LOWER}", None)

@@ -57,11 +57,7 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
 
 
 def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
-    train = planted.write(
-        tmp_path,
-        "train.npz",
-        0,
-    )
+    train = planted.write(tmp_path, "train.npz", 0)
     out = tmp_path / "out"
     assert run(robot, f"{train}@0:10", "--validate", f"{train}@10:", "--out", out, "--friction", "standard") == 0
     found = json.loads((out / "metrics.json").read_text())

@@ -45,8 +45,7 @@ def values(out: Path) -> dict[str, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("train", "unseen", "most", "plain"),
-    [("@0:9.387", "@9.387:", 3.25, 3.55), ("@3.13:", "@0:3.13", 3.65, 4.2)],
+    ("train", "unseen", "most", "plain"), [("@0:9.387", "@9.387:", 3.25, 3.55), ("@3.13:", "@0:3.13", 3.65, 4.2)]
 )
 def test_panda_on_the_rest_of_its_record(data, tmp_path, train, unseen, most, plain):
     """Measured 2.9 and 3.4 %; without richer friction and ripple 3.4 and about 4.0 %; published model 3.66 %.

@@ -89,15 +89,7 @@ def test_the_first_sheet_stands_alone(verdict):
     files = [(f"file{k}.csv", "measured", "10", f"{k:064x}") for k in range(20)]
     first = sheet(certificate.render(page_of(judged(verdict, "because", [TABLE]), files=files)))
     word = "PASS (prediction only)" if verdict == PREDICTION_ONLY else verdict.upper()
-    wanted = (
-        "Calibration of x",
-        word,
-        "Because.",
-        "1.1 mm",
-        "0.12 mm",
-        "± 0.01 mm",
-        "20 unseen poses",
-    )
+    wanted = ("Calibration of x", word, "Because.", "1.1 mm", "0.12 mm", "± 0.01 mm", "20 unseen poses")
     for words in (
         *wanted,
         "0.2 mm",

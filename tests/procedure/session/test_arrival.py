@@ -52,8 +52,7 @@ def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:
 
 def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:
     session = begin(
-        tmp_path / "cell",
-        NewSession("lwr4plus", "cmm", 5, 0, motion={"payloads": {"loaded": 3.28}, "torques": "both"}),
+        tmp_path / "cell", NewSession("lwr4plus", "cmm", 5, 0, motion={"payloads": {"loaded": 3.28}, "torques": "both"})
     )
     for name in ("training.csv", "training_loaded.csv"):
         session.path(f"7-recorded/{name}").write_text("t\n")

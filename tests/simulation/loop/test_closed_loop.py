@@ -16,14 +16,7 @@ from calib.robot import description, library
 from calib.robot.chain import Chain
 from calib.simulation.cells import known_robots
 from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import (
-    Plant,
-    Sensing,
-    SimulatedRun,
-    forward_dynamics,
-    simulate,
-    simulate_many,
-)
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, forward_dynamics, simulate, simulate_many
 from calib.simulation.loop.references import Reference
 from calib.transforms import displace
 
