@@ -1,4 +1,4 @@
-"""The exceptions of the toolkit: one root, and leaves that carry the data a caller needs.
+"""The exceptions of the toolkit, and findings: one root, and leaves that hold the data a caller needs.
 
 Every message says what was found, where, and what to try. ``poses`` and ``trajectories`` import nothing from here and
 raise their own subclasses of `ValueError`.
@@ -12,15 +12,42 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # of a write, whatever the file
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that was noticed of data or of a result; its sentence stands in the catalogue.
+
+    Attributes:
+        code: in `calib.procedure.findings`.
+        values: what its rule and its sentence need [SI], as JSON holds them.
+        accepted: whether the options say that it is intended.
+    """
+
+    code: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+    accepted: bool = False
+
+
+def finding(code: str, **values: Any) -> Finding:
+    """Return a finding with plain values: numpy's numbers as Python's, sequences as tuples."""
+    return Finding(code, {name: _plain(value) for name, value in values.items()})
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return tuple(value) if isinstance(value, list) else value
 
 
 class CalibError(Exception):

@@ -143,6 +143,18 @@ def formats(
         print(documents.describe(topic) if topic else "\n".join(documents.overview()))
 
 
+@app.command()
+def explain(
+    code: Annotated[
+        str | None, typer.Argument(help="of a finding, as metrics.json names it; default: list all")
+    ] = None,
+) -> None:
+    """Print what a finding means and what to do."""
+    from calib.procedure import findings
+
+    print(findings.explain(code) if code else "\n".join(findings.catalogue()))
+
+
 @app.command("next")
 def next_step(folder: Folder, plots: Plots = True) -> None:
     """Go on in a session, then say what to do at the robot."""

@@ -1,30 +1,62 @@
-"""Verdicts, and findings that hold them down: what every stage says of its own evidence, in one form."""
+"""Findings as sentences, and the verdicts that they give: all that may be said stands in ``findings.toml``.
+
+A stage makes values, ``finding("moved", times=…)`` (`calib.errors.Finding`). The catalogue has for each code
+
+    says     the sentence, number first; ``{rms:.3g mm}`` prints a value [SI] in a unit, ``{names:5}`` five of many,
+             ``<, …>`` a part that is left out where one of its values is None or empty
+    advice   what to do
+    level    note, marginal or fail; or
+    limits   value -> level -> above what it holds: the mildest of several values' counts, none of them: nothing is said
+    accept   the name in the options' ``accept`` that lets a verdict pass
+    means    what `calib explain` says besides
+"""
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from string import Formatter
 from typing import Any
 
+from calib.errors import Finding, UsageError, suggestion
+from calib.records import read_record
+from calib.units import DEG
+
+RANKS = ("", "note", "marginal", "fail")
+UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}  # SI -> as printed; others as they are
+MAX_NAMES = 12  # of a list in a sentence
 PREDICTION_ONLY = "pass (prediction only)"  # of a model that predicts well and cannot be exported
 LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One of `LEVELS`, and why, in one sentence."""
+    """One of `LEVELS`, why, in one sentence, and the code of the finding that decided; empty for a pass."""
 
     level: str
     reason: str
+    code: str = ""
 
     def __str__(self) -> str:
         return f"verdict {self.level}: {self.reason}"
+
+    @classmethod
+    def of(cls, figures: str, findings: Iterable[Finding] = ()) -> Verdict:
+        """Return what the worst of findings, the first of equals, allows; `figures` come first in its reason."""
+        worst = max(findings, key=lambda one: RANKS.index(level_of(one)), default=None)
+        if worst is None or level_of(worst) in ("", "note"):
+            return cls("pass", figures)
+        return cls(level_of(worst), "; ".join(filter(None, [figures, sentence(worst)])), worst.code)
 
     def for_prediction(self, why: str) -> Verdict:
         """Return the verdict of a model that cannot be exported, and `why`: a pass is one for prediction only."""
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}") if self.level == "pass" else self
 
-    def held_by(self, found: Sequence[Finding]) -> Verdict:
+    def held_by(self, found: Sequence[SpelledFinding]) -> Verdict:
         """Return the verdict, no better than the findings allow; the one that holds it comes first in its reason."""
         worst = max(found, key=lambda one: LEVELS.index(one.allows), default=None)
         if worst is None or worst.allows == "pass" or LEVELS.index(worst.allows) < LEVELS.index(self.level):
@@ -33,8 +65,8 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What is odd with measurements.
+class SpelledFinding:
+    """What is odd with measurements, with a sentence of its own: on its way into the catalogue.
 
     Attributes:
         name: in the options' ``accept``.
@@ -105,7 +137,103 @@ class Verdicts:
         return str(self) if self.level in ("marginal", "fail") else ""
 
 
-def settled(found: Iterable[Finding], accepted: Collection[str]) -> tuple[Finding, ...]:
+def settled(found: Iterable[SpelledFinding], accepted: Collection[str]) -> tuple[SpelledFinding, ...]:
     """Return findings, those among `accepted` marked as such, worst first."""
     marked = [replace(one, accepted=one.name in accepted) for one in found]
     return tuple(sorted(marked, key=lambda one: -LEVELS.index(one.level)))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of the catalogue, see the module's text."""
+
+    says: str
+    advice: str = ""
+    level: str = "note"
+    limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    accept: str = ""
+    means: str = ""
+
+
+@cache
+def catalogue() -> Mapping[str, Entry]:
+    """Return the catalogue, code -> entry."""
+    text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    return {code: read_record(Entry, entry, code) for code, entry in tomllib.loads(text).items()}
+
+
+def level_of(one: Finding) -> str:
+    """Return one of `RANKS` for a finding, by the catalogue's rule; an accepted one is a note."""
+    entry = catalogue()[one.code]
+    reached = [
+        max((name for name, limit in steps.items() if one.values[value] > limit), key=RANKS.index, default="")
+        for value, steps in entry.limits.items()
+    ]
+    level = min(reached or [entry.level], key=RANKS.index)
+    return "note" if level and one.accepted else level
+
+
+def limit(code: str, value: str, level: str = "fail") -> float:
+    """Return above what a value of a finding has a level."""
+    return catalogue()[code].limits[value][level]
+
+
+def settle(found: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
+    """Return the findings that there is something to say of, those accepted by the options marked, worst first."""
+    marked = [replace(one, accepted=catalogue()[one.code].accept in accepted) for one in found]
+    return tuple(sorted(filter(level_of, marked), key=lambda one: -RANKS.index(level_of(one))))
+
+
+def sentence(one: Finding) -> str:
+    """Return what the catalogue says of a finding, without advice and full stop."""
+    return _filled(catalogue()[one.code].says, one.values)
+
+
+def lines_of(found: Iterable[Finding]) -> list[str]:
+    """Return findings as lines for a user: the sentence, the advice, and how to accept it."""
+    return [_line(one, catalogue()[one.code]) for one in found]
+
+
+def _line(one: Finding, entry: Entry) -> str:
+    words = [sentence(one), _filled(entry.advice, one.values)]
+    if one.accepted:
+        return f"{words[0]} (accepted by the options)"
+    if entry.accept and level_of(one) != "note":
+        words.append(f'if this is intended, add accept = ["{entry.accept}"] to the options')
+    return "; ".join(filter(None, words))
+
+
+def explain(code: str) -> str:
+    """Return what a code of the catalogue means and what to do.
+
+    Raises:
+        UsageError: for a code that there is none of.
+    """
+    if (entry := catalogue().get(code)) is None:
+        raise UsageError(f"no finding '{code}'{suggestion(code, catalogue())}; calib explain lists them")
+    rules = [
+        f"{level} where {value} > {limit:g}" for value, steps in entry.limits.items() for level, limit in steps.items()
+    ]
+    accept = f'accept = ["{entry.accept}"] in the options file lets the verdict pass' if entry.accept else ""
+    parts = (entry.says, "; ".join(rules) or f"level: {entry.level}", entry.means, f"{entry.advice}", accept)
+    return "\n".join([code, *(f"  {part}" for part in parts if part)])
+
+
+def _filled(template: str, values: Mapping[str, Any]) -> str:
+    """Return a template with values printed; an optional part goes where a value of it is None or empty."""
+
+    def kept(part: re.Match[str]) -> str:
+        needed = [name for _, name, _, _ in Formatter().parse(part[1]) if name]
+        return "" if any(values[name] in (None, "", (), [], False) for name in needed) else part[1]
+
+    return _Printer().vformat(re.sub(r"<([^<>]*)>", kept, template), (), values)
+
+
+class _Printer(Formatter):
+    def format_field(self, value: Any, format_spec: str) -> str:
+        number, _, unit = format_spec.partition(" ")
+        if isinstance(value, list | tuple):
+            shown, more = value[: int(number or MAX_NAMES)], len(value) - int(number or MAX_NAMES)
+            return ", ".join(map(str, shown)) + (f" and {more} more" if more > 0 else "")
+        printed = format(value * UNITS.get(unit, 1.0) if unit else value, number)
+        return printed + ("" if unit in ("", "°") else " ") + unit

@@ -20,7 +20,8 @@ from calib.identification.identify import identify
 from calib.identification.possible.contradiction import Contradiction, contradiction
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_signs
-from calib.procedure.findings import Finding, Verdict, settled
+from calib.procedure.findings import SpelledFinding as Finding
+from calib.procedure.findings import Verdict, settled
 from calib.robot.load import load
 
 NAMES = ("joint1", "joint2", "joint3")

@@ -42,7 +42,7 @@ from calib.identification.checks.torque_lag import Lag
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged, ReversedSigns
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
-from calib.procedure.findings import Finding
+from calib.procedure.findings import SpelledFinding as Finding
 from calib.robot.chain import Chain
 from calib.robot.description_checks import impossible_bodies
 

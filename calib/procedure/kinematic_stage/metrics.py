@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from calib.geometry.uncertainty.error_model import Discrepancy
-from calib.procedure.findings import Finding, Verdict
+from calib.procedure.findings import SpelledFinding as Finding
+from calib.procedure.findings import Verdict
 from calib.procedure.sigma_comparison import SigmaComparison
 
 

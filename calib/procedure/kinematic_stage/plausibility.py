@@ -30,7 +30,7 @@ from calib.geometry.checks.joint_signs import reversed_joints
 from calib.geometry.images.camera_guess import pnp_poses
 from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit
-from calib.procedure.findings import Finding
+from calib.procedure.findings import SpelledFinding as Finding
 from calib.procedure.kinematic_stage.remarks import FLOOR, TOO_GOOD
 
 NO_ARM = 0.015

@@ -1,0 +1,78 @@
+"""The catalogue of findings: wording and rules are tested here, once; elsewhere tests ask for codes and values."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from string import Formatter
+
+import pytest
+
+from calib.errors import finding
+from calib.procedure import findings
+from calib.procedure.findings import RANKS, Verdict, catalogue, level_of, lines_of, sentence, settle
+
+PRIVATE = r"\b(un)?(told|drawn|draws?|carried|carries|heard|beside)\b"
+CODES = sorted(catalogue())
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_an_entry_is_short_plain_and_complete(code):
+    entry = catalogue()[code]
+    assert not re.search(PRIVATE, f"{entry.says} {entry.advice} {entry.means}")
+    levels = {entry.level, *(level for steps in entry.limits.values() for level in steps)}
+    assert levels <= set(RANKS[1:]) and entry.says
+    if levels & {"marginal", "fail"}:
+        assert len(re.sub(r"<[^<>]*>|\{[^}]*\}", "x", entry.says).split()) <= 16, (
+            "a verdict has 25 words, figures included"
+        )
+
+
+def test_every_finding_of_the_code_has_the_values_its_entry_needs():
+    made = {}
+    for path in Path(findings.__file__).parents[1].rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "finding" and node.args:
+                names = {word.arg for word in node.keywords}
+                for code in ast.walk(node.args[0]):  # of a choice between two codes, both
+                    if isinstance(code, ast.Constant) and code.value in catalogue():
+                        made.setdefault(code.value, []).append(names)
+    for code, calls in made.items():
+        entry = catalogue()[code]
+        text = re.sub("[<>]", "", f"{entry.says} {entry.advice}")
+        needed = {name for _, name, _, _ in Formatter().parse(text) if name} | set(entry.limits)
+        assert all(None in names or needed <= names for names in calls), code
+
+
+def test_a_level_is_the_mildest_of_its_limits_and_a_verdict_the_worst_of_its_findings():
+    scale = dict(factor=1.01, sigma=1e-4)
+    mild, none, sound = (
+        finding("scale", off=off, explained=x, **scale) for off, x in ((1e-2, 0.5), (1e-2, 0.1), (0, 1))
+    )
+    assert [level_of(one) for one in (mild, none, sound)] == ["marginal", "", ""]
+    worst = finding("moved", elements=("a", "b", "c", "d"), times=7.0)
+    found = settle([mild, none, worst])
+    assert [one.code for one in found] == ["moved", "scale"]
+    verdict = Verdict.of("1 mm", found)
+    assert (verdict.level, verdict.code) == ("fail", "moved") and verdict.reason.startswith("1 mm; ")
+    assert Verdict.of("1 mm", settle(found, ["moved", "scale"])) == Verdict("pass", "1 mm")
+    assert (
+        'accept = ["moved"]' in lines_of(found)[0]
+        and "accepted by the options" in lines_of(settle(found, ["moved"]))[1]
+    )
+    assert "a, b, c and 1 more" in sentence(worst)
+
+
+def test_a_part_without_its_value_is_left_out():
+    rank = dict(rank=3, parameters=4, tolerance=1e-6, last=0.1)
+    assert "gap" in sentence(finding("rank", next=1e-9, **rank))
+    assert "gap" not in sentence(finding("rank", next=None, **rank))
+
+
+def test_the_command_explains_a_code(calib):
+    code, out, _ = calib("explain", "moved")
+    assert code == 0 and "fail where times > 5" in out and 'accept = ["moved"]' in out
+    assert calib("explain")[1].split() == list(catalogue())
+    code, _, err = calib("explain", "mover")
+    assert code == 2 and "did you mean 'moved'" in err
