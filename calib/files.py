@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.errors import CalibError, UsageError
-from calib.records import shielded
+from calib.records import plain, shielded
 
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
@@ -314,11 +314,12 @@ def _digest(path: Path, *_: int) -> str:
 
 
 def write_json(path: str | Path, value: Any) -> Path:
-    """Write `value` as indented JSON.
+    """Write a record (`calib.records`), or anything made of records, mappings and lists, as indented JSON.
 
     Raises:
         CalibError: for a number that is not finite, since JSON has none, with its place; nothing is written.
     """
+    value = plain(value)
     try:
         content = json.dumps(value, indent=2, allow_nan=False)
     except ValueError as error:

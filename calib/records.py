@@ -1,17 +1,28 @@
-"""JSON and tables as frozen dataclasses: checked once, where they are read, and attributes from there on."""
+"""Records: results stored as they are typed, and read back by the same type.
+
+A record is a frozen dataclass (or named tuple) of numbers, texts, arrays and other records. `plain` turns it into what
+JSON holds, field by field under the fields' names; `read_record` turns that into an equal record. A new number is a new
+field: nothing else has to be written. What a record computes and readers of the file want is a `stored` property.
+
+JSON has no NaN: arrays annotated `Array`, and numbers annotated `Number`, hold it as null; in any other field a number
+that is not finite is a mistake, which `calib.files.write_json`, the writer of all records, refuses.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
+import math
 import types
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
-from numbers import Real
 from pathlib import Path
-from typing import Any, SupportsIndex, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
+import numpy as np
+
+from calib.arrays import frozen
 from calib.errors import UsageError
 
 T = TypeVar("T")
@@ -50,7 +61,7 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
 
 def typed_rows(kind: type[T], rows: Iterable[Mapping[str, str]], place: str) -> tuple[T, ...]:
     """Return rows of text by column as values of the named tuple `kind`; `place` is for messages, see `read_rows`."""
-    hints = _hints(kind)
+    hints = get_type_hints(kind)
     return tuple(kind(**{name: _cell(hint, row, name, place) for name, hint in hints.items()}) for row in rows)
 
 
@@ -84,60 +95,83 @@ def read_lines(path: Path) -> list[str]:
     return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
 
-def read_record(kind: type[T], content: Any, place: str = "") -> T:
-    """Return plain JSON `content` as a value of the dataclass `kind`, fields of fields included.
+@dataclass(frozen=True)
+class _Null:
+    """How pydantic reads a number or an array that JSON holds with null in place of NaN."""
 
-    Keys that `kind` does not name are left out, so that a newer version may write more; a field with a default may be
-    missing. Annotations may be dataclasses, named tuples (arrays in JSON), ``tuple[X, ...]``, ``Mapping[str, X]``,
-    ``X | None`` and plain types.
+    array: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        if self.array:
+            return core_schema.no_info_plain_validator_function(frozen)
+        return core_schema.no_info_before_validator_function(lambda x: math.nan if x is None else x, handler(source))
+
+
+Number = Annotated[float, _Null()]
+"""A number of a record that may be NaN or infinite; null in JSON, and NaN when read back."""
+Array = Annotated[np.ndarray, _Null(array=True)]
+"""An array of numbers of a record, any of which may be NaN; nested lists in JSON, read-only when read back."""
+
+
+class stored(property):
+    """A property of a record that `plain` writes beside the fields; it is not read back, but computed again."""
+
+
+def plain(value: Any) -> Any:
+    """Return a record, or anything made of records, arrays, mappings and lists, as JSON holds it."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {name: _or_null(getattr(value, name), null) for name, null in _keys(type(value)).items()}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        lost = ~np.isfinite(value) if value.dtype.kind == "f" else False
+        return np.ma.masked_array(value, lost).tolist()
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
+
+
+def _or_null(value: Any, null: bool) -> Any:
+    return None if null and isinstance(value, float) and not math.isfinite(value) else plain(value)
+
+
+@cache
+def _keys(kind: type) -> dict[str, bool]:
+    """Return the names of a record's fields and stored properties, and whether null stands for NaN there."""
+    hints = get_type_hints(kind, include_extras=True)
+    computed = [name for one in kind.__mro__ for name, item in vars(one).items() if isinstance(item, stored)]
+    numbers = {one.name: _Null() in getattr(hints[one.name], "__metadata__", ()) for one in fields(kind)}
+    return numbers | dict.fromkeys(computed, True)
+
+
+def read_record(kind: type[T], content: Any, place: str = "") -> T:
+    """Return plain JSON `content` as a value of `kind`, a record or a type made of records.
+
+    Keys that a record does not name are left out, so that a newer version may write more; a field with a default may be
+    missing.
 
     Args:
         place: what `content` is, for messages.
 
     Raises:
-        ValueError: where something else stands there, or nothing.
+        ValueError: where something else stands there, or nothing, with its place.
     """
-    return _value(kind, content, place)
+    from pydantic import ValidationError
+
+    try:
+        return _adapter(kind).validate_json(json.dumps(plain(content)), strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+        raise ValueError(
+            f"{f'{place}{where}'.lstrip('.') or 'the content'}: {first['msg']}, found {first['input']!r:.60}"
+        ) from None
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter
 
-
-def _value(kind: Any, content: Any, place: str) -> Any:
-    if kind is Any:
-        return content
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin in (Union, types.UnionType):
-        wanted = [one for one in inner if one is not type(None)]
-        return None if content is None else _value(wanted[0], content, place)
-    if origin is tuple and isinstance(content, list | tuple):
-        kinds = [inner[0]] * len(content) if inner[-1] is Ellipsis else inner
-        if len(kinds) != len(content):
-            raise ValueError(f"{place or 'the list'}: {len(content)} values where {len(kinds)} belong")
-        return tuple(_value(one, each, f"{place}[{k}]") for k, (one, each) in enumerate(zip(kinds, content)))
-    if origin is not None and issubclass(origin, Mapping) and isinstance(content, Mapping):
-        return {name: _value(inner[1], each, f"{place}.{name}".lstrip(".")) for name, each in content.items()}
-    if hasattr(kind, "_fields") and isinstance(content, list | tuple):  # a NamedTuple: an array in JSON
-        return kind(*_value(tuple[tuple(_hints(kind).values())], content, place))
-    if is_dataclass(kind) and isinstance(content, Mapping):
-        return _record(kind, content, place)
-    if kind is float and isinstance(content, Real) and not isinstance(content, bool):
-        return float(content)
-    if kind is int and isinstance(content, SupportsIndex) and not isinstance(content, bool):
-        return int(content)
-    if not isinstance(kind, type) or not isinstance(content, kind):
-        raise ValueError(f"{place or 'the content'}: {content!r:.60} where {getattr(kind, '__name__', kind)} belongs")
-    return content
-
-
-def _record(kind: Any, content: Mapping[str, Any], place: str) -> Any:
-    hints, given = _hints(kind), {}
-    for field in fields(kind):
-        where = f"{place}.{field.name}".lstrip(".")
-        if field.name in content:
-            given[field.name] = _value(hints[field.name], content[field.name], where)
-        elif field.default is MISSING and field.default_factory is MISSING:
-            raise ValueError(f"{where} is missing")
-    return kind(**given)
+    return TypeAdapter(kind)

@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dgeqrf  # type: ignore[attr-defined]
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, Unidentifiable
+from calib.words import listing
 
 CHUNK = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
 RESOLUTION = 1e-10  # singular values of unit-norm columns below this part of the largest are rounding
@@ -205,11 +206,8 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
         return values
     part = np.linalg.norm(np.linalg.svd(scaled)[2][weak], axis=0)
     concerned = [name for name, size in zip(names, part) if size > 0.01]
-    shown = ", ".join(concerned[:12]) + (f" and {len(concerned) - 12} more" if len(concerned) > 12 else "")
-    message = (
-        f"{int(weak.sum())} combination(s) of {len(names)} parameters have no effect on the data: {shown}; {advice}"
-    )
-    raise Unidentifiable(message, concerned, values)
+    message = f"{int(weak.sum())} combination(s) of {len(names)} parameters have no effect on the data"
+    raise Unidentifiable(f"{message}: {listing(concerned)}; {advice}", concerned, values)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:

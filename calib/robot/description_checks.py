@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.robot.chain import Chain, Joint
+from calib.words import listing
 
 DENSEST = 1000.0  # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
 UNEVEN = 1.0  # share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice)
@@ -40,7 +41,7 @@ def _turns(chain: Chain) -> tuple[str, ...]:
     wide = {name: angle for name, angle in wide.items() if TURNS < angle < np.inf}
     if not wide:
         return ()
-    return (f"{_together([*wide])}: limits up to {max(wide.values()):g} rad in the robot's description; degrees?",)
+    return (f"{listing(wide, 4)}: limits up to {max(wide.values()):g} rad in the robot's description; degrees?",)
 
 
 def _furthest(joint: Joint) -> float:
@@ -52,7 +53,7 @@ def _massless(chain: Chain) -> tuple[str, ...]:
     if chain.inertias is None:
         return ()
     names = [joint.name for joint, body in zip(chain.joints, chain.inertias) if not body.any()]
-    return (f"body behind {_together(names)}: its mass is not stated, and counts as zero",) if names else ()
+    return (f"body behind {listing(names, 4)}: its mass is not stated, and counts as zero",) if names else ()
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
@@ -73,15 +74,10 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
     same: dict[str, list[str]] = {}
     for name, words in found.items():
         same.setdefault(words.partition(" (")[0], []).append(name)
-    lines = [f"body behind {_together(names)}: {found[names[0]]}" for names in same.values()]
+    lines = [f"body behind {listing(names, 4)}: {found[names[0]]}" for names in same.values()]
     if total > DENSEST * length**3:
         lines.append(f"its bodies weigh {total:.4g} kg in all where the stretched arm is {length:.3g} m long: grams?")
     return tuple(lines)
-
-
-def _together(names: list[str]) -> str:
-    """Return the names of joints, the first ones of many."""
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _impossible(body: np.ndarray, length: float) -> str:

@@ -13,6 +13,7 @@ from functools import reduce
 import numpy as np
 
 from calib.errors import RobotError
+from calib.words import listing
 
 ALWAYS = 0.95
 SAMPLES = 200
@@ -160,10 +161,9 @@ def check_reachable(
     buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - TOUCH)))
     if not len(buried):
         return
-    shown = ", ".join(f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried[:3])
-    more = f" and {len(buried) - 3} more" if len(buried) > 3 else ""
+    shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried), 3)
     raise RobotError(
-        f"in each of {len(distances)} random postures there is {shown}{more}: nothing keeps clear of that. Sizes and "
+        f"in each of {len(distances)} random postures there is {shown}: nothing keeps clear of that. Sizes and "
         "places are in m (or say \"20 mm\"), in the arm's base frame, which may lie above the floor; an obstacle's xyz "
         "is its middle; where capsules stand for the links, [collision] radius may be too large"
     )

@@ -16,6 +16,7 @@ from calib.data.camera.board import Board, corners
 from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens
 from calib.errors import CalibError, MeasurementError
+from calib.words import counted
 
 MOST = 30  # images that a first lens is found from (our choice)
 FEWEST = 4
@@ -61,7 +62,7 @@ def estimate_lens(
     good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
     if len(good) < FEWEST:
         raise MeasurementError(
-            f"{len(good)} image{'s' if len(good) != 1 else ''} with a board: a lens takes {FEWEST} at least, tilted "
+            f"{counted(len(good), 'image')} with a board: a lens takes {FEWEST} at least, tilted "
             "differently, and a good one 15; take more, or give the lens (camera.yaml)",
             file,
         )

@@ -36,6 +36,7 @@ from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plausible import Limits
 from calib.errors import CalibError, MeasurementError
+from calib.words import counted, listing
 
 JOINTS = "joints.csv"
 LOOKED_INTO = 3  # useless images that are looked into for the reason, unless it is found
@@ -185,14 +186,14 @@ def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray,
     rows = np.array([k for k, name in enumerate(names) if problems.get(name) == ""], dtype=int)
     notes = []
     if missing:
-        notes.append(f"{len(missing)} of {len(names)} rows have no image: {listed(missing)}")
+        notes.append(f"{len(missing)} of {len(names)} rows have no image: {listing(missing, 5)}")
     if extra := sorted(set(found.images) - set(names)):
-        notes.append(f"{len(extra)} images have no row in {JOINTS}: {listed(extra)}")
+        notes.append(f"{len(extra)} images have no row in {JOINTS}: {listing(extra, 5)}")
     notes += problem_words(problems)
     if len(rows) < LEAST:
         why = "; ".join(notes) or "there are no more rows"
         raise MeasurementError(
-            f"{len(rows)} usable image{'s' if len(rows) != 1 else ''}: a calibration takes some 20 to 40 from all "
+            f"{counted(len(rows), 'usable image')}: a calibration takes some 20 to 40 from all "
             f"around, {LEAST} at the very least ({why})",
             path,
         )
@@ -210,13 +211,8 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
         for each in zip(*(MEASURED.findall(problems[name]) for name in own)):
             low, high = min(each, key=float), max(each, key=float)
             reason = reason.replace("#", low if low == high else f"{low} to {high}", 1)
-        result.append(f"{len(own)} image{'s are' if len(own) > 1 else ' is'} of no use ({reason}): {listed(own)}")
+        result.append(f"{len(own)} image{'s are' if len(own) > 1 else ' is'} of no use ({reason}): {listing(own, 5)}")
     return result
-
-
-def listed(names: Sequence[str], most: int = 5) -> str:
-    """Return names with commas between them, the first few."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.checks.repeatability import SAME
+from calib.words import counted
 
 MOST = 0.5  # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
 
@@ -78,4 +79,4 @@ def _numbers(block: PoseMeasurements, chosen: Sequence[bool] | np.ndarray) -> li
 
 def _rows(numbers: Sequence[int]) -> str:
     shown = ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")
-    return f"{len(numbers)} row{'s' if len(numbers) > 1 else ''} ({shown})"
+    return f"{counted(len(numbers), 'row')} ({shown})"

@@ -15,7 +15,6 @@ import numpy as np
 from calib.data.camera.board import corners
 from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens
-from calib.data.poses.image_folders import listed
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
@@ -23,6 +22,7 @@ from calib.geometry.images.hand_eye import Placement, misfit, place_robustly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert, pose, to_quaternion
+from calib.words import counted, listing
 
 ROUNDS = 4  # of leaving corners out
 MEDIAN = 1.1774  # of the length of a vector of two standard normals
@@ -125,7 +125,7 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
     gone = np.argwhere(before & ~block.seen)
     if not len(gone):
         return block
-    named = listed([f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone], NAMED)
+    named = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), NAMED)
     words = f"{len(gone)} of {before.sum()} corners do not fit into their image and are left out: {named}"
     return replace(block, notes=(*block.notes, words))
 
@@ -153,7 +153,7 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
         else "are their joint values those of other images, or was camera or board moved?"
     )
     words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from where all others do: {cause}"
-    words += f" ({listed([block.name(int(block.rows[row])) for row in strange])})"
+    words += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
     if len(strange) > FEW * len(block):
         raise MeasurementError(f"{len(strange)} of {len(block)} images {words}", block.file)
     return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} left out, they {words}"
@@ -220,7 +220,7 @@ def _check_pairing(
         own = slice(max(shift, 0), len(arm) + min(shift, 0)), slice(max(-shift, 0), len(arm) + min(-shift, 0))
         again = place_robustly(arm[own[0]], seen[own[1]], lever)
         if again.error < PAIRED * placed.error:
-            rows = f"{abs(shift)} row{'s' if abs(shift) > 1 else ''}"
+            rows = counted(abs(shift), "row")
             raise MeasurementError(
                 f"images and joint values are shifted by {rows}: as they stand the board is off by "
                 f"{1e3 * placed.error:.0f} mm in the median, with each image beside the joints {rows} "

@@ -21,6 +21,7 @@ from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.planning import Planned
 from calib.robot.tables import dumps
 from calib.units import motion_units
+from calib.words import counted
 from trajectories.design.verify import dense_motion
 from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints
@@ -194,7 +195,7 @@ def design_lines(designed: Designed) -> list[str]:
         )
     played = designed.playback
     parts = ["the approach"] if played.approach is not None else []
-    parts.append(f"{played.repeat} period{'s' if played.repeat > 1 else ''}")
+    parts.append(counted(played.repeat, "period"))
     result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
     result += [] if designed.outlook is None else prediction.lines(designed.outlook)
     return [*result, *designed.inputs.limits.bounds.lines(), *(f"note: {note}" for note in designed.notes)]

@@ -18,6 +18,7 @@ from calib.procedure.export import geometry
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.description_checks import impossible_bodies
+from calib.words import listing
 
 UNLIKE = 3.0  # times a body's mass in the description from which on it is named (our choice)
 
@@ -144,8 +145,7 @@ def drive_notes(given: IdentifiedRobot) -> list[str]:
         )
     if np.any(given.drives.values[:, 3]) or given.drives.left:
         names = [*(["offsets"] if np.any(given.drives.values[:, 3]) else []), *given.drives.left]
-        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-        notes.append(f"in parameters.json alone: {', '.join(names[:8])}{more}")
+        notes.append(f"in parameters.json alone: {listing(names, 8)}")
     carried = given.found.dynamics.model.bodies
     if payloads := [label for label, c in zip(carried.labels, carried.coordinates) if c < 0]:
         notes.append(f"payload {', '.join(payloads)} is not part of the robot: in parameters.json alone")

@@ -32,6 +32,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit
 from calib.procedure.findings import SpelledFinding as Finding
 from calib.procedure.kinematic_stage.remarks import FLOOR, TOO_GOOD
+from calib.words import listing
 
 NO_ARM = 0.015
 BETTER = 3.0
@@ -139,10 +140,9 @@ def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
     if not told:
         return []
     words = [each for _, each in sorted(told, reverse=True)]
-    more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""
     one = Finding(
         "moved", "fail" if max(told)[0] > NO_MOUNTING else "marginal",
-        f"the fit moved {', '.join(words[:NAMED])}{more} from the nominal arm, further than any sound arm is off: is "
+        f"the fit moved {listing(words, NAMED)} from the nominal arm, further than any sound arm is off: is "
         "this the robot, does its file count a joint's angle from another zero or the other way, are the columns in "
         "its order?",
     )  # fmt: skip

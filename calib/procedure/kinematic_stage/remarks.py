@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from calib.geometry.model_choice.ladder import GROSS, ModelSelection
 from calib.geometry.observation import observe
 from calib.geometry.result import GeometricFit
 from calib.units import ERRORS
+from calib.words import listing
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
 TOO_GOOD = 2e-6  # rms [m]: less is left by no instrument (our choice)
@@ -59,19 +59,19 @@ def remark(finding: Diagnosis | Unidentified) -> str:
             gap = "" if below is None else f"; singular values fall from {last:.1e} to {below:.1e} there"
             return f"{rank} of {parameters} parameters can be told apart (tolerance {tolerance:.0e}{gap})."
         case NoEffect(names):
-            return f"No effect on what was measured: {_list(names)}."
+            return f"No effect on what was measured: {listing(names)}."
         case Merged(names, station, tool, arm):
             places = ["the placement of the instrument"] if station else []
             places += ["the mounting of the tool"] if tool else []
-            places += [_list(arm, 4)] if arm else []
-            return f"Merged into {' and '.join(places)}, and left at nominal: {_list(names)}."
+            places += [listing(arm, 4)] if arm else []
+            return f"Merged into {' and '.join(places)}, and left at nominal: {listing(names)}."
         case HeldByPrior(names):
-            return f"Drawn to nominal, since the measurements hardly tell them: {_list(names)}."
+            return f"Drawn to nominal, since the measurements hardly tell them: {listing(names)}."
         case LeftNominal(names):
             return (
                 "The poses tell these worse than a robot's maker does (±10 mm, ±50 mrad), so they stay at nominal: "
-                f"{_list(names)}. Poses that move the joints concerned further, or a target further off the last axis, "
-                "would tell them."
+                f"{listing(names)}. Poses that move the joints concerned further, or a target further off the last "
+                "axis, would tell them."
             )
         case LoosePlacement():
             return _loose(finding)
@@ -90,11 +90,6 @@ def _loose(finding: LoosePlacement) -> str:
 
 def _named(file: str) -> str:
     return Path(file).name or "measurements"
-
-
-def _list(names: Sequence[str], most: int = 12) -> str:
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 @dataclass(frozen=True)

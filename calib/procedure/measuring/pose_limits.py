@@ -39,6 +39,7 @@ from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import placement
 from calib.transforms import invert
+from calib.words import listing
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
 
@@ -314,9 +315,8 @@ def _collision(
         notes = (*notes, f"the floor is NOT kept: every posture is below {floor:g} m; state it under [collision]")
         floor = None
     if model.excluded:
-        pairs = ", ".join(" with ".join(pair) for pair in model.excluded[:3])
-        more = f" and {len(model.excluded) - 3} more" if len(model.excluded) > 3 else ""
-        notes = (*notes, f"not watched, since no posture parts them: {pairs}{more}")
+        pairs = listing((" with ".join(pair) for pair in model.excluded), 3)
+        notes = (*notes, f"not watched, since no posture parts them: {pairs}")
     kept = [*([f"self-collision ({shapes})"] if within else [])]
     kept += [] if floor is None or "floor" in idle else [f"floor at {floor:g} m"]
     kept += ["walls of the cell"] if not {wall.name for wall in walls} <= idle else []

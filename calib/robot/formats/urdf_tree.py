@@ -15,6 +15,7 @@ from calib.errors import RobotError, suggestion
 from calib.robot.chain import Joint
 from calib.robot.formats.markup import Node, parse
 from calib.transforms import from_xyz_rpy
+from calib.words import listing
 
 MOVING = ("revolute", "continuous", "prismatic")
 KINDS = (*MOVING, "fixed", "floating", "planar")
@@ -182,8 +183,9 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
         if node is not None and (np.abs(_floats(node, "rpy", "0 0 0", where)) > TURN).any():
             found.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
     if len(found) > 1:
-        shown = ", ".join(found[:3]) + (f" and {len(found) - 3} more" if len(found) > 3 else "")
-        raise RobotError(f"{where}: {shown}: beyond a full turn: degrees? A URDF's angles are radians; convert them")
+        raise RobotError(
+            f"{where}: {listing(found, 3)}: beyond a full turn: degrees? A URDF's angles are radians; convert them"
+        )
     return tuple(f"{one} is beyond a full turn: degrees? A URDF's angles are radians" for one in found)
 
 
