@@ -134,6 +134,36 @@ class SessionError(CalibError):
     """A session folder that is busy, damaged, or not in the state a command needs."""
 
 
+def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: Any) -> None:
+    """Raise `kind(message, *details)` unless `holds`; for messages that can be formed whether it holds or not."""
+    if not holds:
+        raise kind(message, *details)
+
+
+def one_of(word: Any, words: Collection[str], what: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
+    """Return `word`; one that is none of `words` raises ``what 'word' is none of ... (did you mean ...?)``."""
+    if word not in words:
+        raise kind(f"{what} '{word}' is none of {', '.join(words)}{suggestion(str(word), words)}", *details)
+    return word
+
+
+@contextmanager
+def refused_as(
+    kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], words: str, *details: Any
+) -> Iterator[None]:
+    """Raise what others raise inside, of `kinds`, as `kind(words, *details)`; ``{}`` in `words` is what they say.
+
+    An error of the operating system says its reason without the file's name, which `details` or `words` have.
+    """
+    try:
+        yield
+    except kinds as error:
+        if isinstance(error, CalibError):
+            raise
+        said = getattr(error, "strerror", None) or error
+        raise kind(words.replace("{}", str(said)), *details) from error
+
+
 def command_line(*words: object, program: str = "calib") -> str:
     """Return a command as a shell takes it: ``calib next 'cell 7'``."""
     return shlex.join([program, *map(str, words)])

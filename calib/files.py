@@ -21,7 +21,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, require
 from calib.records import plain, shielded
 
 if TYPE_CHECKING:  # the commands' help is written without loading it
@@ -142,8 +142,7 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     Raises:
         UsageError: with the file concerned.
     """
-    if _reached(out) and out.is_dir():
-        raise UsageError(f"{out} is a folder; give a file to write to")
+    require(not (_reached(out) and out.is_dir()), f"{out} is a folder; give a file to write to", UsageError)
     check_writable(out.absolute().parent, out)
     check_not_input([out], inputs)
     if suffixes and out.suffix not in suffixes:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.errors import BadInput, NothingFeasible
+from poses.errors import BadInput, NothingFeasible, require
 
 
 def draw_candidates(
@@ -41,8 +41,7 @@ def draw_candidates(
     low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
     if low.ndim != 1 or low.shape != high.shape or not (low < high).all():
         raise BadInput(f"limits: expected two (n,) arrays with lower < upper, found {low} and {high}")
-    if count < 1:
-        raise BadInput(f"count = {count}: ask for at least one candidate")
+    require(count >= 1, f"count = {count}: ask for at least one candidate")
     most = max(200 * count, 100_000) if most is None else most
     block = 1 << max(int(block - 1).bit_length(), 0)  # Sobol points keep their balance in powers of two
     sequence = qmc.Sobol(len(low), scramble=True, rng=np.random.default_rng(seed))

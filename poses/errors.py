@@ -9,6 +9,12 @@ class BadInput(ValueError):
     """An array or an option that cannot be what it should be (shape, NaN, an unknown name)."""
 
 
+def require(holds: object, message: str, kind: type[Exception] = BadInput) -> None:
+    """Raise `kind(message)` unless `holds`; for messages that can be formed whether it holds or not."""
+    if not holds:
+        raise kind(message)
+
+
 class TooFewCandidates(ValueError):
     """Fewer candidates than poses to choose.
 

@@ -25,7 +25,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.errors import BadInput
+from poses.errors import BadInput, require
 
 Index = Literal["O1", "O2", "O3", "O4", "O5", "cond"]
 _POWERS = {"O2": (1.0, 1.0), "O3": (1.0, 0.0), "O4": (2.0, 1.0), "cond": (1.0, 1.0)}  # merit = a log sp − b log s1
@@ -155,8 +155,7 @@ def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int
     if index not in get_args(Index):
         raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
     array = np.asarray(W, dtype=float)
-    if array.ndim not in (2, 3) or not array.size:
-        raise BadInput(f"W: expected (m, rows, p) or (m rows, p), found {array.shape}")
+    require(array.ndim in (2, 3) and array.size, f"W: expected (m, rows, p) or (m rows, p), found {array.shape}")
     if not np.isfinite(array).all():
         raise BadInput(
             "W holds values that are not finite; look for poses outside the model's domain or failed divisions"

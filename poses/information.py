@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
-from poses.errors import BadInput, NotIdentifiable, TooFewCandidates
+from poses.errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
 RANK_TOLERANCE = 1e-7
 """Smallest accepted ratio of singular values of the column-scaled candidates: our choice (Gram matrices see 1e-8)."""
@@ -91,8 +91,7 @@ def log_det(matrices: np.ndarray) -> np.ndarray:
 
 
 def _check_counts(count: int, rows: int, p: int, m: int, measured: int) -> None:
-    if m < 1:
-        raise BadInput(f"m = {m}: at least one pose is to be chosen")
+    require(m >= 1, f"m = {m}: at least one pose is to be chosen")
     if count < m:
         raise TooFewCandidates(
             f"{count} candidates for {m} poses: draw more candidates or ask for fewer poses", count, m

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 from trajectories.setpoints import Setpoints
 
 KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
@@ -72,5 +72,4 @@ def _check(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarray], r
     for kind, values in bounds.items():
         if values.shape != start.shape or not (np.isfinite(values) & (values > 0)).all():
             raise BadInput(f"approach: {kind} limits have to be finite and above zero, one per joint; found {values}")
-    if not (np.isfinite(rate) and rate > 0):
-        raise BadInput(f"rate {rate:g} Hz: expected a number above zero")
+    require(np.isfinite(rate) and rate > 0, f"rate {rate:g} Hz: expected a number above zero")

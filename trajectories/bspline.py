@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,8 @@ def bspline_family(
     counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
         raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
-    if degree < 5:
-        raise BadInput(f"degree {degree}: 5 at least, or the jerk has kinks and nothing bounds it between samples")
-    if not np.isfinite(period) or period <= 0:
-        raise BadInput(f"period {period} s: expected a positive number")
+    require(degree >= 5, f"degree {degree}: 5 at least, or the jerk has kinks and nothing bounds it between samples")
+    require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     if rate is not None:
         aligned_period(period, rate)
     freedoms = []

@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from trajectories.basis import ORDERS, SampledMotion
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Slopes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -145,10 +145,8 @@ class TorqueLimit:
         if not np.isfinite(self.parameters).all():
             k = int(np.argmin(np.isfinite(self.parameters)))
             raise BadInput(f"torque model: parameter {k + 1} is not finite ({self.parameters[k]})")
-        if not (self.limits > 0).all():
-            raise BadInput(f"torque limits have to be above zero, found {self.limits}")
-        if not 0 <= self.margin < 1:
-            raise BadInput(f"torque margin {self.margin}: expected a share of the limits from 0 to below 1")
+        require((self.limits > 0).all(), f"torque limits have to be above zero, found {self.limits}")
+        require(0 <= self.margin < 1, f"torque margin {self.margin}: expected a share of the limits from 0 to below 1")
         object.__setattr__(self, "joints", np.flatnonzero(np.isfinite(self.limits)))
 
     @property

@@ -7,6 +7,12 @@ class BadInput(ValueError):
     """An array or an option that cannot be what it should be (shape, NaN, limits that cross, an unknown name)."""
 
 
+def require(holds: object, message: str, kind: type[Exception] = BadInput) -> None:
+    """Raise `kind(message)` unless `holds`; for messages that can be formed whether it holds or not."""
+    if not holds:
+        raise kind(message)
+
+
 class NotExciting(ValueError):
     """No motion of the family tells all columns of the regressor apart."""
 

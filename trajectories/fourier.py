@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +150,7 @@ def _freedom(count: int, period: float, rest: bool, start: float | None) -> Free
 
 
 def _check_frequencies(counts: Sequence[int], period: float, resonance: float | None) -> None:
-    if not np.isfinite(period) or period <= 0:
-        raise BadInput(f"period {period} s: expected a positive number")
+    require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     top = max(counts) * 2 * np.pi / period
     if resonance is not None and not top < resonance:
         least = 2 * np.pi * max(counts) / resonance

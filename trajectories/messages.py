@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 from trajectories.setpoints import Setpoints
 
 DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
@@ -23,8 +23,7 @@ def joint_trajectory(track: Setpoints, joint_names: Sequence[str], every: int = 
     """
     if len(joint_names) != track.n or len(set(joint_names)) != track.n:
         raise BadInput(f"the motion has {track.n} joints, the message would name {', '.join(joint_names) or 'none'}")
-    if every < 1:
-        raise BadInput(f"every {every}: expected 1 or more")
+    require(every >= 1, f"every {every}: expected 1 or more")
     rows = np.unique(np.append(np.arange(0, len(track), every), len(track) - 1))
     points = [_point(track, int(k)) for k in rows]
     return {

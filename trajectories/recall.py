@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import next_fast_len
 
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 
 LIKENESS = 0.9  # share of the reference's variance that a found period explains at least (our choice)
 
@@ -90,15 +90,13 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
         )
     chain = [k for k in range(best % len(r), len(alike), len(r)) if alike[k] >= likeness]
     run = _run_with(chain, best, len(r))[skip:]
-    if not run:
-        raise BadInput(f"fewer than {skip + 1} whole periods of the motion are in the recording")
+    require(run, f"fewer than {skip + 1} whole periods of the motion are in the recording")
     return Recalled(run[0], len(r), len(run), tuple(float(alike[k]) for k in run), _lag(alike, best))
 
 
 def average(values: np.ndarray, found: Recalled) -> Averaged:
     """Average signals (N, k) of the recording over the whole periods found; two or more."""
-    if found.periods < 2:
-        raise BadInput("one period has no variance: record two or more")
+    require(found.periods >= 2, "one period has no variance: record two or more")
     parts = np.asarray(values, dtype=float)[found.rows].reshape(found.periods, found.period, -1)
     return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), found.periods)
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 
 JUMP = 1e-6  # of a joint [rad or m] at a seam between two tracks
 
@@ -46,8 +46,7 @@ class Setpoints:
 
     def repeated(self, times: int) -> Setpoints:
         """Return a closed motion `times` times over: periodic, both ends included, so N - 1 samples a period."""
-        if times < 1:
-            raise BadInput(f"a motion can be repeated once or more often, not {times} times")
+        require(times >= 1, f"a motion can be repeated once or more often, not {times} times")
         return joined([self] * times)
 
 
@@ -86,8 +85,7 @@ def slowed(track: Setpoints, factor: float) -> Setpoints:
     Args:
         factor: 1 or more; rounded to a whole number of samples at the end.
     """
-    if not np.isfinite(factor) or factor < 1:
-        raise BadInput(f"a rehearsal runs a factor of 1 or more slower, not {factor:g}")
+    require(np.isfinite(factor) and factor >= 1, f"a rehearsal runs a factor of 1 or more slower, not {factor:g}")
     if factor == 1:
         return track
     count = round((len(track) - 1) * factor)

@@ -12,7 +12,7 @@ from calib.api.given import listed
 from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.arguments import checked
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
@@ -44,8 +44,7 @@ def validate(
         MeasurementError: for files that cannot be right, naming row and column.
     """
     given = listed(unseen)
-    if not given:
-        raise UsageError("validate: unseen: nothing is given to validate on")
+    require(given, "validate: unseen: nothing is given to validate on", UsageError)
     if isinstance(result, (ParallelGeometry, ParallelDynamics)):
         return _of_parallel(result, given)
     if isinstance(result, GeometryFit):

@@ -21,7 +21,7 @@ from typing import IO
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import MeasurementError, suggestion
+from calib.errors import MeasurementError, require, suggestion
 from calib.files import check_regular
 from calib.records import plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
@@ -135,8 +135,7 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
         places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
         raise MeasurementError(f"stands in the header more than once (columns {places})", path, column=name)
     cells = _read_columns(lines, separator, names, path)
-    if not len(cells[0]):
-        raise MeasurementError("has a header but no data rows", path)
+    require(len(cells[0]), "has a header but no data rows", MeasurementError, path)
     rows = frozen(np.arange(1, len(cells[0]) + 1), int)
     if header is None and names[-1] == f"column {len(names)}" and not _filled(cells[-1]):
         names, units, cells = names[:-1], units[:-1], cells[:-1]  # each line ends with a separator

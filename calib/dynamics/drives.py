@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.dynamics.shapes import SHAPES, V0, Joined, Shape
-from calib.errors import CalibError
+from calib.errors import CalibError, one_of, require
 
 Motion = tuple[tuple[int, float], ...]
 STANDARD = {"Ia": "acceleration", "Fv": "velocity", "Fc": "sign", "off": "one"}
@@ -47,8 +47,7 @@ class DriveTerm:
     linear: bool = False
 
     def __post_init__(self) -> None:
-        if self.shape not in SHAPES:
-            raise CalibError(f"term '{self.name}': shape '{self.shape}' is none of {', '.join(SHAPES)}")
+        one_of(self.shape, SHAPES, f"term '{self.name}': shape")
         wanted = SHAPES[self.shape].settings
         if wanted[:1] == ("edge",) and len(self.settings) == len(wanted) - 1:
             object.__setattr__(self, "settings", (math.inf, *self.settings))
@@ -56,8 +55,7 @@ class DriveTerm:
             raise CalibError(
                 f"term '{self.name}': shape '{self.shape}' needs ({', '.join(wanted)}), not {self.settings}"
             )
-        if self.side not in ("link", "motor"):
-            raise CalibError(f"term '{self.name}': side '{self.side}' is neither 'link' nor 'motor'")
+        require(self.side in ("link", "motor"), f"term '{self.name}': side '{self.side}' is neither 'link' nor 'motor'")
 
     @property
     def form(self) -> Shape:
@@ -111,8 +109,7 @@ def standard(
     result = []
     for joint, names in enumerate(sets):
         for name in names.split():
-            if name not in known:
-                raise CalibError(f"joint {joint + 1}: drive term '{name}' is none of {', '.join(known)}")
+            require(name in known, f"joint {joint + 1}: drive term '{name}' is none of {', '.join(known)}")
             settings = (smoothing[joint],) if known[name] == "sign" else ()
             side = "link" if name in LINK_SIDE else "motor"
             is_linear = bool(linear[joint]) if linear is not None else False

@@ -19,7 +19,7 @@ from itertools import groupby
 
 import numpy as np
 
-from calib.errors import CalibError
+from calib.errors import CalibError, one_of
 
 BODIES = "bodies"  # the side of a column that is a body's parameter
 
@@ -226,8 +226,7 @@ def torque_rows(name: str) -> TorqueRows:
     Raises:
         CalibError: for a name that is none of `ROWS`.
     """
-    if name not in ROWS:
-        raise CalibError(f"model kind '{name}' is none of {', '.join(ROWS)}")
+    one_of(name, ROWS, "model kind")
     return ROWS[name]
 
 

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 from scipy.special import fdtrc
 
-from calib.errors import CalibError, Unidentifiable
+from calib.errors import Unidentifiable, require
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles
 
@@ -157,10 +157,7 @@ def _refused(step: EliminationStep, rule: Rule, ratio: float, level: float) -> b
 
 def _check_lists(names: Sequence[str], keep: Sequence[str], drop: Sequence[str]) -> None:
     unknown = [name for name in (*keep, *drop) if name not in names]
-    if unknown:
-        raise CalibError(f"keep or drop names {', '.join(unknown)}, not among the parameters {', '.join(names)}")
+    require(not unknown, f"keep or drop names {', '.join(unknown)}, not among the parameters {', '.join(names)}")
     both = [name for name in keep if name in drop]
-    if both:
-        raise CalibError(f"{', '.join(both)} cannot be kept and dropped")
-    if len(set(drop)) >= len(names):
-        raise Unidentifiable("dropping every parameter leaves no model", drop)
+    require(not both, f"{', '.join(both)} cannot be kept and dropped")
+    require(len(set(drop)) < len(names), "dropping every parameter leaves no model", Unidentifiable, drop)

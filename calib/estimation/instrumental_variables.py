@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from calib.arrays import shaped
-from calib.errors import CalibError, Unidentifiable
+from calib.errors import Unidentifiable, require
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
@@ -166,8 +166,7 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
     left = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
     dof = int(problem.data.rows.sum() / inflation) - p
-    if dof <= 0:
-        raise Unidentifiable("fewer independent rows than parameters; record longer", problem.names)
+    require(dof > 0, "fewer independent rows than parameters; record longer", Unidentifiable, problem.names)
     residual_std = float(np.sqrt(np.sum(squares / sigma**2) / left.sum()))
     covariance = inflation * residual_std**2 * inverse @ inverse.T
     units = problem.data.units[p:]
@@ -240,8 +239,7 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     split = split_columns(columns, [np.arange(p)], 1e-8)
     k = split.rank - p
     dof = int(rows) - p - k
-    if k <= 0 or dof <= 0:
-        raise CalibError("instruments equal to the columns leave nothing to test (or too few rows)")
+    require(k > 0 and dof > 0, "instruments equal to the columns leave nothing to test (or too few rows)")
     target = factor[:, -1]
     first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
     f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf

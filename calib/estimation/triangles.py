@@ -17,7 +17,7 @@ import scipy.linalg
 from scipy.linalg.lapack import dgeqrf  # type: ignore[attr-defined]
 
 from calib.arrays import frozen, shaped
-from calib.errors import CalibError, Unidentifiable
+from calib.errors import CalibError, Unidentifiable, require
 from calib.words import listing
 
 CHUNK = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
@@ -65,8 +65,7 @@ def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int 
     """Return triangles that have seen no rows."""
     p = len(names)
     given = tuple(units) if units is not None else ("",) * p
-    if len(given) != p:
-        raise CalibError(f"{p} parameter names but {len(given)} units")
+    require(len(given) == p, f"{p} parameter names but {len(given)} units")
     return Triangles(tuple(names), given, frozen(np.zeros((groups, p + 1, p + 1))), frozen(np.zeros(groups), int))
 
 

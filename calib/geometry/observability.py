@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.poses.measurements import Poses, Positions
-from calib.errors import Unidentifiable, UsageError
+from calib.errors import Unidentifiable, UsageError, one_of, require
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import prepare, target_jacobian
@@ -121,8 +121,7 @@ def observation(
         sigmas: of a position [m] and an orientation [rad].
         seed: of the postures.
     """
-    if kind not in KINDS:
-        raise UsageError(f"kind '{kind}' is none of {', '.join(KINDS)}")
+    one_of(kind, KINDS, "kind", UsageError)
     full = kind == Poses.kind
     q = random_joints(cell.chain, SAMPLES, seed)
     blocks = prepare(cell, [_measured(q, cell, number, full) for number in range(len(cell.tools))])
@@ -131,8 +130,7 @@ def observation(
         turns = [k for k in layout(cell).tool_index if layout(cell).units[k] == "rad"]
         columns = np.setdiff1d(columns, turns)
     split = base_columns(cell, blocks, columns)
-    if not split.rank:
-        raise Unidentifiable(f"robot '{cell.chain.name}': no parameter has an effect on what is measured")
+    require(split.rank, f"robot '{cell.chain.name}': no parameter has an effect on what is measured", Unidentifiable)
     return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
 
 

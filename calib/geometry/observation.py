@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pixels import Pixels
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout_counts
 from calib.geometry.pixel_residuals import view_of
@@ -60,8 +60,7 @@ def prepare(
 
 
 def _index(names: tuple[str, ...], name: str, what: str) -> int:
-    if name not in names:
-        raise UsageError(f"{what} '{name}' is not part of the installation, which has {', '.join(names)}")
+    require(name in names, f"{what} '{name}' is not part of the installation, which has {', '.join(names)}", UsageError)
     return names.index(name)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.poses.fit_options import FitOptions
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.geometry.installation import FRAME_AXES, Installation
 from calib.robot import deflection
 from calib.transforms import displace
@@ -71,8 +71,7 @@ class ParameterLayout:
         """
         table = {name: k for k, name in enumerate(self.names)}
         for name in names:
-            if name not in table:
-                raise UsageError(f"no geometric parameter '{name}'; there are {', '.join(self.names)}")
+            require(name in table, f"no geometric parameter '{name}'; there are {', '.join(self.names)}", UsageError)
         return np.array([table[name] for name in names], dtype=int)
 
 

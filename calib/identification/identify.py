@@ -16,7 +16,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel, States
 from calib.dynamics.torque_rows import POWER
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
 from calib.identification.cases import Case
@@ -144,8 +144,7 @@ def identify_model(
         CalibError: the method's failure, where there is no estimate.
     """
     settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
-    if not cases:
-        raise UsageError("no recording to identify from")
+    require(cases, "no recording to identify from", UsageError)
     method = method_named(settings.method)
     if method.needs_simulation:
         settings = require_loop(settings) if method.needs_controller else require_robot(settings)

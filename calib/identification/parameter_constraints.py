@@ -22,7 +22,7 @@ from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import NotConverged, UsageError, suggestion
+from calib.errors import NotConverged, UsageError, require, suggestion
 from calib.estimation.convex.constrained import within
 from calib.estimation.convex.constraint_relations import contradicting, restricted
 from calib.estimation.convex.definite import Definite
@@ -311,8 +311,7 @@ def signs(names: Sequence[str], positive: Sequence[str]) -> Constraints:
         UsageError: for a name that is none of the columns.
     """
     for name in positive:
-        if name not in names:
-            raise UsageError(f"'{name}' is none of the estimated parameters {', '.join(names)}")
+        require(name in names, f"'{name}' is none of the estimated parameters {', '.join(names)}", UsageError)
     matrix = np.eye(len(names))[[list(names).index(name) for name in positive]]
     count = len(positive)
     return Constraints(
@@ -400,8 +399,7 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
     if np.abs(base.transform.T @ own - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         raise UsageError(_without_effect(weights, base))
     row[: base.b] += own
-    if not row.any():
-        raise UsageError(f"[constraints]: the weights of {', '.join(weights)} add to nothing")
+    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} add to nothing", UsageError)
     return row
 
 

@@ -16,7 +16,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.robot.chain import Chain
@@ -111,8 +111,7 @@ class IdentificationSettings:
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: its bodies, payloads at its tip, and the drives' standard terms."""
-    if settings.passive:
-        raise UsageError(f"passive = '{settings.passive}': a serial arm has no passive joints")
+    require(not settings.passive, f"passive = '{settings.passive}': a serial arm has no passive joints", UsageError)
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))
@@ -138,8 +137,7 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
         joints = [j for row, motion in one.acts for j in (row, *(k for k, _ in motion))]
         named.append((f"term '{one.name}': joint {max(joints, default=0) + 1}", tuple(joints)))
     for place, joints in named:
-        if max(joints, default=0) >= n:
-            raise UsageError(f"{place}: the robot has joints 1 to {n}")
+        require(max(joints, default=0) < n, f"{place}: the robot has joints 1 to {n}", UsageError)
     for coupling in settings.couplings:
         if coupling.joints[0] == coupling.joints[1]:
             raise UsageError(f"coupling: joint {coupling.joints[0] + 1} is coupled with itself; name two joints")

@@ -25,7 +25,7 @@ from calib.dynamics.idim import KEPT_LAST
 from calib.dynamics.regressor_model import Loads, States
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, POWER, Projection, TorqueRows, projected
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, require
 from calib.mechanism.closure import ClosedRobot
 from calib.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.mechanism.platform_body import energy_columns, wrench_regressor
@@ -277,8 +277,7 @@ def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
         return projected(PLATFORM, Projection(robot.freedom, units, partial(_to_platform, known)))
     if name == POWER.name:
         return POWER
-    if name != MOTOR.name:
-        raise UsageError(f"rows = '{name}': a parallel robot's are platform, motor or power")
+    require(name == MOTOR.name, f"rows = '{name}': a parallel robot's are platform, motor or power", UsageError)
     if robot.redundant:
         raise UsageError(
             f"rows = 'motor': '{robot.name}' has {robot.n} actuators for {robot.r} freedoms, so that the share of each "

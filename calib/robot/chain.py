@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import RobotError
+from calib.errors import RobotError, require
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -90,8 +90,7 @@ class Element:
     def __post_init__(self) -> None:
         if self.axis not in AXES:
             raise RobotError(f"element '{self.name}': axis '{self.axis}' is none of {', '.join(AXES)}")
-        if not np.isfinite(self.value):
-            raise RobotError(f"element '{self.name}': value {self.value} is not finite")
+        require(np.isfinite(self.value), f"element '{self.name}': value {self.value} is not finite", RobotError)
         if self.placement is not None:
             object.__setattr__(self, "placement", frozen(self.placement))
 

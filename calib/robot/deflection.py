@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.errors import CalibError
+from calib.errors import CalibError, one_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames, sweep
 
@@ -34,8 +34,7 @@ class Term:
     order: int = 0
 
     def __post_init__(self) -> None:
-        if self.basis not in BASES:
-            raise CalibError(f"deflection basis '{self.basis}' is none of {', '.join(BASES)}")
+        one_of(self.basis, BASES, "deflection basis")
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import RobotError
+from calib.errors import RobotError, require
 from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector, word
@@ -154,8 +154,7 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
             raise RobotError(f"{where}: {key} {value!r} is not a whole number from 0 to {most}")
     axis = word(entry, "axis", where)
     sign = number(entry.get("sign", 1.0), f"{where}, sign")
-    if abs(sign) != 1.0:
-        raise RobotError(f"{where}: sign {sign:g} is neither 1 nor -1")
+    require(abs(sign) == 1.0, f"{where}: sign {sign:g} is neither 1 nor -1", RobotError)
     return Element(
         name=name,
         axis=axis,

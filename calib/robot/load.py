@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from calib.errors import RobotError, suggestion
+from calib.errors import RobotError, require, suggestion
 from calib.robot import calibrated, description, library
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -51,14 +51,12 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
 def resolve(robot: str | Path) -> Path:
     """Return the file that `robot` names; a file in the working folder goes before the library."""
     path, names = Path(robot), library.names()
-    if not str(robot).strip():
-        raise RobotError(f"an empty text names no robot; the library has {', '.join(names)}")
+    require(str(robot).strip(), f"an empty text names no robot; the library has {', '.join(names)}", RobotError)
     known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(names)}"
     if path.is_dir():
         if (path / calibrated.ROBOT).is_file():
             return path / calibrated.ROBOT
-        if str(robot) not in names:
-            raise RobotError(f"folder {path} holds no robot.toml; give {known}")
+        require(str(robot) in names, f"folder {path} holds no robot.toml; give {known}", RobotError)
     elif path.is_file():
         if path.suffix in (".urdf", ".toml"):
             return path
@@ -66,6 +64,5 @@ def resolve(robot: str | Path) -> Path:
         raise RobotError(f"{path} is neither .urdf nor .toml; {advice}")
     if str(robot) in names:
         return library.path(str(robot))
-    if path.suffix in (".urdf", ".toml") or len(path.parts) > 1:
-        raise RobotError(f"no file {path}; give {known}")
+    require(path.suffix not in (".urdf", ".toml") and len(path.parts) <= 1, f"no file {path}; give {known}", RobotError)
     raise RobotError(f"no robot '{robot}'{suggestion(str(robot), names)}; give {known}")

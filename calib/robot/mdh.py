@@ -50,7 +50,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import RobotError
+from calib.errors import RobotError, one_of, require
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector, word
 
@@ -82,8 +82,7 @@ class Row:
     inertia: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise RobotError(f"row '{self.name}': kind '{self.kind}' is none of {', '.join(KINDS)}")
+        one_of(self.kind, KINDS, f"row '{self.name}': kind", RobotError)
 
 
 def read(path: str | Path, propose_beta: bool = True) -> Chain:
@@ -137,8 +136,7 @@ def chain(
         propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the moving one before.
     """
     moving = [row for row in rows if row.kind != "fixed"]
-    if not moving:
-        raise RobotError(f"robot '{name}': every row is fixed; at least one has to be revolute or prismatic")
+    require(moving, f"robot '{name}': every row is fixed; at least one has to be revolute or prismatic", RobotError)
     parallel = _parallel(rows) if propose_beta else set()
     elements: list[Element] = []
     owner = 0

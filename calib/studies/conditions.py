@@ -48,7 +48,7 @@ from typing import Annotated, Any
 
 from calib.config import parse, read_toml, strict
 from calib.config_types import Filled, Name, OneOf, Real, Spread, Text, Whole
-from calib.errors import UsageError, suggestion
+from calib.errors import UsageError, require, suggestion
 from calib.identification.methods.registry import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
@@ -225,8 +225,7 @@ def _paths(files: Sequence[str | Path]) -> list[Path]:
             result += found
         else:
             result.append(Path(one))
-    if not result:
-        raise UsageError("no study named: give a file, or a name out of calib study --list")
+    require(result, "no study named: give a file, or a name out of calib study --list", UsageError)
     return list(dict.fromkeys(result))
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from calib import files
-from calib.errors import CalibError, UsageError, suggestion
+from calib.errors import CalibError, UsageError, require, suggestion
 from calib.studies.trial import COLUMNS, STATUSES, TrialRow
 
 JOURNAL, WHOLE, LOCK = "rows.csv", "rows.parquet", "study.lock"
@@ -192,8 +192,7 @@ def _check_columns(path: Path, found: Sequence[str]) -> None:
     if tuple(found) == _HEAD:
         return
     other = found[0].removeprefix("calib-study-") if found[0].startswith("calib-study-") else ""
-    if not other:
-        raise UsageError(f"{path} holds no rows of a study: run this one in another folder (--out)")
+    require(other, f"{path} holds no rows of a study: run this one in another folder (--out)", UsageError)
     missing = ", ".join(sorted(set(_HEAD[1:]) - set(found[1:]))[:5])
     lacks = f"; it lacks {missing}" if missing else ""
     raise UsageError(

@@ -17,7 +17,7 @@ import numpy as np
 
 from trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
 from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
-from trajectories.errors import BadInput, NotExciting, NothingFeasible
+from trajectories.errors import BadInput, NotExciting, NothingFeasible, require
 
 KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
 
@@ -52,8 +52,7 @@ def design(
         raise BadInput(f"method '{method}' is none of {', '.join(get_args(Method))}")
     began = time.perf_counter()
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
-    if not tasks:
-        raise BadInput("no starts: ask for one at least, or give a guess")
+    require(tasks, "no starts: ask for one at least, or give a guess")
     search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
     try:
         search.run(tasks, STAGES[:2])

@@ -16,7 +16,7 @@ import numpy as np
 from trajectories.basis import Basis, Family, SampledMotion, sample_times
 from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
 from trajectories.design.objectives import Excitation, Objective, Observed, Value, observed
-from trajectories.errors import BadInput
+from trajectories.errors import BadInput, require
 
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
 NEAR = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
@@ -80,12 +80,10 @@ class ExcitationProblem:
     def __post_init__(self) -> None:
         if not 0 < self.stretch[0] <= self.stretch[1]:
             raise BadInput(f"stretch {self.stretch}: expected two positive factors, the smaller first")
-        if self.samples < 8:
-            raise BadInput(f"{self.samples} samples: expected 8 or more over a period")
+        require(self.samples >= 8, f"{self.samples} samples: expected 8 or more over a period")
         if self.coarse is not None and (self.coarse.n, self.coarse.period) != (self.family.n, self.family.period):
             raise BadInput("the coarse family has other joints or another period than the family")
-        if not self.objectives and not self.goals:
-            raise BadInput("nothing to design for: give objectives or goals")
+        require(self.objectives or self.goals, "nothing to design for: give objectives or goals")
 
     @property
     def free_period(self) -> bool:

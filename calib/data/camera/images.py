@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, require
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
@@ -76,6 +76,5 @@ def write_image(path: Path, image: np.ndarray) -> Path:
     from calib import files
 
     done, content = cv2.imencode(path.suffix, image)
-    if not done:
-        raise MeasurementError("cannot be written as an image", path)
+    require(done, "cannot be written as an image", MeasurementError, path)
     return files.write(path, content.tobytes())

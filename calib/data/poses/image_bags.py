@@ -21,7 +21,7 @@ from calib.data.camera import corner_file
 from calib.data.camera.board import Board
 from calib.data.camera.corner_file import Found
 from calib.data.poses.image_folders import JOINTS, detected
-from calib.errors import MeasurementError, suggestion
+from calib.errors import MeasurementError, require, suggestion
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 JOINT = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
@@ -77,8 +77,7 @@ def read_image_bag(
             names, stamps, q = _joints(reader, _topic(reader, JOINT, joint_topic, "joint states", path), path)
             connections = _topic(reader, IMAGE, image_topic, "images", path)
             chosen, own, notes = _at_rest(_image_stamps(reader, connections), stamps, q)
-            if not len(chosen):
-                raise MeasurementError(f"no image was taken with the arm at rest: {'; '.join(notes)}", path)
+            require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
             images = _images(reader, connections, set(chosen.tolist()))
             labels = [f"image {k + 1}" for k in chosen]
             found = detected(
@@ -117,8 +116,7 @@ def _joints(reader: Any, connections: list[Any], path: Path) -> tuple[tuple[str,
             order = [list(message.name).index(name) for name in names]
             stamps.append(_stamp(message, logged))
             rows.append(np.asarray(message.position)[order])
-    if len(rows) < 2:
-        raise MeasurementError(f"{len(rows)} joint states are too few to pair images with", path)
+    require(len(rows) >= 2, f"{len(rows)} joint states are too few to pair images with", MeasurementError, path)
     place = np.argsort(stamps, kind="stable")
     return names, np.array(stamps)[place], np.array(rows)[place]
 

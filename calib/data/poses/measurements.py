@@ -13,7 +13,7 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,7 @@ class PoseMeasurements:
         for name in self.per_row:
             if (value := getattr(self, name)) is None:
                 continue
-            if len(value) != m:
-                raise MeasurementError(f"{name} has {len(value)} rows where q has {m}", self.file)
+            require(len(value) == m, f"{name} has {len(value)} rows where q has {m}", MeasurementError, self.file)
             object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
 
     def __len__(self) -> int:

@@ -31,7 +31,7 @@ from calib.arrays import frozen
 from calib.data.csv_table import Table, read_header, read_table, row_width
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.plausible import turns
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, require
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 _POSE_MARKS = ("w", "rx", "r", "a")
@@ -54,8 +54,7 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
     found = read_header(path)[0]
     if not recognises(found):
         raise MeasurementError(f"is no RoboDK file: its header begins {', '.join(found[:7])}, not J1 to J6", path)
-    if joints != 6:
-        raise MeasurementError(f"RoboDK's form has 6 joints, the robot has {joints}", path)
+    require(joints == 6, f"RoboDK's form has 6 joints, the robot has {joints}", MeasurementError, path)
     pose = len(found) == 18 or (len(found) == 12 and _plain(found[9]) in _POSE_MARKS)
     if len(found) not in (9, 12, 18):
         message = f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18"

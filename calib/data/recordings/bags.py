@@ -19,7 +19,7 @@ import numpy as np
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.errors import MeasurementError, brief, suggestion
+from calib.errors import MeasurementError, brief, require, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
@@ -99,8 +99,7 @@ def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:
 
 
 def _refuse_joints(names: Sequence[str], seen: Sequence[tuple[str, ...]], path: Path) -> None:
-    if not seen:
-        raise MeasurementError("its topic of joint states has no messages", path)
+    require(seen, "its topic of joint states has no messages", MeasurementError, path)
     known = sorted({name for own in seen for name in own})
     missing = [name for name in names if name not in known]
     what = (
@@ -118,8 +117,7 @@ def _assemble(
     ends: Ends,
 ) -> Recording:
     for ours, what in (("q", "positions"), ("effort", "efforts")):
-        if not parts[ours].size:
-            raise MeasurementError(f"its joint states have no {what}", path)
+        require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
     notes = [f"{skipped} messages lack one of the joints; left out"] if skipped else []
     stamps = parts["header"]
     if not stamps.any():

@@ -26,7 +26,7 @@ from scipy.ndimage import uniform_filter1d
 
 from calib.arrays import frozen
 from calib.data.recordings.recording import Recording
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 
 CLOCKS = ("stamps", "even", "counted")
 GAIN = 0.8  # another clock than the stamps' must bring the roughness below this share
@@ -65,8 +65,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     Raises:
         UsageError: for a clock that is none, or that this recording does not have.
     """
-    if kind not in ("auto", *CLOCKS):
-        raise UsageError(f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'")
+    require(kind in ("auto", *CLOCKS), f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'", UsageError)
     clocks = {"stamps": (recording.t, np.ones(len(recording), dtype=bool), _step(recording.t))}
     if (even := _even_times(recording.t)) is not None:
         clocks["even"] = even

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, one_of
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
@@ -90,8 +90,7 @@ class Recording:
     jumps: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise MeasurementError(f"kind '{self.kind}' is none of {', '.join(KINDS)}", self.file)
+        one_of(self.kind, KINDS, "kind", MeasurementError, self.file)
         shape = (len(self.t), len(self.joint_names))
         for name in SERIES:
             value = getattr(self, name)

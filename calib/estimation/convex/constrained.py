@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from calib.arrays import frozen, shaped
-from calib.errors import CalibError
+from calib.errors import CalibError, require
 from calib.estimation.convex import definite
 from calib.estimation.convex.constraint_relations import from_free
 from calib.estimation.convex.definite import Definite
@@ -126,10 +126,8 @@ def _on_equalities(
     rank = int(np.sum(values > 1e-10 * values[0]))
     origin = right[:rank].T @ ((left[:, :rank].T @ (held / size)) / values[:rank])
     away = np.abs(scaled @ origin - held) / np.maximum(np.abs(held), size * max(float(np.abs(origin).max()), 1e-300))
-    if away.max() > 1e-8:
-        raise CalibError("equalities contradict each other: no point satisfies all of them")
-    if rank == p:
-        raise CalibError(f"equalities fix all {p} parameters: they leave nothing to estimate")
+    require(away.max() <= 1e-8, "equalities contradict each other: no point satisfies all of them")
+    require(rank != p, f"equalities fix all {p} parameters: they leave nothing to estimate")
     origin, basis = unit * origin, unit[:, None] * right[rank:].T
     reduced = retriangulate(np.column_stack([factor[:, :p] @ basis, factor[:, p] - factor[:, :p] @ origin]))
     found = minimise(reduced[: p - rank + 1], rows @ basis, rows @ origin + offset)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets, take
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 
 REGIONS = 20
 FOLDS = 5
@@ -124,8 +124,7 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
         "random": lambda: random_folds(measured, 10, seed),
         "poses": lambda: random_folds(measured, None, seed),
     }
-    if name not in ways:
-        raise UsageError(f"folds {name}: expected one of {', '.join(ways)}")
+    require(name in ways, f"folds {name}: expected one of {', '.join(ways)}", UsageError)
     return ways[name]()
 
 

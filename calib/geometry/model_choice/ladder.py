@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.errors import UsageError
+from calib.errors import UsageError, one_of
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import FoldStatistics, blind_folds, fold_statistics
@@ -126,8 +126,7 @@ def select_model(
     Raises:
         UsageError: for a model that does not exist.
     """
-    if model not in ("auto", *MODELS):
-        raise UsageError(f"model '{model}' is none of auto, {', '.join(MODELS)}")
+    one_of(model, ("auto", *MODELS), "model", UsageError)
     tell = progress or (lambda done, total, what: None)
     folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
     climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell, seed)

@@ -24,7 +24,7 @@ from calib.data.signals.decimation import Decimator, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
-from calib.errors import UsageError
+from calib.errors import UsageError, one_of
 from calib.identification.cases import Case
 from calib.identification.left_out.regimes import regimes
 from calib.identification.left_out.time_folds import CrossValidation
@@ -146,8 +146,7 @@ def select_friction(
             a step's name: that step at all joints, nothing else.
     """
     say = progress or (lambda words: None)
-    if wanted not in NAMES:
-        raise UsageError(f"friction '{wanted}' is none of {', '.join(NAMES)}")
+    one_of(wanted, NAMES, "friction", UsageError)
     say("friction: columns")
     sensed = candidates.torque_rows.sensed
     steps_tried = [name for name in STEPS if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]

@@ -32,7 +32,7 @@ from scipy.interpolate import CubicSpline
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm, added_inertia, standard
 from calib.dynamics.rigid_body import mass_matrix
-from calib.errors import CalibError
+from calib.errors import require
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import periods_per_sample, take
 from calib.identification.prediction import Dynamics
@@ -101,8 +101,7 @@ def replay(
         CalibError: where the rows are not the motors', or the loop is unstable.
     """
     model, n = dynamics.model, chain.n
-    if not model.torque_rows.with_motors:
-        raise CalibError(f"rows '{model.torque_rows.name}' do not hold all of the motors' torque")
+    require(model.torque_rows.with_motors, f"rows '{model.torque_rows.name}' do not hold all of the motors' torque")
     part = _stretch(case)
     motion = case.motion
     robot, left_out = _robot(dynamics, case)

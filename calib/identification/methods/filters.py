@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.errors import CalibError, CannotSimulate, Diverged
+from calib.errors import CalibError, CannotSimulate, Diverged, require
 from calib.estimation.linear import LinearFit
 from calib.estimation.sequential.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.identification.cases import Case
@@ -158,8 +158,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     for q, tau in _steps(case, part):
         belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
         belief, size = corrected(belief, q, n, seen)
-        if not np.isfinite(size):
-            raise Diverged("the filter's estimate is no longer finite", belief.mean)
+        require(np.isfinite(size), "the filter's estimate is no longer finite", Diverged, belief.mean)
         sizes.append(size / n)
     settled = sizes[len(sizes) // 4 :]
     return replace(

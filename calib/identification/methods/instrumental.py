@@ -26,7 +26,7 @@ from calib.data.signals.filtering import low_pass, slope
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError
+from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
 from calib.estimation import instrumental_variables
 from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
 from calib.estimation.linear import LinearFit, settled_std, wls
@@ -207,8 +207,7 @@ def identify_instrumental(
         NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where they led away.
         CannotSimulate: where the loop is unstable with the robot it starts from, or with an estimate and all near it.
     """
-    if method not in ROUNDS:
-        raise UsageError(f"method '{method}' is none of {', '.join(ROUNDS)}")
+    one_of(method, ROUNDS, "method", UsageError)
     if not model.torque_rows.motors_alone or not cases:
         raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
     task = _task(model, base, cases, decimator, ROUNDS[method], columns)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.errors import RobotError, suggestion
+from calib.errors import RobotError, require, suggestion
 from calib.robot.chain import AXES, Chain, Element
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import JointTag, Mimic, UrdfTree, transform_body
@@ -208,8 +208,7 @@ def _longest(tree: UrdfTree, base: str) -> str:
             if joint.name not in grippers
         ]
     most = max(best.values())
-    if most == 0:
-        raise RobotError(f"{tree.where}: no actuated joint hangs on '{base}'; choose another base (--base)")
+    require(most != 0, f"{tree.where}: no actuated joint hangs on '{base}'; choose another base (--base)", RobotError)
     found = [link for link, count in best.items() if count == most]
     found = [link for link in found if not any(_hangs(tree, other, link) for other in found if other != link)]
     if len(found) > 1:

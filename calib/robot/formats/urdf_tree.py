@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.errors import RobotError, suggestion
+from calib.errors import RobotError, require, suggestion
 from calib.robot.chain import Joint
 from calib.robot.formats.markup import Node, parse
 from calib.transforms import from_xyz_rpy
@@ -216,10 +216,8 @@ def _is_macro(node: Node) -> bool:
 def _fresh(node: Node, known: Iterable[str], where: str) -> str:
     """Return the name of a link or joint, which has to be there and new."""
     name = node.attributes.get("name", "")
-    if not name:
-        raise RobotError(f"{where}, line {node.line}: a <{node.tag}> without a name")
-    if name in known:
-        raise RobotError(f"{where}, line {node.line}: a second {node.tag} named '{name}'")
+    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name", RobotError)
+    require(name not in known, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
     return name
 
 
@@ -272,8 +270,7 @@ def _axis(node: Node, kind: str, place: str) -> np.ndarray:
         return np.array([1.0, 0.0, 0.0])
     axis = np.array([1.0, 0.0, 0.0]) if found is None else _floats(found, "xyz", "1 0 0", place)
     length = np.linalg.norm(axis)
-    if not length > 1e-9:
-        raise RobotError(f'{place}: its axis is zero; give a direction such as xyz="0 0 1"')
+    require(length > 1e-9, f'{place}: its axis is zero; give a direction such as xyz="0 0 1"', RobotError)
     return axis / length
 
 
@@ -363,5 +360,4 @@ def _check_loops(tree: UrdfTree) -> None:
         todo += [joint.child for joint in tree.below[link]]
     if lost := [link for link in tree.bodies if link not in reached]:
         raise RobotError(f"{tree.where}: links {', '.join(lost)} hang on each other in a loop; a URDF is a tree")
-    if not tree.bodies:
-        raise RobotError(f"{tree.where}: no <link> found")
+    require(tree.bodies, f"{tree.where}: no <link> found", RobotError)

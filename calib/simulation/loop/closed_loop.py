@@ -18,7 +18,7 @@ from scipy.linalg import solve_banded
 from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
-from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged
+from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
@@ -209,8 +209,7 @@ def simulate_many(
 
     values = shaped(parameters, (None, len(plant.parameters)), "parameters")
     own = [0] * len(values) if seeds is None else list(seeds)
-    if len(own) != len(values):
-        raise CalibError(f"{len(own)} seeds for {len(values)} parameter vectors")
+    require(len(own) == len(values), f"{len(own)} seeds for {len(values)} parameter vectors")
 
     def one(k: int) -> SimulatedRun | NotConverged:
         try:
@@ -310,8 +309,7 @@ def forward_dynamics(
     values = np.empty((0, count)) if parameters is None else shaped(parameters, (len(q), count), "parameters")
     layout = _layout_of(plant)
     failed = loop_kernels.forward_dynamics(*_packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
-    if failed >= 0:
-        raise CannotSimulate(f"sample {failed}: the inertia matrix is not positive definite")
+    require(failed < 0, f"sample {failed}: the inertia matrix is not positive definite", CannotSimulate)
     return out
 
 

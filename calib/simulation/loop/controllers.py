@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen, shaped
-from calib.errors import CalibError
+from calib.errors import CalibError, require
 from calib.simulation.loop.references import Reference
 
 
@@ -50,8 +50,7 @@ class Controller:
         for name in ("kp", "kd", "ki", "share", "limit", "windup"):
             value = np.broadcast_to(np.asarray(getattr(self, name), dtype=float), (n,))
             object.__setattr__(self, name, frozen(np.array(value)))
-        if self.delay < 0:
-            raise CalibError(f"a delay of {self.delay} control periods is none")
+        require(self.delay >= 0, f"a delay of {self.delay} control periods is none")
 
     @property
     def rows(self) -> np.ndarray:
