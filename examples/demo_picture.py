@@ -95,7 +95,7 @@ def draw(session: Session, verdict: str, figures: dict[str, float]) -> None:
     t, measured, predicted = (np.array(each, dtype=float).T for each in (curves.t, curves.measured, curves.predicted))
     row = int(np.argmax(np.linalg.norm(measured, axis=0)))
     with styled():
-        figure, (poses, torque) = sheet(1, 2, WIDE, 2.9, top=0.62, across=0.8)
+        figure, (poses, torque) = sheet(1, 2, WIDE, 2.9, head=0.3)
         place = np.arange(1, len(before) + 1)
         for errors, colour, name in ((before, BEFORE, "nominal"), (after, AFTER, "calibrated")):
             poses.plot(place, errors, "o", color=colour, markersize=4.0)

@@ -84,9 +84,9 @@ class DynamicsModel:
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: measured and predicted torques, autocorrelations, friction."""
-        from calib.procedure.report import dynamics_figures
+        from calib.procedure.report import charts, dynamics_figures
 
-        return dynamics_figures.figures(self.outcome)
+        return charts.figures(dynamics_figures.figures(self.outcome))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

@@ -82,6 +82,7 @@ class PoseSelection:
 
         There are none where the poses do not tell all parameters.
         """
+        from calib.procedure.report.charts import figure
         from calib.procedure.report.geometry_figures import predicted_map
         from calib.procedure.report.uncertainty_figures import outlook_figure
 
@@ -92,7 +93,7 @@ class PoseSelection:
             "predicted": lambda: predicted_map(look.poses.points, look.poses.spread),
             "outlook": lambda: outlook_figure(curve, own, "poses", "σ of the tool's position [mm]"),
         }
-        return {name: drawn[name]() for name in self.chosen.figures}
+        return {name: figure(drawn[name]()) for name in self.chosen.figures}
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""
@@ -170,10 +171,10 @@ class GeometryFit:
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures of the certificate by name."""
-        from calib.procedure.report import figures
+        from calib.procedure.report import charts, figures
         from calib.procedure.report.fit_report import collect
 
-        return {name: shown.make() for name, shown in figures.captioned(collect(self.outcome)).items()}
+        return {name: charts.figure(chart) for name, (chart, _) in figures.captioned(collect(self.outcome)).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

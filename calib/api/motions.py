@@ -45,9 +45,9 @@ class ExcitationDesign:
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: motion, tool path, search, front."""
-        from calib.procedure.report import motion_figures
+        from calib.procedure.report import charts, motion_figures
 
-        return motion_figures.design_figures(self.designed)
+        return charts.figures(motion_figures.design_figures(self.designed))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
@@ -85,9 +85,9 @@ class MotionPlan:
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: motion and speed profile."""
-        from calib.procedure.report import motion_figures
+        from calib.procedure.report import charts, motion_figures
 
-        return motion_figures.plan_figures(self.planned)
+        return charts.figures(motion_figures.plan_figures(self.planned))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from calib.folders import METRICS
-from calib.procedure.kinematic_stage.metrics import LadderStep
 from calib.procedure.report import geometry_figures
+from calib.procedure.report.charts import Chart, picture
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.page import Picture, Pictures
-from calib.procedure.report.style import HALF, WIDE, picture
+from calib.procedure.report.style import HALF, WIDE
 from calib.records import read_json
 
 if TYPE_CHECKING:  # the figures of a fit are drawn without loading the dynamics' modules
@@ -24,13 +21,7 @@ if TYPE_CHECKING:  # the figures of a fit are drawn without loading the dynamics
 
 DRAWN = 300  # points per curve of the excitation
 
-
-class _Captioned(NamedTuple):
-    """What makes a figure, what it shows in a sentence, and whether it takes the page's width."""
-
-    make: Callable[[], Figure]
-    caption: str
-    wide: bool = False
+Captioned = tuple[Chart, str]  # with what it shows, in a sentence
 
 
 def draw(report: Report) -> dict[str, Picture]:
@@ -38,70 +29,59 @@ def draw(report: Report) -> dict[str, Picture]:
     return {name: picture(*found) for name, found in captioned(report).items()}
 
 
-def captioned(report: Report) -> dict[str, _Captioned]:
-    """Return the figures by name; those that the data do not give are left out."""
-    result: dict[str, _Captioned] = {}
+def captioned(report: Report) -> dict[str, Captioned]:
+    """Return the charts of a report by name; those that the data do not give are left out."""
+    result: dict[str, Captioned] = {}
     proof = next((rows for rows in report.sets if rows.unseen), report.sets[0])
     label = f"{proof.poses} {'unseen' if proof.unseen else 'fitted'} poses ({proof.name})"
     for nature in ("position", "orientation", "distance"):
         if nature in proof.calibrated:
             sizes = [np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated)]
-            make = partial(geometry_figures.error_histogram, sizes[0], sizes[1], nature, report.noise.get(nature))
-            result[nature] = _Captioned(make, f"{nature.capitalize()} errors before and after, {label}; dashed: rms.")
+            chart = geometry_figures.error_histogram(sizes[0], sizes[1], nature, report.noise.get(nature))
+            result[nature] = chart, f"{nature.capitalize()} errors before and after, {label}; dashed: rms."
     rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
     if len(rungs) > 1:
-        result["ladder"] = _ladder(report, rungs)
+        chart = geometry_figures.ladder(
+            [rung.model for rung in rungs], [rung.parameters for rung in rungs],
+            [1e-3 * (rung.cross_validated_mm or 0.0) for rung in rungs], [not rung.note for rung in rungs],
+            report.noise.get("position"),
+        )  # fmt: skip
+        result["ladder"] = chart, "Models tried, by their cross-validated error. Filled: kept; open: left out."
     if report.singular_values:
-        make = partial(geometry_figures.singular_values, np.array(report.singular_values), report.rank)
+        chart = geometry_figures.singular_values(np.array(report.singular_values), report.rank)
         words = "Singular values of the scaled observation matrix: filled ones carry a parameter, open ones none."
-        result["singular_values"] = _Captioned(make, words)
+        result["singular_values"] = chart, words
     if proof.q:
         result |= _over_workspace(report, proof, label)
     for number, seen in enumerate(report.images, 1):
-        make = partial(geometry_figures.image_coverage, seen.size, np.array(seen.count), np.array(seen.rms))
+        chart = geometry_figures.image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
         words = f"Where in the image corners were seen, and how well they are predicted there ({seen.file})."
-        result["coverage" if number == 1 else f"coverage_{number}"] = _Captioned(make, words, True)
+        result["coverage" if number == 1 else f"coverage_{number}"] = chart, words
     arm = [row for row in report.parameters if row.group == "arm"]
     if arm:
         change = np.array([row.value - row.nominal for row in arm])
         sigma = np.array([row.sigma for row in arm])
         names, units = [row.name for row in arm], [row.unit for row in arm]
-        make = partial(geometry_figures.parameter_changes, names, units, change, sigma)
-        result["parameters"] = _Captioned(make, "What the fit changed in the arm. Grey: less than two sigmas.", True)
+        chart = geometry_figures.parameter_changes(names, units, change, sigma)
+        result["parameters"] = chart, "What the fit changed in the arm. Grey: less than two sigmas."
     if len(report.correlated.names) > 1:
-        matrix = np.array(report.correlated.matrix)
-        make = partial(geometry_figures.correlation_map, report.correlated.names, matrix, 0.0)
-        result["correlations"] = _Captioned(make, "Parameters that the data tell apart least.")
+        chart = geometry_figures.correlation_map(report.correlated.names, np.array(report.correlated.matrix), 0.0)
+        result["correlations"] = chart, "The most strongly correlated parameters."
     return result
 
 
-def _ladder(report: Report, rungs: Sequence[LadderStep]) -> _Captioned:
-    make = partial(
-        geometry_figures.ladder,
-        [rung.model for rung in rungs],
-        [rung.parameters for rung in rungs],
-        [1e-3 * (rung.cross_validated_mm or 0.0) for rung in rungs],
-        [not rung.note for rung in rungs],
-        report.noise.get("position"),
-    )
-    return _Captioned(make, "The ladder of models: error on rows left out. Filled: kept; open: left out.", True)
-
-
-def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, _Captioned]:
-    """Return the figures that need one error per pose: against the joints, and over the workspace."""
+def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, Captioned]:
+    """Return the charts that need one error per pose: against the joints, and over the workspace."""
     nature = "position" if "position" in proof.calibrated else "distance"
     before, after = (np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated))
     q, points = np.array(proof.q), np.array(proof.points)
-    joints = partial(geometry_figures.residuals_by_joint, q, before, after, report.joints, report.prismatic, nature)
+    joints = geometry_figures.residuals_by_joint(q, before, after, report.joints, report.prismatic, nature)
+    below = "; below: 95 % are expected within." if proof.expected else "."
     return {
-        "joints": _Captioned(
-            joints, f"Errors against each joint, {label}: a trend is something no parameter holds.", True
-        ),
-        "map": _Captioned(
-            partial(geometry_figures.error_map, points, after, expected=np.array(proof.expected)),
-            f"Remaining error over the workspace, {label}"
-            + ("; below: 95 % are expected within." if proof.expected else "."),
-            True,
+        "joints": (joints, f"Errors against each joint, {label}: a trend is an unmodelled effect."),
+        "map": (
+            geometry_figures.error_map(points, after, expected=np.array(proof.expected)),
+            f"Remaining error over the workspace, {label}{below}",
         ),
     }
 
@@ -134,13 +114,12 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     own = next(iter(unseen.fit.values()))
     sides = [[x or 0.0 for x in one.raw.relative_error_percent.joints] for one in (own, proof)]
     name, white = next(iter(unseen.autocorrelation.items()))
-    many = len(unseen.rows) > dynamics_figures.FEW
-    width = WIDE if many else HALF
-    bars = partial(dynamics_figures.errors_by_row, sides[0], sides[1], unseen.rows)
-    drawn = partial(dynamics_figures.autocorrelations, white.values, white.bound, unseen.rows, "What is left", width)
+    width = WIDE if len(unseen.rows) > dynamics_figures.FEW else HALF
+    bars = dynamics_figures.errors_by_row(sides[0], sides[1], unseen.rows)
+    drawn = dynamics_figures.autocorrelations(white.values, white.bound, unseen.rows, "Residuals", width)
     shares = f"Share of each torque that the model leaves, on the training motion and on {where}."
-    rest = f"Autocorrelation of what is left below the band on {name}; dashed: white noise."
-    return [picture(bars, shares, many), picture(drawn, rest, many)]
+    rest = f"Autocorrelation of the residuals below the band on {name}; dashed: white noise."
+    return [picture(bars, shares), picture(drawn, rest)]
 
 
 def _torques(unseen: UnseenReport) -> list[Picture]:
@@ -156,9 +135,8 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
         )
         raw = {**unseen.fit, **unseen.validation}[curves.name].raw.relative_error_percent
         title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
-        make = partial(dynamics_figures.torques, t, measured, predicted, unseen.rows, unseen.units, title, raw.joints)
-        words = f"Torques on {curves.name}, {seen}: measured, predicted, and what is left."
-        result.append(picture(make, words, True))
+        chart = dynamics_figures.torques(t, measured, predicted, unseen.rows, unseen.units, title, raw.joints)
+        result.append(picture(chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."))
     return result
 
 
@@ -184,7 +162,7 @@ def _excitation(excitation: Path) -> list[Picture]:
     )
     names, none = motion.joint_names, np.full(q.shape[1], np.inf)
     series = [(each, -none, none, title) for each, title in ((q, "position"), (v, "velocity"))]
-    return [picture(partial(motion_figures.motion_sheet, t, series, ("rad", "rad/s"), names), words, True)]
+    return [picture(motion_figures.motion_sheet(t, series, ("rad", "rad/s"), names), words)]
 
 
 def _significance(found: DynamicReport) -> Picture:
@@ -194,6 +172,5 @@ def _significance(found: DynamicReport) -> Picture:
     known = [row for row in found.estimate if row.sigma]
     sigma = np.array([row.sigma or np.nan for row in known])
     values = np.array([row.value for row in known])
-    make = partial(dynamics_figures.significance, [row.name for row in known], values, sigma)
-    words = "How far each parameter is from zero, in its σ; grey, below the dashed line: not told from zero."
-    return picture(make, words, True)
+    chart = dynamics_figures.significance([row.name for row in known], values, sigma)
+    return picture(chart, "How far each parameter is from zero, in its σ; grey: not significant.")

@@ -7,22 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from calib.procedure.report.style import (
-    AFTER,
-    BEFORE,
-    HALF,
-    MARK,
-    QUIET,
-    WIDE,
-    legend,
-    room,
-    save_all,
-    sheet,
-    styled,
-    thinned,
-)
+from calib.procedure.report.charts import Chart, Level, Line, Panel, Words, save_all
+from calib.procedure.report.style import AFTER, BEFORE, HALF, MARK, QUIET
 from calib.procedure.report.uncertainty_figures import outlook_figure
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
@@ -41,8 +28,8 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 def motion_sheet(
     times: np.ndarray, series: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], units: Sequence[str],
     names: Sequence[str],
-) -> Figure:  # fmt: skip
-    """Draw series of every joint, a line per joint and a column per series, with their limits dashed.
+) -> Chart:  # fmt: skip
+    """Return series of every joint, a line per joint and a column per series, with their limits dashed.
 
     Args:
         times: (N,) [s].
@@ -51,33 +38,24 @@ def motion_sheet(
         names: of the n joints.
     """
     n, columns = len(names), len(series)
-    labels = [name.replace("_", "_\n") if len(name) > 12 else name for name in names]
-    title = _nearest(series, names)
-    top = 0.5 if title else 0.25
-    left = room(["-0.00"], 6.5) + 0.16 + 0.1 * max(label.count("\n") for label in labels)
-    with styled():
-        figure, axes = sheet(
-            n, columns, WIDE, 0.35 + top + 0.75 * n, left=left, across=0.42, between=0.12, top=top, bottom=0.36
+    panels = []
+    for j, k in ((j, k) for j in range(n) for k in range(columns)):
+        values, lower, upper, quantity = series[k]
+        last = j == n - 1
+        bounds = [Level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
+        label = names[j].replace("_", "_\n") if len(names[j]) > 12 else names[j]
+        panels.append(
+            Panel(
+                [Line(times, values[:, j]), *bounds],
+                f"{quantity} [{units[k]}]" if j == 0 else "",
+                "time [s]" if last else "",
+                label if k == 0 else "",
+                xlim=(times[0], times[-1]),
+                ticks=4,
+                bare="" if last else "x",
+            )
         )
-        for j, k in np.ndindex(n, columns):
-            values, lower, upper, quantity = series[k]
-            axis = axes[j * columns + k]
-            axis.plot(*thinned(times, values[:, j]), color=AFTER, linewidth=0.8)
-            for bound in (lower[j], upper[j]):
-                if np.isfinite(bound):
-                    axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
-            axis.set_xlim(times[0], times[-1])
-            axis.locator_params(axis="y", nbins=3)
-            axis.locator_params(axis="x", nbins=5)
-            axis.tick_params(labelsize=6.5, labelbottom=j == n - 1, pad=2.0)
-            if j == 0:
-                axis.set_title(f"{quantity} [{units[k]}]", fontsize=7.5, fontweight="normal", pad=3.0)
-            if k == 0:
-                axis.set_ylabel(labels[j], fontsize=7, labelpad=2.0)
-            if j == n - 1:
-                axis.set_xlabel("time [s]", fontsize=7, labelpad=2.0)
-        legend(figure, None, title)
-    return figure
+    return Chart(panels, 0.7 + 0.75 * n, columns, title=_nearest(series, names))
 
 
 def _nearest(series: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], names: Sequence[str]) -> str:
@@ -92,8 +70,8 @@ def _nearest(series: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], n
     return words
 
 
-def _motion_figure(designed: Designed) -> Figure:
-    """Draw q, v, a and τ of every joint over one period, with their limits dashed."""
+def _motion_figure(designed: Designed) -> Chart:
+    """Return q, v, a and τ of every joint over one period, with their limits dashed."""
     motion = _motion(designed)
     states = zip((motion.q, motion.v, motion.a), (_limits(designed, order) for order in range(3)), TITLES)
     rows = [(values, lower, upper, title) for values, (lower, upper), title in states]
@@ -105,49 +83,37 @@ def _motion_figure(designed: Designed) -> Figure:
     return motion_sheet(motion.times, rows, units, designed.inputs.chain.joint_names)
 
 
-def _path_figure(designed: Designed) -> Figure:
-    """Draw the tool's path from above and from the side."""
+def _path_figure(designed: Designed) -> Chart:
+    """Return the tool's path from above and from the side."""
     tool = sweep(designed.inputs.chain, _motion(designed).q).position
-    with styled():
-        figure, axes = sheet(1, 2, WIDE, 3.4, across=0.6)
-        for axis, (i, j), title in (
-            (axes[0], (0, 1), "the tool's path from above"),
-            (axes[1], (0, 2), "from the side"),
-        ):
-            axis.plot(tool[i], tool[j], color=AFTER, linewidth=0.9)
-            axis.plot(tool[i, :1], tool[j, :1], "o", color=MARK, markersize=4)
-            axis.annotate("start", (tool[i, 0], tool[j, 0]), xytext=(4, 4), textcoords="offset points", fontsize=7)
-            axis.plot([0.0], [0.0], "+", color=QUIET)
-            axis.annotate("base", (0.0, 0.0), xytext=(4, 4), textcoords="offset points", fontsize=7)
-            axis.set_aspect("equal", adjustable="datalim")
-            axis.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", title=title)
-            axis.grid(True)
-    return figure
+    panels = [
+        Panel(
+            [
+                Line(tool[0], tool[j], form="-"), Line(tool[0, :1], tool[j, :1], "o", MARK),
+                Words("start", tool[0, 0], tool[j, 0]), Line([0.0], [0.0], "+", QUIET), Words("base", 0.0, 0.0),
+            ],
+            title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True,
+        )
+        for j, title in ((1, "the tool's path from above"), (2, "from the side"))
+    ]  # fmt: skip
+    return Chart(panels, 3.2, 2)
 
 
-def _history_figure(designed: Designed) -> Figure:
-    """Draw the improving feasible motions of the best start."""
+def _history_figure(designed: Designed) -> Chart:
+    """Return the improving feasible motions of the best start."""
     history = np.asarray(designed.found.history, dtype=float)
-    with styled():
-        figure, (axis,) = sheet(width=HALF, height=2.3)
-        axis.plot(history, color=AFTER, linewidth=1.0)
-        axis.set(xlabel="improving feasible motions", ylabel="objective")
-        if len(history):
-            axis.set_title(f"{history[0]:.4g} at first, {history[-1]:.4g} at last")
-    return figure
+    title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
+    curve = Line(np.arange(len(history)), history)
+    return Chart([Panel([curve], title, "improving feasible motions", "objective")], 2.2, width=HALF)
 
 
-def _front_figure(front: Front) -> Figure:
-    """Draw the trade-off the engineer chooses from; open points are beaten by others."""
-    with styled():
-        figure, (axis,) = sheet(width=HALF, height=2.7)
-        good = front.values[front.best]
-        good = good[np.argsort(good[:, 1])]
-        axis.plot(good[:, 1], good[:, 0], "o-", color=AFTER, linewidth=0.9, markersize=4)
-        rest = front.values[~front.best]
-        axis.plot(rest[:, 1], rest[:, 0], "o", color=BEFORE, markerfacecolor="none", markersize=4)
-        axis.set(xlabel=front.names[1], ylabel=front.names[0], title=f"{len(good)} motions to choose from")
-    return figure
+def _front_figure(front: Front) -> Chart:
+    """Return the trade-off the engineer chooses from; open points are beaten by others."""
+    good = front.values[front.best]
+    good, rest = good[np.argsort(good[:, 1])], front.values[~front.best]
+    points = [Line(good[:, 1], good[:, 0], "o-", size=4.0), Line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
+    title = f"{len(good)} motions to choose from"
+    return Chart([Panel(points, title, front.names[1], front.names[0])], 2.5, width=HALF)
 
 
 def _motion(designed: Designed) -> Any:
@@ -164,7 +130,7 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
     return -none, none
 
 
-def design_figures(designed: Designed) -> dict[str, Figure]:
+def design_figures(designed: Designed) -> dict[str, Chart]:
     """Return the figures of a designed motion by name: motion, tool path, search, front and outlook if any."""
     figures = {"motion": _motion_figure(designed), "path": _path_figure(designed), "history": _history_figure(designed)}
     if designed.front is not None and len(designed.front.values):
@@ -176,7 +142,7 @@ def design_figures(designed: Designed) -> dict[str, Figure]:
     return figures
 
 
-def plan_figures(planned: Planned) -> dict[str, Figure]:
+def plan_figures(planned: Planned) -> dict[str, Chart]:
     """Return the figures of a planned motion by name: motion and speed profile."""
     return {"motion": _plan_figure(planned), "profile": _profile_figure(planned)}
 
@@ -191,8 +157,8 @@ def write_plan(planned: Planned, folder: Path) -> None:
     save_all(plan_figures(planned), folder)
 
 
-def _plan_figure(planned: Planned) -> Figure:
-    """Draw q, v, a and τ of every joint with their limits dashed."""
+def _plan_figure(planned: Planned) -> Chart:
+    """Return q, v, a and τ of every joint with their limits dashed."""
     track, limits = planned.track, planned.limits
     rows = [
         (track.q, planned.lower, planned.upper, "position"),
@@ -205,26 +171,20 @@ def _plan_figure(planned: Planned) -> Figure:
     return motion_sheet(track.times, rows, units, planned.chain.joint_names)
 
 
-def _profile_figure(planned: Planned) -> Figure:
-    """Draw the speed along the path, and which limit is nearest to being reached."""
-    with styled():
-        figure, (above, below) = sheet(2, 1, WIDE, 3.8, top=0.4, between=0.2)
-        start = 0.0
-        for one in planned.timings:
-            times = start + one.profile.times
-            above.plot(times, np.sqrt(one.profile.x), color=AFTER, linewidth=0.9)
-            instants = np.repeat(times[:-1], len(one.sampled.s) // (len(times) - 1))
-            for (name, used), color in zip(one.used.items(), (BEFORE, AFTER, QUIET)):
-                label = name if start == 0.0 else None
-                below.plot(instants, used.max(axis=1), color=color, linewidth=0.8, label=label)
-            start = float(times[-1])
-        below.axhline(1.0, color=MARK, linewidth=0.6, linestyle="--")
-        above.set(ylabel="speed along the path")
-        below.set(xlabel="time [s]", ylabel="share of the limit", ylim=(0, 1.05))
-        above.tick_params(labelbottom=False)
-        below.set_xlim(above.get_xlim())
-        share = np.average(
-            [one.active_share for one in planned.timings], weights=[one.duration for one in planned.timings]
-        )
-        legend(figure, below, f"{start:.3g} s, with a limit all but reached for {share:.0%} of them")
-    return figure
+def _profile_figure(planned: Planned) -> Chart:
+    """Return the speed along the path, and which limit is nearest to being reached."""
+    above, below, start = [], [], 0.0
+    for one in planned.timings:
+        times = start + one.profile.times
+        above.append(Line(times, np.sqrt(one.profile.x)))
+        instants = np.repeat(times[:-1], len(one.sampled.s) // (len(times) - 1))
+        for (name, used), colour in zip(one.used.items(), (BEFORE, AFTER, QUIET)):
+            below.append(Line(instants, used.max(axis=1), colour=colour, label=name if start == 0.0 else ""))
+        start = float(times[-1])
+    below.append(Level(1.0))
+    share = np.average([one.active_share for one in planned.timings], weights=[one.duration for one in planned.timings])
+    panels = [
+        Panel(below, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),
+        Panel(above, x="time [s]", y="speed along the path", xlim=(0.0, start)),
+    ]
+    return Chart(panels, 3.8, title=f"{start:.3g} s, with a limit all but reached for {share:.0%} of them")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import files
 from calib.data.poses.pixels import Pixels
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.procedure.kinematic_stage import selection
@@ -67,10 +68,11 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
     outlook = chosen.outlook.poses
     if session.plots and np.isfinite(outlook.rms):
+        from calib.procedure.report.charts import picture
         from calib.procedure.report.geometry_figures import predicted_map
-        from calib.procedure.report.style import save
 
-        save(predicted_map(outlook.points, outlook.spread), session.path(PREDICTED))
+        chart = predicted_map(outlook.points, outlook.spread)
+        files.write(session.path(PREDICTED), picture(chart, "").png)
     unseen = _unseen(session, robot_file, chain, wanted.validation)
     kept = (*chosen.kept(), *(f"{words}: {number}" for words, number in selection.predicted_rows(chosen)))
     return Plan(q, unseen, words, kept, record, chosen.run, chosen.prediction)

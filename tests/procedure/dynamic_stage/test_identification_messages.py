@@ -24,7 +24,7 @@ from calib.identification.scores import PredictionErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
-from calib.procedure.report import console, dynamics_figures, dynamics_section
+from calib.procedure.report import charts, console, dynamics_figures, dynamics_section
 from calib.robot.calibrated import CalibratedChain
 from calib.units import motion_units
 
@@ -80,7 +80,7 @@ def test_figures_have_units_at_their_axes():
         repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
         inputs=inputs,
     )  # fmt: skip
-    figure = dynamics_figures.file_torques(one, np.asarray(one.target), outcome)
+    figure = charts.figure(dynamics_figures.file_torques(one, np.asarray(one.target), outcome))
     units = [f"{joint.name} [{unit}]: 5 % left" for joint, unit in zip(joints, ("N", "N m", "N m"))]
     assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"

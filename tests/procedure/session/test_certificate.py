@@ -20,7 +20,7 @@ from sessions import go_on
 from without_figures import run
 
 from calib.errors import CalibError
-from calib.procedure.report import certificate, figures, fit_report, geometry_figures, style
+from calib.procedure.report import certificate, charts, figures, fit_report, geometry_figures, style
 from calib.procedure.session.folder import Session
 
 
@@ -131,7 +131,8 @@ def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Pat
 
 def test_names_of_correlated_parameters_do_not_overlap() -> None:
     names = [f"shoulder_lift_joint.offset cos {k} shoulder_lift_joint" for k in range(12)]
-    figure = geometry_figures.correlation_map(names, 0.5 + 0.5 * np.eye(12), 0.0)
+    figure = charts.figure(geometry_figures.correlation_map(names, 0.5 + 0.5 * np.eye(12), 0.0))
+    figure.draw_without_rendering()
     axes = figure.axes[0].get_position()
     inches = axes.height * figure.get_figheight(), axes.width * figure.get_figwidth()
     assert min(inches) / len(names) > 6.5 / 72.0, "a line per name"
@@ -161,7 +162,7 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
         geometry_figures.ladder(["frames", "geometry"], [12, 34], [5e-3, 1e-3], [True, True], 1e-4),
         geometry_figures.correlation_map(names, np.eye(20)),
     ]
-    for number, figure in enumerate(drawn):
+    for number, figure in enumerate(map(charts.figure, drawn)):
         assert isinstance(figure, Figure)
         path = style.save(figure, tmp_path / f"{number}.png", dpi=40)
         assert path.read_bytes()[:4] == b"\x89PNG"
@@ -173,7 +174,9 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
 
 
 def test_a_figure_is_drawn_the_same_twice() -> None:
-    one, two = (style.png(geometry_figures.singular_values(np.array([2.0, 1.0, 1e-12]), 2)) for _ in range(2))
+    one, two = (
+        style.png(charts.figure(geometry_figures.singular_values(np.array([2.0, 1.0, 1e-12]), 2))) for _ in range(2)
+    )
     assert one == two
 
 
@@ -181,7 +184,7 @@ def test_a_figure_is_drawn_the_same_twice() -> None:
 def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
     """Matplotlib would read what stands between two of them as mathematics, and fail where it is none."""
     changes, units = np.array([1e-3, 2e-3]), ["m", "rad"]
-    figure = geometry_figures.parameter_changes([name, name], units, changes, changes / 9.0)
+    figure = charts.figure(geometry_figures.parameter_changes([name, name], units, changes, changes / 9.0))
     assert style.png(figure, dpi=40)[:4] == b"\x89PNG"
     labels = [label for axes in figure.axes for label in axes.get_yticklabels()]
     assert [label.get_text() for label in labels] == [name, name] and not any(
@@ -191,7 +194,7 @@ def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
 
 def test_paper_is_white_and_peaks_are_kept() -> None:
     picture = np.asarray(
-        Image.open(io.BytesIO(style.png(geometry_figures.singular_values(np.ones(3), 3)))).convert("RGB")
+        Image.open(io.BytesIO(style.png(charts.figure(geometry_figures.singular_values(np.ones(3), 3))))).convert("RGB")
     )
     assert (picture[0, 0] == 255).all() and (picture == 255).mean() > 0.8
     t = np.linspace(0.0, 1.0, 100_000)

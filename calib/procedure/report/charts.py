@@ -1,0 +1,336 @@
+"""Figures as values: a `Chart` is a grid of `Panel`s, a panel some layers over two axes; `figure` draws them.
+
+Layers are lines, bars, marked levels, words, coloured dots, heat maps, histograms and boxes: nine ways to show numbers.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullLocator
+
+from calib import files
+from calib.procedure.report import style
+from calib.procedure.report.page import Picture
+from calib.procedure.report.style import AFTER, INK, MARK, QUIET, WIDE, label_ticks, log_axis
+
+SIZE = 16.0  # of a coloured dot [pt²]
+
+
+class Layer(Protocol):
+    """Something that a panel shows."""
+
+    def draw(self, axes: Axes) -> None:
+        """Draw onto axes whose scales are set."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A curve or points (k,), in matplotlib's letters (``-``, ``o``, ``o-``); `spread` (k,): half lengths of bars."""
+
+    x: Any
+    y: Any
+    form: str = "-"
+    colour: str = AFTER
+    width: float = 0.9
+    size: float = 3.5
+    hollow: bool = False
+    label: str = ""
+    spread: Any = None
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it, long curves thinned."""
+        x, y = np.asarray(self.x, dtype=float), np.asarray(self.y, dtype=float)
+        if self.form == "-":
+            x, y = style.thinned(x, y)
+        axes.errorbar(
+            x, y, self.spread, fmt=self.form, color=self.colour, linewidth=self.width, markersize=self.size,
+            markerfacecolor="white" if self.hollow else self.colour, label=self.label,
+            markeredgewidth=0.8 if self.hollow or self.form == "+" else 0.0,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """Bars (k,) from `base` at 0, 1, …, in one colour or one each, sideways or upright, with bars of error or none."""
+
+    values: Any
+    colours: Any = AFTER
+    upright: bool = False
+    shift: float = 0.0
+    thick: float = 0.7
+    base: float = 0.0
+    spread: Any = None
+    label: str = ""
+
+    def draw(self, axes: Axes) -> None:
+        """Draw them."""
+        values = np.asarray(self.values, dtype=float)
+        place = np.arange(len(values)) + self.shift
+        kind, error = (axes.bar, "yerr") if self.upright else (axes.barh, "xerr")
+        bars: Any = {error: self.spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
+        given = (values - self.base, self.thick, self.base)
+        kind(place, *given, color=self.colours, label=self.label, **(bars if self.spread is not None else {}))
+
+
+@dataclass(frozen=True)
+class Level:
+    """A dashed line across the panel, horizontal or upright; words beside an upright one stand at this height."""
+
+    at: float
+    colour: str = MARK
+    form: str = "--"
+    upright: bool = False
+    words: str = ""
+    height: float = 0.98
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it."""
+        (axes.axvline if self.upright else axes.axhline)(self.at, color=self.colour, linewidth=0.8, linestyle=self.form)
+        if not self.words:
+            return
+        where = axes.transAxes.inverted().transform(axes.transData.transform((self.at, self.at)))
+        right = not self.upright or where[0] < 0.6
+        point, frame = ((self.at, self.height), ("data", "axes fraction"))
+        if not self.upright:
+            point, frame = (0.0, self.at), ("axes fraction", "data")
+        axes.annotate(
+            self.words, point, xycoords=frame, xytext=(3 if right else -3, 0 if self.upright else 1),
+            textcoords="offset points", color=self.colour, va="top" if self.upright else "bottom",
+            ha="left" if right else "right",
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Words:
+    """Words at a point, moved by an offset [pt]."""
+
+    words: str
+    x: float
+    y: float
+    offset: tuple[float, float] = (4, 4)
+    colour: str = INK
+    size: float = 7.0
+    across: str = "left"
+    along: str = "baseline"
+
+    def draw(self, axes: Axes) -> None:
+        """Write them."""
+        axes.annotate(
+            self.words, (self.x, self.y), self.offset, textcoords="offset points", color=self.colour,
+            fontsize=self.size, ha=self.across, va=self.along,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """Points (k,) coloured by their values (k,) up to `most`, which a scale explains where it has a `unit`."""
+
+    x: Any
+    y: Any
+    values: Any
+    most: float
+    unit: str = ""
+
+    def draw(self, axes: Axes) -> None:
+        """Draw them, the largest values on top."""
+        order = np.argsort(self.values)
+        x, y, values = (np.asarray(each)[order] for each in (self.x, self.y, self.values))
+        drawn = axes.scatter(
+            x, y, SIZE, values, cmap="cividis_r", vmin=0.0, vmax=self.most, edgecolors=QUIET, linewidths=0.25
+        )
+        if self.unit:
+            _scale(axes, drawn, self.unit, extend="max" if values[-1] > self.most else "neither")
+
+
+@dataclass(frozen=True, eq=False)
+class Heat:
+    """A map (rows, columns) of values, row 0 above; NaN stays white.
+
+    Attributes:
+        extent: left, right, bottom, top; by default cell k is at k.
+        limits: of the colours; from 0 by default.
+        written: whether values stand in their cells.
+    """
+
+    values: Any
+    unit: str = ""
+    extent: tuple[float, float, float, float] | None = None
+    limits: tuple[float, float | None] = (0.0, None)
+    colours: str = "cividis_r"
+    written: bool = False
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it, and its scale."""
+        low, high = self.limits
+        drawn = axes.imshow(
+            self.values, self.colours, vmin=low, vmax=high, extent=self.extent, interpolation="nearest",
+            aspect="equal" if self.extent else "auto",
+        )  # fmt: skip
+        for (i, j), value in np.ndenumerate(self.values) if self.written else ():
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=5.5, color=_letters(value))
+        _scale(axes, drawn, self.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """Counts (k,) between edges (k + 1,)."""
+
+    counts: Any
+    edges: Any
+    colour: str = AFTER
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it."""
+        axes.stairs(self.counts, self.edges, fill=True, color=self.colour, alpha=0.9)
+        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Values (k,) at a place of the y axis: quartiles and median, 5th and 95th percentile, points beyond."""
+
+    values: Any
+    place: float
+    colour: str = AFTER
+
+    def draw(self, axes: Axes) -> None:
+        """Draw it."""
+        axes.boxplot(
+            [self.values], positions=[self.place], orientation="horizontal", whis=(5, 95), widths=0.56,
+            patch_artist=True, manage_ticks=False, boxprops={"facecolor": self.colour, "linewidth": 0},
+            medianprops={"color": "white", "linewidth": 1.4}, whiskerprops={"color": QUIET}, capprops={"linewidth": 0},
+            flierprops={"marker": ".", "markersize": 2.0, "markeredgecolor": QUIET},
+        )  # fmt: skip
+
+
+def _letters(value: float) -> str:
+    return "white" if abs(value) > 0.6 else INK
+
+
+def _scale(axes: Axes, drawn: Any, unit: str, **options: Any) -> None:
+    scale = axes.get_figure().colorbar(drawn, ax=axes, pad=0.02, aspect=30, **options)  # type: ignore[union-attr]
+    scale.ax.set_title(unit, fontsize=7.0, fontweight="normal")
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Layers over two axes.
+
+    Attributes:
+        layers: drawn in their order.
+        title, x, y: words at the top and at the axes.
+        xlim, ylim: limits, or what the layers need.
+        log: letters of the axes that are logarithmic (their limits are needed).
+        xnames, ynames: labels at 0, 1, … instead of numbers; x names of one line stand upright.
+        grid: ``x``, ``y``, ``both`` or none.
+        equal: one scale for both axes.
+        bare: letters of the axes whose labels are left out, since a neighbour has them.
+        symlog: the y axis is linear up to there from zero, and logarithmic beyond; 0: all linear.
+        ticks: at most about so many numbers at an axis.
+    """
+
+    layers: Sequence[Layer]
+    title: str = ""
+    x: str = ""
+    y: str = ""
+    xlim: tuple[float, float] | None = None
+    ylim: tuple[float, float] | None = None
+    log: str = ""
+    xnames: Sequence[str] | None = None
+    ynames: Sequence[str] | None = None
+    grid: str = ""
+    equal: bool = False
+    bare: str = ""
+    symlog: float = 0.0
+    ticks: int = 0
+
+    def draw(self, axes: Axes) -> None:
+        """Draw the panel."""
+        axes.set(title=self.title, xlabel=self.x, ylabel=self.y)
+        for axis, names, limits in ((axes.xaxis, self.xnames, self.xlim), (axes.yaxis, self.ynames, self.ylim)):
+            if limits:
+                axes.set(**{f"{axis.axis_name}lim": limits})
+            if names is not None:
+                turned = axis is axes.xaxis and not any("\n" in name for name in names)
+                label_ticks(axis, range(len(names)), names, 5.0 if len(names) > 60 else 6.5, 90 * turned)
+                axes.set(**{f"{axis.axis_name}lim": (-0.6, len(names) - 0.4)})
+            elif axis.axis_name in self.log and limits:
+                log_axis(axis, *limits)
+            elif self.ticks:
+                axes.locator_params(axis.axis_name, nbins=self.ticks)  # type: ignore[arg-type]
+        if self.ynames is not None:
+            axes.invert_yaxis()
+        if self.symlog:
+            axes.set_yscale("symlog", linthresh=self.symlog)
+            axes.yaxis.set(major_formatter=lambda value, _: style.number(value), minor_locator=NullLocator())
+        if self.equal:
+            axes.set_aspect("equal", adjustable="datalim")
+        for layer in self.layers:
+            layer.draw(axes)
+        if self.grid:
+            axes.grid(axis=self.grid)  # type: ignore[arg-type]
+        axes.tick_params(labelbottom="x" not in self.bare, labelleft="y" not in self.bare)
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Panels row by row.
+
+    Attributes:
+        panels: at least one.
+        height: of the figure [in].
+        columns: panels in a row.
+        width: of the figure [in].
+        title: of the whole, at its head; the labels of the first panel's layers stand there, too.
+    """
+
+    panels: Sequence[Panel]
+    height: float
+    columns: int = 1
+    width: float = WIDE
+    title: str = ""
+
+
+def figure(chart: Chart) -> Figure:
+    """Return a chart drawn by matplotlib, without a window."""
+    with style.styled(quiet_titles=bool(chart.title)):
+        rows = -(-len(chart.panels) // chart.columns)
+        result, axes = style.sheet(rows, chart.columns, chart.width, chart.height, 0.25 if chart.title else 0.0)
+        for panel, place in zip(chart.panels, axes):
+            panel.draw(place)
+        for place in axes[len(chart.panels) :]:
+            place.set_axis_off()
+        if chart.title:
+            style.legend(result, axes[0], chart.title)
+    return result
+
+
+def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
+    """Return charts by name, drawn."""
+    return {name: figure(chart) for name, chart in charts.items()}
+
+
+def picture(chart: Chart, caption: str) -> Picture:
+    """Return a chart for a page; one that was drawn before is taken again: a certificate shows what its steps drew."""
+    return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF)
+
+
+@lru_cache(maxsize=32)
+def _drawn(chart: bytes) -> bytes:
+    return style.png(figure(pickle.loads(chart)))
+
+
+def save_all(charts: Mapping[str, Chart], folder: Path) -> None:
+    """Write charts into a folder, as ``plot_<name>.png``."""
+    for name, chart in charts.items():
+        files.write(folder / f"plot_{name}.png", picture(chart, "").png)
