@@ -20,6 +20,7 @@ HOMES = {
     "numba": [
         "calib.dynamics.gradient_kernels",
         "calib.dynamics.kernels",
+        "calib.dynamics.shape_kernels",
         "calib.mechanism.closure_kernels",
         "calib.robot.capsule_kernels",
         "calib.simulation.loop.loop_kernels",

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.dynamics.shapes import SHAPES, V0, Joined, Shape
+from calib.dynamics.shapes import CODES, SHAPES, V0, Joined, Shape
 from calib.errors import CalibError, one_of, require
 
 Motion = tuple[tuple[int, float], ...]
@@ -86,7 +86,29 @@ class DriveTerm:
         """
         for k, (row, motion) in enumerate(self.acts):
             seen = _join(self, motion, motions, states[k] if self.form.remembers else None)
-            yield row, self.form.values(seen, self.settings)
+            yield row, self.values(seen)
+
+    def values(self, seen: Joined) -> np.ndarray:
+        """Return the column (N,) at a motion, per unit of the parameter."""
+        if self.shape == "acceleration":
+            return seen.a
+        found = self._evaluated(seen)[0]
+        return found * np.abs(seen.load) if self.form.loaded and seen.load is not None else found
+
+    def slopes(self, seen: Joined) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the slopes of the column by x, v (N,) and a."""
+        _, by_x, by_v = self._evaluated(seen)
+        return by_x, by_v, float(self.shape == "acceleration")
+
+    def _evaluated(self, seen: Joined) -> np.ndarray:
+        """Return value and slopes by x and v (3, N)."""
+        from calib.dynamics import shape_kernels
+
+        acts, out = np.zeros((1, 8)), np.empty((3, len(seen.v)))
+        acts[0, 1 : 1 + len(self.settings)] = self.settings
+        series = (seen.x, seen.v, seen.v if seen.state is None else seen.state)
+        shape_kernels.fill(CODES[self.shape], acts, *map(np.ascontiguousarray, series), out)
+        return out
 
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
@@ -184,10 +206,10 @@ def slopes(
 ) -> None:
     """Add the slopes of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
     for weight, one in zip(weights, terms, strict=True):
-        if one.form.slopes is None:
+        if not one.form.slopes:
             raise CalibError(f"term '{one.name}' ({one.shape}) depends on the past or on torques: it has no slopes")
         for row, motion in one.acts:
-            parts = one.form.slopes(_join(one, motion, [*motions, None], None), one.settings)
+            parts = one.slopes(_join(one, motion, [*motions, None], None))
             for target, part in zip(out, parts):
                 for joint, share in motion:
                     target[joint] += share * weight[row] * part

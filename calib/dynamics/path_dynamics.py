@@ -24,9 +24,6 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
 
-AFFINE = ("acceleration", "one", "position")  # shapes that Proposition 1 holds for; all others are friction
-# which setting smooths or delays Coulomb's sign
-SMOOTHED = {"sign": 0, "dead": 0, "stribeck": 2, "load": 0, "presliding": 1}
 MIXED = 1e-6  # of a column, beyond which friction counts as regrouped with something else
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -73,7 +70,7 @@ class PathDynamics:
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the friction torques (N, n); friction with memory (stop operators) counts as fully stressed."""
-        rubbing = [k for k, one in enumerate(self.terms) if one.shape not in AFFINE]
+        rubbing = [k for k, one in enumerate(self.terms) if one.form.friction]
         loaded = any(self.terms[k].form.loaded for k in rubbing)
         load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a) if loaded else None
         return self._drives(rubbing, q, v, a, load)
@@ -98,7 +95,7 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     _require_torques(model)
     rubbing = _is_friction(model)
     first = model.inertial
-    without = replace(model, terms=tuple(one for one in model.columns if one.shape in AFFINE))
+    without = replace(model, terms=tuple(one for one in model.columns if not one.form.friction))
     return PathDynamics(
         without.regressor, values[~rubbing], *_valued(model, values), model.bodies, np.array(values[:first])
     )
@@ -132,7 +129,7 @@ def _require_torques(model: IdentificationModel) -> None:
 def _is_friction(model: IdentificationModel) -> np.ndarray:
     """Tell which of the p columns depend on speed."""
     bodies = np.zeros(model.inertial, dtype=bool)
-    return np.concatenate([bodies, np.array([one.shape not in AFFINE for one in model.columns], dtype=bool)])
+    return np.concatenate([bodies, np.array([one.form.friction for one in model.columns], dtype=bool)])
 
 
 def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[DriveTerm, ...], np.ndarray]:
@@ -143,11 +140,8 @@ def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[Drive
 
 def _sharp(one: DriveTerm) -> DriveTerm:
     """Return the term with Coulomb's sign as it is, not smoothed: at low speed the larger torque."""
-    if one.shape not in SMOOTHED:
-        return one
-    settings = list(one.settings)
-    settings[SMOOTHED[one.shape]] = 0.0
-    return replace(one, settings=tuple(settings))
+    names = one.form.settings
+    return replace(one, settings=tuple(0.0 if name == "v0" else x for name, x in zip(names, one.settings)))
 
 
 def _stressed(terms: Sequence[DriveTerm], v: np.ndarray) -> np.ndarray:

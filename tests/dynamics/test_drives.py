@@ -37,6 +37,13 @@ def column(model, name, *motion, **more):
     return model.regressor(*motion, **more)[:, :, model.names.index(name)]
 
 
+def test_compiled_codes_are_the_places_in_the_table_of_shapes():
+    from calib.dynamics import shape_kernels
+    from calib.dynamics.shapes import CODES
+
+    assert {name: getattr(shape_kernels, name.upper()) for name in CODES} == CODES
+
+
 def test_standard_columns():
     q, v, a = states(6)
     model = IdentificationModel(bodies_of(TX40), drives.standard(["Ia Fv Fc off"] * 6, v0=0.0))

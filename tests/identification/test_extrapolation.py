@@ -41,7 +41,7 @@ def without_friction(case: Case) -> Case:
 def test_a_shape_that_bends_keeps_its_value_beyond_the_edge(one):
     def at(v: float) -> float:
         state = np.array([0.0]), np.array([v]), np.array([0.0])
-        return float(one[0].form.values(Joined(*state), one[0].settings)[0])
+        return float(one[0].values(Joined(*state))[0])
 
     assert at(6.0) == at(2.0) != at(1.0)
     assert at(-6.0) == at(-2.0)

@@ -39,7 +39,7 @@ def explained(one: ripple.Ripple, where: GearTravel, torque: np.ndarray) -> floa
     for own, value in zip(one.terms, one.values):
         source = own.acts[0][1][0][0]
         q, v = where.q[:, source], where.v[:, source]
-        predicted += value * own.form.values(Joined(q, v, np.zeros_like(q)), own.settings)
+        predicted += value * own.values(Joined(q, v, np.zeros_like(q)))
     return 1.0 - float(np.sum((torque - predicted) ** 2) / np.sum(torque**2))
 
 

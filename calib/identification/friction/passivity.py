@@ -66,7 +66,7 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
         for k in members:
             one = terms[k]
             assert one is not None
-            block[:, k] = one.form.values(seen, one.settings) * np.sign(v)
+            block[:, k] = one.values(seen) * np.sign(v)
         rows += list(block)
     return np.array(rows).reshape(-1, p)
 

@@ -30,7 +30,7 @@ import numpy as np
 from calib.arrays import frozen
 from calib.data.signals.filtering import low_pass
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import Joined, banded
+from calib.dynamics.shapes import Joined
 from calib.identification.cases import Case
 from calib.identification.rows import segments
 
@@ -222,10 +222,8 @@ class _WaveCrossValidation:
 def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
     """Return the columns (N, k) of a wave at the samples of a track, in the order of `_terms`."""
     q, v = track.q[:, wave[0]], track.v[:, wave[0]]
-    seen, offered = Joined(q, v, np.zeros_like(q)), _terms(wave[0], (wave,), nodes, None)
-    waves = {"sine_band": np.sin(wave[1] * q), "cosine_band": np.cos(wave[1] * q)}
-    gains = {settings: banded(seen, settings) for settings in dict.fromkeys(one.settings for one in offered)}
-    return np.stack([waves[one.shape] * gains[one.settings] for one in offered], axis=1)
+    seen = Joined(q, v, np.zeros_like(q))
+    return np.stack([one.values(seen) for one in _terms(wave[0], (wave,), nodes, None)], axis=1)
 
 
 def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:

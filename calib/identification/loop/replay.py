@@ -47,7 +47,6 @@ FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
 LONGEST = 20.0  # [s] of a recording that are replayed
 MARGIN = 0.05  # least eigenvalue of a possible robot's inertia, scaled by its diagonal
 SOFT = 0.25  # least smoothing of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MARGIN` is 0.11
-REPLAYED = ("acceleration", "velocity", "one", "sign", "speed", "cubic", "stribeck")  # the rest is in the disturbance
 LEAST = 1e-3  # [kg m² or kg] least inertia of a joint
 FEEDBACK, CAD, IDENTIFIED, FLOOR = (
     "feedback alone",
@@ -138,10 +137,11 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a robot, with what the case carries, and the names of terms that cannot be simulated."""
     model = dynamics.model
     bodies = model.inertial
-    kept = [k for k, one in enumerate(model.columns) if one.shape in REPLAYED]
+    simulated = [one.form.of_velocity or one.shape == "acceleration" for one in model.columns]
+    kept = np.flatnonzero(simulated)
     terms = tuple(replace(model.columns[k], side="motor") for k in kept)
     values = dynamics.values[:bodies] * model.carried_columns(case.carried)
-    left_out = tuple(one.name for one in model.columns if one.shape not in REPLAYED)
+    left_out = tuple(one.name for one, there in zip(model.columns, simulated) if not there)
     return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][kept]])), left_out
 
 
@@ -176,7 +176,7 @@ def _possible(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
 
 def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
     """Return a term whose sign the simulator can integrate at this control period."""
-    if one.shape not in ("sign", "stribeck"):
+    if "v0" not in one.form.settings:
         return one
     least = SOFT * abs(value) * reference.period / size[one.acts[0][0]]
     return replace(one, settings=(*one.settings[:-1], max(one.settings[-1], least)))

@@ -116,7 +116,7 @@ class _NoisyStates:
 def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> _NoisyStates:
     """Return the samples with the covariance of their states' noise."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
-    smooth = np.array([one is None or one.form.slopes is not None for one in problem.terms], dtype=bool)
+    smooth = np.array([one is None or one.form.slopes for one in problem.terms], dtype=bool)
     parts, first = [], 0
     for case in problem.cases:
         motion = case.motion

@@ -171,8 +171,8 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     bodies = bodies_of(chain).with_gravity(np.asarray(found.model.bodies.gravity))
     numbers = found.values[: 10 * bodies.count]
     terms = list(zip(found.model.columns, found.values[found.model.inertial :]))
-    kept = [(one, value) for one, value in terms if one.form.slopes is not None]
-    left = [one.name for one, _ in terms if one.form.slopes is None]
+    kept = [(one, value) for one, value in terms if one.form.slopes]
+    left = [one.name for one, _ in terms if not one.form.slopes]
     values = np.array([*numbers, *(value for _, value in kept)])
     if not np.isfinite(values).all():
         names = [*bodies.names, *(one.name for one, _ in kept)]

@@ -69,7 +69,7 @@ def _friction(outcome: IdentificationOutcome) -> Chart:
         for one, value in own:
             for speeds, target in ((grid, curve), (v[:, j], observed[:, j])):
                 still = np.zeros(len(speeds))
-                target += value * one.form.values(Joined(still, speeds, still), one.settings)
+                target += value * one.values(Joined(still, speeds, still))
         curves.append((grid, curve))
     speeds = ["m/s" if joint.kind == "prismatic" else "rad/s" for joint in outcome.inputs.chain.joints]
     title = f"friction over velocity on {case.name}"

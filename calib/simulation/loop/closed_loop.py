@@ -18,19 +18,15 @@ from scipy.linalg import solve_banded
 from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
+from calib.dynamics.shapes import CODES
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
 _TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
-_ACTS = (
-    "sign", "speed", "cubic", "stribeck", "root", "position", "sine", "cosine", "dead", "sine_band", "cosine_band",
-    "stop", "presliding", "load", "load_velocity",
-)  # fmt: skip
-_CODES = {name: code for code, name in enumerate(_ACTS)}  # as in `loop_kernels`
-_SMOOTHED = ("sign", "stribeck", "root", "dead", "presliding", "load")  # whose last setting must be above zero
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-SIMULATED = ("acceleration", "velocity", "one", *_ACTS)
+LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
+RAMP = 0.1  # of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated
 _LOWER = (
     "these gains do not hold this robot at this rate; lower kp and kd (are they in the unit of the torque?), or the "
     "delay"
@@ -44,7 +40,7 @@ class Plant:
 
     Attributes:
         bodies: of the robot.
-        terms: its drives; shapes out of `SIMULATED`, signs with a smoothing above zero.
+        terms: its drives, signs with a smoothing above zero.
         parameters: (10 B + k,) standard parameters of the bodies, then one value per term. Any values that give a
             positive definite inertia will do: base parameters, zeros for the others, too.
     """
@@ -57,9 +53,7 @@ class Plant:
         size = self.inertial + len(self.terms)
         object.__setattr__(self, "parameters", frozen(shaped(self.parameters, (size,), "parameters of the plant")))
         for one in self.terms:
-            if one.shape not in SIMULATED:
-                raise CalibError(f"term '{one.name}': the simulator knows {', '.join(SIMULATED)}, not '{one.shape}'")
-            if one.shape in _SMOOTHED and not one.settings[-1] > 0.0:
+            if any(x <= 0.0 for name, x in zip(one.form.settings, one.settings) if name in ("v0", "rest")):
                 raise CalibError(
                     f"term '{one.name}': an exact sign cannot be integrated; give a smoothing v0 of some 0.01 rad/s"
                 )
@@ -260,7 +254,7 @@ def simulate_tangents(
     from calib.simulation.loop import loop_kernels, tangent_kernels
 
     for one in plant.terms:
-        if one.shape in _CODES and one.form.slopes is None and one.shape != "dead":
+        if not one.form.slopes:
             raise CalibError(
                 f"term '{one.name}' ({one.shape}): no tangents of friction that hangs on loads or the past"
             )
@@ -382,7 +376,7 @@ def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     owners: list[int] = []
     for k, one in enumerate(plant.terms):
         for row, motion in one.acts:
-            if one.shape in _CODES:
+            if one.shape not in LINEAR:
                 owners.append(first + k)
                 continue
             seen = ((2 * n, 1.0),) if one.shape == "one" else motion
@@ -429,9 +423,9 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
             weights = np.zeros(n)
             for joint, weight in motion:
                 weights[joint] += weight
-            if one.shape in _CODES:
-                settings = [0.0] * (7 - len(one.settings)) + list(one.settings)
-                acts.append((row, _CODES[one.shape], value, settings, weights))
+            if one.shape not in LINEAR:
+                settings = [*one.settings, RAMP * one.settings[0]] if one.shape == "dead" else [*one.settings]
+                acts.append((row, CODES[one.shape], value, [*settings, *[0.0] * (7 - len(settings))], weights))
             else:
                 first = 0 if one.shape == "acceleration" else n
                 linear[row, first : first + n] += value * weights

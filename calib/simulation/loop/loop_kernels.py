@@ -14,8 +14,7 @@ passes on: half of the time otherwise. B bodies, n joints, T acts of friction th
     body    (B + 1, 23): placement (rotation by rows, origin) with each joint about or along z, ten standard parameters
             in such a frame, scale; row B, columns 0 to 2: the base's acceleration against gravity
     linear  (n, 2 n + 1): added inertia, viscous friction, offset
-    kinds   (T, 2) torque row and code; acts (T, 8 + n): amount, seven settings (the last ones used), weights of the
-            joints' motions
+    kinds   (T, 2) torque row and code; acts (T, 8 + n): amount, up to seven settings, weights of the joints' motions
     memory  (T, 2) of friction that depends on the past: state of the stop operator, and where it was there
     loads   (n,) torques that the gears transmit, of the last call, where friction depends on them
     work    (B + 1, 46): pose, velocity 12, acceleration 18, twist 24, force 30, inertia about the origin 36 …
@@ -23,18 +22,25 @@ passes on: half of the time otherwise. B bodies, n joints, T acts of friction th
 
 from __future__ import annotations
 
-from math import cos, exp, isinf, pi, sin, sqrt, tanh
+from math import cos, sin, sqrt
 
 import numpy as np
 from numba import get_num_threads, njit
 
-OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-JOINED = {**OPTIONS, "forceinline": True}
+from calib.dynamics.kernels import OPTIONS
+from calib.dynamics.shape_kernels import (
+    JOINED,
+    LOAD,
+    LOAD_VELOCITY,
+    PRESLIDING,
+    SIGN,
+    STOP,
+    shape,
+    smooth_sign,
+    steepest,
+)
+
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
-SIGN, SPEED, CUBIC, STRIBECK, ROOT, POSITION, SINE, COSINE, DEAD = 0, 1, 2, 3, 4, 5, 6, 7, 8
-SINE_BAND, COSINE_BAND, STOP, PRESLIDING, LOAD, LOAD_VELOCITY = 9, 10, 11, 12, 13, 14
-EDGE = 0.1  # of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated
-BEYOND = 0.1  # [rad] over which ripple of a band fades outside the positions it was learnt at
 MOST = 64  # steps that friction may ask for in one period
 BRISK = 1.5  # reciprocals of friction's fastest decay in a step of the midpoint rule, which is stable up to 2
 REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: one period away at most 6 v0
@@ -210,18 +216,6 @@ def substitute(matrix, vector):
 
 
 @njit(**JOINED)
-def _smooth_sign(scaled):
-    """Return tanh, cut where it is one to rounding."""
-    return 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
-
-
-@njit(**JOINED)
-def _held(rate, edge):
-    """Return the velocity up to the edge of what was learnt."""
-    return min(edge, max(-edge, rate))
-
-
-@njit(**JOINED)
 def seen(acts, t, motion):
     """Return what act t sees of a motion (n,): the weighted sum over joints."""
     total = 0.0
@@ -236,45 +230,15 @@ def _stop(memory, t, place, width):
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
 
-@njit(**OPTIONS)
-def shape(code, acts, t, memory, q, v):
-    """Return what act t is per unit of its parameter, as `calib.dynamics.shapes` says; loads are another's business."""
-    rate, last = seen(acts, t, v), acts[t, 7]
-    if code == SPEED:
-        return abs(_held(rate, last))
-    if code == CUBIC:
-        return _held(rate, last) ** 3
-    if code == ROOT:
-        rate = _held(rate, acts[t, 6])
-        return rate / sqrt(abs(rate) + last)
-    if code == DEAD:
-        wide = EDGE * last
-        return 0.5 * (_smooth_sign((rate - last) / wide) + _smooth_sign((rate + last) / wide))
-    if code == LOAD_VELOCITY:
-        return _held(rate, last)
-    if code in (SIGN, LOAD):
-        return _smooth_sign(rate / last)
-    if code == STRIBECK:
-        return _smooth_sign(rate / last) * exp(-((abs(rate) / acts[t, 5]) ** acts[t, 6]))
+@njit(**JOINED)
+def act(code, acts, t, memory, q, v):
+    """Return what act t is per unit of its parameter, and its slopes by place and rate; loads are another's business.
+
+    `calib.dynamics.shape_kernels.shape` of what the act sees.
+    """
     place = seen(acts, t, q)
-    if code == POSITION:
-        return place
-    if code == STOP:
-        return _stop(memory, t, place, last)
-    if code == PRESLIDING:
-        return _stop(memory, t, place, acts[t, 6]) - _smooth_sign(rate / last)
-    if code in (SINE, COSINE):
-        gain = 1.0 / (1.0 + (rate / last) ** 2)
-        return gain * (sin(acts[t, 6] * place) if code == SINE else cos(acts[t, 6] * place))
-    order, left, middle, right = acts[t, 1], acts[t, 2], acts[t, 3], acts[t, 4]
-    frequency = abs(rate) * order / (2.0 * pi)
-    falls = 1.0 if isinf(right) else (right - frequency) / (right - middle)
-    gain = min(1.0, max(0.0, min((frequency - left) / (middle - left), falls)))
-    if not acts[t, 5] * rate > 0.0 or gain == 0.0:
-        return 0.0
-    outside = max(max(acts[t, 6] - place, place - last), 0.0)
-    gain *= min(1.0, max(0.0, 1.0 - outside / BEYOND))
-    return gain * (sin(order * place) if code == SINE_BAND else cos(order * place))
+    state = _stop(memory, t, place, acts[t, 1]) if code in (STOP, PRESLIDING) else 0.0
+    return shape(code, acts, t, place, seen(acts, t, v), state)
 
 
 @njit(**JOINED)
@@ -291,9 +255,9 @@ def _friction(linear, kinds, acts, memory, q, v, out):
         if code in (LOAD, LOAD_VELOCITY):
             loaded = True
         elif code == SIGN:
-            out[kinds[t, 0]] -= acts[t, 0] * _smooth_sign(seen(acts, t, v) / acts[t, 7])
+            out[kinds[t, 0]] -= acts[t, 0] * smooth_sign(seen(acts, t, v), acts[t, 1])
         else:
-            out[kinds[t, 0]] -= acts[t, 0] * shape(code, acts, t, memory, q, v)
+            out[kinds[t, 0]] -= acts[t, 0] * act(code, acts, t, memory, q, v)[0]
     return loaded
 
 
@@ -323,7 +287,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
         for t in range(kinds.shape[0]):
             if kinds[t, 1] == LOAD or kinds[t, 1] == LOAD_VELOCITY:
                 size = abs(seen(acts, t, loads))
-                extra[kinds[t, 0]] += acts[t, 0] * size * shape(kinds[t, 1], acts, t, memory, q, v)
+                extra[kinds[t, 0]] += acts[t, 0] * size * act(kinds[t, 1], acts, t, memory, q, v)[0]
         for j in range(n):
             change[j] = -extra[j]
         substitute(matrix, change)
@@ -342,22 +306,11 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
     """
     total, springs, n = 0.0, 0.0, unit.shape[0]
     for t in range(kinds.shape[0]):
-        code, last, amount, spring = kinds[t, 1], acts[t, 7], acts[t, 0], 0.0
-        if code in (SIGN, STRIBECK):
-            slope, middle = amount / last, 0.0
-        elif code == LOAD:
-            slope, middle = amount * abs(seen(acts, t, loads)) / last, 0.0
-        elif code == ROOT:
-            slope, middle = amount / sqrt(last), 0.0
-        elif code == DEAD:
-            slope, middle, last = 0.5 * amount / (EDGE * last), last, EDGE * last
-        elif code == STOP:
-            slope, middle, spring = 0.0, 0.0, amount / last
-        elif code == PRESLIDING:
-            slope, middle, spring = amount / last, 0.0, amount / acts[t, 6]
-        else:
-            continue
-        if abs(abs(seen(acts, t, v)) - middle) > REACH * last:
+        slope, middle, width, spring = steepest(kinds[t, 1], acts, t)
+        slope, spring = acts[t, 0] * slope, acts[t, 0] * spring
+        if kinds[t, 1] == LOAD:
+            slope *= abs(seen(acts, t, loads))
+        if abs(abs(seen(acts, t, v)) - middle) > REACH * width:
             slope = 0.0
         if slope == 0.0 and spring == 0.0:
             continue
@@ -399,8 +352,7 @@ def _remember(kinds, acts, q, memory):
     for t in range(kinds.shape[0]):
         if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
             place = seen(acts, t, q)
-            width = acts[t, 7] if kinds[t, 1] == STOP else acts[t, 6]
-            memory[t, 0], memory[t, 1] = _stop(memory, t, place, width), place
+            memory[t, 0], memory[t, 1] = _stop(memory, t, place, acts[t, 1]), place
 
 
 @njit(**OPTIONS)

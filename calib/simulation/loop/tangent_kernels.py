@@ -24,39 +24,25 @@ Arrays are those of `loop_kernels`; besides
 
 from __future__ import annotations
 
-from math import cos, exp, sin, sqrt, tanh
-
 import numpy as np
 from numba import njit
 
+from calib.dynamics.kernels import OPTIONS
 from calib.simulation.loop.loop_kernels import (
-    COSINE,
-    CUBIC,
-    DEAD,
     DIVERGED,
-    EDGE,
     FINE,
     MOST,
-    OPTIONS,
-    POSITION,
-    ROOT,
-    SIGN,
     SINGULAR,
-    SPEED,
     STIFF,
-    STRIBECK,
     accelerate,
+    act,
     command,
     dynamics,
     linearise_command,
-    seen,
     set_parameters,
-    shape,
     stiffness,
     substitute,
 )
-
-JOINED = {**OPTIONS, "forceinline": True}
 
 
 @njit(**OPTIONS)
@@ -246,43 +232,6 @@ def _columns(tree, order, find, work, more, ten, out):
 
 
 @njit(**OPTIONS)
-def _act_slopes(code, acts, t, q, v):
-    """Return the slopes by place and by rate of act t, per unit of its parameter."""
-    rate, last = seen(acts, t, v), acts[t, 7]
-    if (code in (SPEED, CUBIC) and abs(rate) >= last) or (code == ROOT and abs(rate) >= acts[t, 6]):
-        return 0.0, 0.0
-    if code == SPEED:
-        return 0.0, 1.0 if rate > 0.0 else -1.0 if rate < 0.0 else 0.0
-    if code == CUBIC:
-        return 0.0, 3.0 * rate * rate
-    if code == ROOT:
-        size = abs(rate) + last
-        return 0.0, (0.5 * abs(rate) + last) / (size * sqrt(size))
-    if code == POSITION:
-        return 1.0, 0.0
-    if code == DEAD:
-        wide = EDGE * last
-        one, other = tanh((rate - last) / wide), tanh((rate + last) / wide)
-        return 0.0, (1.0 - 0.5 * (one * one + other * other)) / wide
-    if code == SIGN or code == STRIBECK:  # noqa: SIM109
-        soft = tanh(rate / last)
-        slope = (1.0 - soft * soft) / last
-        if code == SIGN:
-            return 0.0, slope
-        vs, exponent = acts[t, 5], acts[t, 6]
-        ratio = abs(rate) / vs
-        gain = exp(-(ratio**exponent))
-        inner = exponent / vs * ratio ** (exponent - 1.0) if ratio > 0.0 else 0.0
-        return 0.0, gain * (slope - abs(soft) * inner)
-    order, place = acts[t, 6], seen(acts, t, q)
-    gain = 1.0 / (1.0 + (rate / last) ** 2)
-    wave, rising = sin(order * place), order * cos(order * place)
-    if code == COSINE:
-        wave, rising = cos(order * place), -order * sin(order * place)
-    return gain * rising, -2.0 * rate / (last * last) * gain * gain * wave
-
-
-@njit(**OPTIONS)
 def _linearise(
     tree, body, linear, kinds, acts, order, entries, shares, owners, find, memory, q, v, a, work, own, more, ten,
     by_q, by_v, out,
@@ -299,13 +248,13 @@ def _linearise(
         _columns(tree, order, find, work, more, ten, out)
     _slopes(tree, work, more, by_q, by_v)
     for t in range(kinds.shape[0]):
-        row, code = kinds[t, 0], kinds[t, 1]
-        place, rate = _act_slopes(code, acts, t, q, v)
+        row = kinds[t, 0]
+        value, place, rate = act(kinds[t, 1], acts, t, memory, q, v)
         for k in range(n):
             by_q[row, k] += acts[t, 0] * acts[t, 8 + k] * place
             by_v[row, k] += acts[t, 0] * acts[t, 8 + k] * rate
         if find.shape[0] and find[owners[t]] >= 0:
-            out[row, find[owners[t]]] += shape(code, acts, t, memory, q, v)
+            out[row, find[owners[t]]] += value
     if find.shape[0]:
         for e in range(entries.shape[0]):
             column, place = find[entries[e, 2]], entries[e, 1]

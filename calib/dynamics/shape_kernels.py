@@ -1,0 +1,127 @@
+"""Compiled shapes of friction and other drive torques (numba): one formula, with slopes, for arrays and simulations.
+
+A shape's settings stand in one row of `acts`, from column 1 on, in the order of `calib.dynamics.shapes.SHAPES`; the
+other columns are the simulator's. Codes are places in `SHAPES`.
+"""
+
+from __future__ import annotations
+
+from math import cos, exp, isinf, pi, sin, sqrt, tanh
+
+from numba import njit
+
+from calib.dynamics.kernels import OPTIONS
+
+JOINED = {**OPTIONS, "forceinline": True}
+ACCELERATION, VELOCITY, ONE, POSITION, SIGN, DEAD, SPEED, CUBIC, ROOT = range(9)
+STRIBECK, LOAD, LOAD_VELOCITY, STOP, PRESLIDING, SINE, COSINE, SINE_BAND, COSINE_BAND = range(9, 18)
+FADE = 0.1  # [rad] over which ripple of a band fades outside the positions it was identified at
+
+
+@njit(**JOINED)
+def smooth_sign(v, v0):
+    """Return tanh(v / v0), cut where it is one to rounding; the exact sign for v0 = 0."""
+    if not v0 > 0.0:
+        return 1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0
+    scaled = v / v0
+    return 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
+
+
+@njit(**JOINED)
+def _sign_slope(sign, v0):
+    return (1.0 - sign * sign) / v0 if v0 > 0.0 else 0.0
+
+
+@njit(**JOINED)
+def _band(acts, t, x, v):
+    """Return the gain of ripple in one band and one direction: a hat over the frequency order · |v| / 2π [Hz].
+
+    It fades over `FADE` beyond the positions it was identified at, lower … upper: its phase does not reach further.
+    """
+    left, middle, right, lower, upper = acts[t, 2], acts[t, 3], acts[t, 4], acts[t, 6], acts[t, 7]
+    frequency = abs(v) * acts[t, 1] / (2.0 * pi)
+    falls = 1.0 if isinf(right) else (right - frequency) / (right - middle)
+    gain = min(1.0, max(0.0, min((frequency - left) / (middle - left), falls)))
+    if not acts[t, 5] * v > 0.0 or gain == 0.0:
+        return 0.0
+    outside = max(max(lower - x, x - upper), 0.0)
+    return gain * min(1.0, max(0.0, 1.0 - outside / FADE))
+
+
+@njit(**OPTIONS)
+def shape(code, acts, t, x, v, state):
+    """Return what a shape is per unit of its parameter (and of its load, where it has one), and its slopes by x and v.
+
+    Args:
+        code: which shape.
+        acts, t: its settings.
+        x, v: position and velocity [rad or m, per s].
+        state: of the stop operator, see `calib.dynamics.drives.friction_states`.
+    """
+    first, second, third = acts[t, 1], acts[t, 2], acts[t, 3]
+    if code in (SIGN, LOAD):
+        sign = smooth_sign(v, first)
+        return sign, 0.0, _sign_slope(sign, first)
+    if code in (SPEED, CUBIC, ROOT, LOAD_VELOCITY):  # beyond the edge of what they were identified at they stay
+        held, inside = min(first, max(-first, v)), 1.0 if abs(v) < first else 0.0
+        if code == SPEED:
+            return abs(held), 0.0, inside * smooth_sign(v, 0.0)
+        if code == CUBIC:
+            return held**3, 0.0, inside * 3.0 * held * held
+        if code == LOAD_VELOCITY:
+            return held, 0.0, inside
+        size = abs(held) + second
+        return held / sqrt(size), 0.0, inside * (size - 0.5 * abs(held)) / (size * sqrt(size))
+    if code == STRIBECK:
+        sign, ratio = smooth_sign(v, third), abs(v) / first
+        gain = exp(-(ratio**second))
+        fall = second / first * ratio ** (second - 1.0) if ratio > 0.0 else 0.0
+        return sign * gain, 0.0, gain * (_sign_slope(sign, third) - abs(sign) * fall)
+    if code == STOP:
+        return state, 0.0, 0.0
+    if code == PRESLIDING:
+        return state - smooth_sign(v, second), 0.0, 0.0
+    if code in (SINE, COSINE):
+        fading = 1.0 / (1.0 + (v / second) ** 2)
+        wave, rising = sin(first * x), first * cos(first * x)
+        if code == COSINE:
+            wave, rising = cos(first * x), -first * sin(first * x)
+        return fading * wave, fading * rising, -2.0 * v / (second * second) * fading * fading * wave
+    if code in (SINE_BAND, COSINE_BAND):
+        return _band(acts, t, x, v) * (sin(first * x) if code == SINE_BAND else cos(first * x)), 0.0, 0.0
+    if code == DEAD:
+        if not second > 0.0:
+            return smooth_sign(v, 0.0) if abs(v) > first else 0.0, 0.0, 0.0
+        one, other = smooth_sign(v - first, second), smooth_sign(v + first, second)  # a ramp: no jump is integrable
+        return 0.5 * (one + other), 0.0, 0.5 * (_sign_slope(one, second) + _sign_slope(other, second))
+    if code == POSITION:
+        return x, 1.0, 0.0
+    if code == VELOCITY:
+        return v, 0.0, 1.0
+    return 1.0, 0.0, 0.0
+
+
+@njit(**OPTIONS)
+def steepest(code, acts, t):
+    """Return the steepest slope by v of a smoothed sign, about which |v|, its width, and the spring of a stop."""
+    first, second, third = acts[t, 1], acts[t, 2], acts[t, 3]
+    if code in (SIGN, LOAD):
+        return 1.0 / first, 0.0, first, 0.0
+    if code == STRIBECK:
+        return 1.0 / third, 0.0, third, 0.0
+    if code == ROOT:
+        return 1.0 / sqrt(second), 0.0, second, 0.0
+    if code == DEAD:
+        return 0.5 / second, first, second, 0.0
+    if code == STOP:
+        return 0.0, 0.0, 1.0, 1.0 / first
+    if code == PRESLIDING:
+        return 1.0 / second, 0.0, second, 1.0 / first
+    return 0.0, 0.0, 1.0, 0.0
+
+
+@njit(**OPTIONS)
+def fill(code, acts, x, v, state, out):
+    """Write values and slopes by x and v of one shape into out (3, N)."""
+    for k in range(v.shape[0]):
+        out[0, k], out[1, k], out[2, k] = shape(code, acts, 0, x[k], v[k], state[k])
