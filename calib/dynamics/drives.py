@@ -92,19 +92,19 @@ class DriveTerm:
         """Return the column (N,) at a motion, per unit of the parameter."""
         if self.shape == "acceleration":
             return seen.a
-        found = self._evaluated(seen)[0]
+        found = self._evaluated(seen, 1)[0]
         return found * np.abs(seen.load) if self.form.loaded and seen.load is not None else found
 
     def slopes(self, seen: Joined) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the slopes of the column by x, v (N,) and a."""
-        _, by_x, by_v = self._evaluated(seen)
+        _, by_x, by_v = self._evaluated(seen, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
-    def _evaluated(self, seen: Joined) -> np.ndarray:
-        """Return value and slopes by x and v (3, N)."""
+    def _evaluated(self, seen: Joined, rows: int) -> np.ndarray:
+        """Return the value, or value and slopes by x and v, (1 or 3, N)."""
         from calib.dynamics import shape_kernels
 
-        acts, out = np.zeros((1, 8)), np.empty((3, len(seen.v)))
+        acts, out = np.zeros((1, 8)), np.empty((rows, len(seen.v)))
         acts[0, 1 : 1 + len(self.settings)] = self.settings
         series = (seen.x, seen.v, seen.v if seen.state is None else seen.state)
         shape_kernels.fill(CODES[self.shape], acts, *map(np.ascontiguousarray, series), out)

@@ -122,6 +122,9 @@ def steepest(code, acts, t):
 
 @njit(**OPTIONS)
 def fill(code, acts, x, v, state, out):
-    """Write values and slopes by x and v of one shape into out (3, N)."""
+    """Write values, and with three rows slopes by x and v, of one shape into out (1 or 3, N)."""
     for k in range(v.shape[0]):
-        out[0, k], out[1, k], out[2, k] = shape(code, acts, 0, x[k], v[k], state[k])
+        value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
+        out[0, k] = value
+        if out.shape[0] == 3:
+            out[1, k], out[2, k] = by_x, by_v
