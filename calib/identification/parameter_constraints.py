@@ -23,10 +23,9 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import NotConverged, UsageError, require, suggestion
-from calib.estimation.convex.constrained import within
+from calib.estimation.convex.cone_program import Definite
+from calib.estimation.convex.constrained import Constrained, within
 from calib.estimation.convex.constraint_relations import contradicting, restricted
-from calib.estimation.convex.definite import Definite
-from calib.estimation.convex.interior_point import Constrained
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
 from calib.identification.body_cone import BodyCone, cone_of

@@ -41,7 +41,7 @@ from calib.arrays import frozen
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
-from calib.estimation.convex.interior_point import minimise
+from calib.estimation.convex.constrained import within
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
@@ -323,12 +323,6 @@ def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
         factor: (p + 1, p + 1) triangle of data and prior, whitened.
         rows: A (c, p); one of a single entry is kept exactly.
     """
-    p = rows.shape[1]
-    free = np.asarray(scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p]))
-    if not len(rows) or (rows @ free >= 0.0).all():
-        return free
-    norms = np.linalg.norm(factor[:p, :p], axis=0)
-    found = minimise(factor, rows / np.linalg.norm(rows / norms, axis=1, keepdims=True), np.zeros(len(rows))).values
+    found = within(factor, rows, np.zeros(len(rows)), np.full(len(rows), np.inf)).values
     alone = rows[np.count_nonzero(rows, axis=1) == 1]
-    held = (alone != 0.0).any(axis=0)
-    return np.where(held, np.maximum(found, 0.0), found)
+    return np.where((alone != 0.0).any(axis=0), np.maximum(found, 0.0), found)

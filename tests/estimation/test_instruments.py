@@ -7,8 +7,8 @@ import pytest
 import scipy.signal
 
 from calib.errors import Unidentifiable
+from calib.estimation.convex.cone_program import Definite
 from calib.estimation.convex.constrained import within
-from calib.estimation.convex.definite import Definite
 from calib.estimation.instrumental_variables import exogeneity, instrument, iv, projected, settled, strength
 from calib.estimation.linear import ols
 

@@ -1,26 +1,52 @@
 """Least squares under bounds, equalities and matrices that must be positive definite, from a triangle of [W y].
 
-With R from `triangles.combine` it is constrained least squares, with `instruments.projected` the inner problem of
-PC-IDIM-IV (Janot's slides on the TX40, where the sign of the multipliers' term must be read as minus). Equalities are
-eliminated beforehand: b = b0 + N t. Matrices come in only where the optimum without them leaves one indefinite.
+min ½ ‖R b - z‖² under A b >= e, E b = d and M_k(b) = Σ_j A_kj b_j ⪰ λ I. With R from `triangles.combine` it is
+constrained least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40,
+where the sign of the multipliers' term must be read as minus). Clarabel finds which constraints bind (Goulart & Chen
+2024); on them the optimum is that of Gouriéroux & Monfort, to the last bit. Matrices come in only where the optimum
+without them leaves one indefinite.
+
 Constraints add knowledge, not consistency: where they bind at wrong values the estimate is biased, and they do not cure
 the bias of least squares in a loop.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 import scipy.linalg
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, require
-from calib.estimation.convex import definite
+from calib.estimation.convex.cone_program import Definite, minimise, scale
 from calib.estimation.convex.constraint_relations import from_free
-from calib.estimation.convex.definite import Definite
-from calib.estimation.convex.interior_point import Constrained, minimise
-from calib.estimation.triangles import retriangulate
+
+ENTER = 8  # matrices that enter at once, the most indefinite (our choice)
+MAX_DROPS = 30  # rounds in which what does not bind may go: rounding could let it come back
+BINDS = 1e-6  # of the scaled problem, multipliers of matrices above which bind
+MAX_MOVE = 1e-3  # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
+CONTRADICT = 1e-8  # of an equality, by which the best point may miss it
+
+
+@dataclass(frozen=True, eq=False)
+class Constrained:
+    """The optimum, with what is needed to check it.
+
+    Attributes:
+        values: (p,) b.
+        multipliers: (c,) μ of the constraints, >= 0 but for equalities.
+        slack: (c,) what bounds leave, and smallest eigenvalues above their least.
+        binding: (c,) bool; where the data want to go on, symptom of a constraint too tight or of a biased estimate.
+        normals: (c, p) slopes of the slack at the optimum; of a matrix that binds <A, Z> / trace Z, Z its multiplier.
+    """
+
+    values: np.ndarray
+    multipliers: np.ndarray
+    slack: np.ndarray
+    binding: np.ndarray
+    normals: np.ndarray
 
 
 def within(
@@ -44,100 +70,124 @@ def within(
     p = len(factor) - 1
     matrix = shaped(matrix, (None, p), "constraint matrix A")
     lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-    if lower.shape != (len(matrix),) or upper.shape != lower.shape or np.isnan(lower).any() or np.isnan(upper).any():
-        raise CalibError(f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
+    sound = lower.shape == (len(matrix),) == upper.shape and not np.isnan([lower, upper]).any()
+    require(sound, f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
     if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
         raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
     same = lower == upper
     low, high = np.isfinite(lower) & ~same, np.isfinite(upper) & ~same
-    rows, offset = np.vstack([matrix[low], -matrix[high]]), np.concatenate([-lower[low], upper[high]])
-    equal, held = matrix[same], lower[same]
-
-    def solve(used: int) -> Constrained:
-        if len(equal):
-            return _on_equalities(factor, rows[:used], offset[:used], equal, held)
-        return minimise(factor, rows[:used], offset[:used])
-
-    found = _on_bounds(factor, solve(0), rows[:0], offset[:0])
-    if (rows @ found.values + offset < 0.0).any():  # else the optimum without them is that of the whole problem
-        found = _on_bounds(factor, solve(len(rows)), rows, offset)
-    else:
-        found = _widened(found, 0, rows, rows @ found.values + offset)
-    if matrices is None:
-        return found
+    rows, edges = np.vstack([matrix[low], -matrix[high]]), np.concatenate([lower[low], -upper[high]])
+    planes = _Planes(factor, rows, edges, matrix[same], lower[same])
+    matrices = matrices or Definite(np.zeros((0, 1, 1, p)), 1.0)
+    found = planes.optimum(np.zeros(len(rows), dtype=bool))
+    if (found.slack[: len(rows)] < 0.0).any():
+        found = planes.bounded()
     sizes, normals = matrices.least_eigenvalues(found.values)
-    if matrices.satisfied(sizes):
-        return _widened(found, len(rows), normals, sizes)
-    return definite.minimise(factor, rows, offset, equal, held, matrices)
+    if not matrices.satisfied(sizes):
+        return planes.definite(matrices)
+    return _widened(found, len(rows), normals, sizes)
 
 
-def _on_bounds(factor: np.ndarray, found: Constrained, rows: np.ndarray, offset: np.ndarray) -> Constrained:
-    """Return the optimum under linear constraints exactly on those that bind; the barrier keeps it √`TOLERANCE` off.
+class _Planes:
+    """The problem without matrices: A b >= e and E b = d."""
 
-    Left as it is where it is degenerate: a multiplier of an inequality would change sign, or another be violated.
-    """
-    if not found.binding.any():
-        return found
-    p, normals = len(found.values), found.normals[found.binding]
-    free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
-    apart = np.zeros(len(found.slack))
-    apart[: len(rows)] = rows @ found.values + offset
-    held = normals @ found.values - apart[found.binding]
-    values = from_free(factor, free, normals, held)
-    for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):  # bounds on single parameters: to the last bit
-        place = int(np.flatnonzero(normals[row])[0])
-        values[place] = held[row] / normals[row, place]
-    slack = np.where(found.binding, 0.0, apart + found.normals @ (values - found.values))
-    away = np.linalg.norm(factor[:p, :p] @ (values - found.values)) / max(np.linalg.norm(factor[:p, p]), 1e-300)
-    unit = 1.0 / np.linalg.norm(factor[:p, :p], axis=0)
-    slope = factor[:p, :p].T @ (factor[:p, :p] @ values - factor[:p, p])
-    size = np.linalg.norm(normals * unit, axis=1)
-    multipliers = np.zeros(len(slack))
-    multipliers[found.binding] = np.linalg.lstsq((normals * unit / size[:, None]).T, slope * unit)[0] / size
-    if (slack < 0.0).any() or (multipliers[: len(rows)] < 0.0).any() or away > 1e-3:
-        return found
-    return replace(found, values=frozen(values), slack=frozen(slack), multipliers=frozen(multipliers))
+    def __init__(self, factor: np.ndarray, rows: np.ndarray, edges: np.ndarray, equal: np.ndarray, held: np.ndarray):
+        self.factor, self.rows, self.edges, self.equal, self.held = factor, rows, edges, equal, held
+        p = len(factor) - 1
+        self.problem, self.fixed = scale(factor, rows, -edges), scale(factor, equal, -held)
+        self.normals, self.sides = np.vstack([rows, equal]), np.concatenate([edges, held])
+        self.free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+        self._require_solvable()
+
+    def _require_solvable(self) -> None:
+        """Refuse equalities that contradict each other or leave nothing."""
+        if not len(self.equal):
+            return
+        scaled, wanted = self.fixed.rows, -self.fixed.offset
+        acts = scaled.any(axis=1)
+        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} acts on no parameter")
+        origin, _, rank, _ = np.linalg.lstsq(scaled, wanted, rcond=1e-10)
+        away = np.abs(scaled @ origin - wanted) / np.maximum(np.abs(wanted), max(float(np.abs(origin).max()), 1e-300))
+        require(away.max() <= CONTRADICT, "equalities contradict each other: no point satisfies all of them")
+        require(rank < len(self.free), f"equalities fix all {rank} parameters: they leave nothing to estimate")
+
+    def optimum(self, active: np.ndarray) -> Constrained:
+        """Return the optimum on the equalities and the inequalities that are active (c,), whatever the others say."""
+        binding = np.append(active, np.ones(len(self.held), dtype=bool))
+        normals, sides = self.normals[binding], self.sides[binding]
+        values, multipliers = np.array(self.free), np.zeros(len(binding))
+        if len(normals):
+            p = len(values)
+            values = from_free(self.factor, self.free, normals, sides)
+            for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):  # bounds on single parameters
+                place = int(np.flatnonzero(normals[row])[0])
+                values[place] = sides[row] / normals[row, place]
+            slope = self.factor[:p, :p].T @ (self.factor[:p, :p] @ values - self.factor[:p, p])
+            unit = 1.0 / np.linalg.norm(self.factor[:p, :p], axis=0)
+            size = np.linalg.norm(normals * unit, axis=1)
+            multipliers[binding] = np.linalg.lstsq((normals * unit / size[:, None]).T, slope * unit)[0] / size
+        slack = np.where(binding, 0.0, self.normals @ values - self.sides)
+        return _frozen(values, multipliers, slack, binding, self.normals)
+
+    def bounded(self) -> Constrained:
+        """Return the optimum under the inequalities, exactly on those that bind.
+
+        As the solver has it where that is degenerate: a multiplier would change its sign, or another be violated.
+        """
+        c, p = len(self.rows), len(self.free)
+        found = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
+        exact = self.optimum(found.binding[:c])
+        away = np.linalg.norm(self.problem.upper @ ((exact.values - found.values) / self.problem.unit))
+        good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= MAX_MOVE
+        return exact if good else found
+
+    def definite(self, matrices: Definite) -> Constrained:
+        """Return the optimum under inequalities and matrices by cone programs.
+
+        Of many matrices few bind: those most indefinite enter, until all others are definite; what does not bind may
+        go, since the least misfit rises from one set to the next and none comes back (our choice).
+        """
+        problem, fixed = self.problem, self.fixed
+        small = Definite(matrices.matrices * problem.unit, matrices.least)
+        used = np.zeros(0, dtype=int) if matrices.likely is None else matrices.likely
+        for rounds in count():
+            if not len(used):
+                used = np.argsort(small.least_eigenvalues(self.free / problem.unit)[0])[:ENTER]
+            b, mu, pushes, rates = minimise(problem, fixed, small.matrices[used], small.least)
+            sizes, normals = small.least_eigenvalues(b)
+            traces = np.einsum("kii->k", pushes)
+            bind = traces > BINDS
+            left = sizes.copy()
+            left[used] = 0.0
+            if small.satisfied(left):
+                break
+            worst = np.argsort(left)[:ENTER]
+            used = np.union1d(used[bind] if rounds < MAX_DROPS else used, worst[left[worst] < 0.0])
+        held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[used[bind]])
+        normals[used[bind]] = held_by / traces[bind, None]
+        force = np.zeros(len(small.matrices))
+        force[used[bind]] = traces[bind]
+        slack = np.maximum(problem.h(b), 0.0)
+        whole = np.vstack([problem.rows, normals, fixed.rows])
+        binding = np.concatenate([mu > slack, force > 0.0, np.ones(len(rates), dtype=bool)])
+        scales = np.concatenate([problem.sizes, np.ones(len(force)), fixed.sizes])
+        apart = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
+        return _frozen(
+            b * problem.unit, np.concatenate([mu, force, rates]) * problem.length**2 / scales, apart * scales, binding,
+            whole * scales[:, None] / problem.unit,
+        )  # fmt: skip
+
+
+def _frozen(*parts: np.ndarray) -> Constrained:
+    values, multipliers, slack, binding, normals = parts
+    return Constrained(frozen(values), frozen(multipliers), frozen(slack), frozen(binding, bool), frozen(normals))
 
 
 def _widened(found: Constrained, place: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
     """Return the optimum with further inequalities, none of which binds, from `place` on."""
     zero = np.zeros(len(slack))
-    return replace(
-        found, multipliers=frozen(np.insert(found.multipliers, place, zero)),
-        slack=frozen(np.insert(found.slack, place, slack)),
-        binding=frozen(np.insert(found.binding, place, zero > 0.0), bool),
-        normals=frozen(np.insert(found.normals, place, normals, axis=0)),
-    )  # fmt: skip
-
-
-def _on_equalities(
-    factor: np.ndarray, rows: np.ndarray, offset: np.ndarray, equal: np.ndarray, held: np.ndarray
-) -> Constrained:
-    """Minimise over b = b0 + N t, E N = 0, E b0 = d, in units that give the columns of R unit norm."""
-    p = len(factor) - 1
-    norms = np.linalg.norm(factor[:p, :p], axis=0)
-    unit = 1.0 / np.where(norms > 0.0, norms, 1.0)
-    scaled = equal * unit
-    size = np.linalg.norm(scaled, axis=1)
-    if not size.all():
-        raise CalibError(f"equality {int(np.argmin(size)) + 1} acts on no parameter")
-    left, values, right = np.linalg.svd(scaled / size[:, None])
-    rank = int(np.sum(values > 1e-10 * values[0]))
-    origin = right[:rank].T @ ((left[:, :rank].T @ (held / size)) / values[:rank])
-    away = np.abs(scaled @ origin - held) / np.maximum(np.abs(held), size * max(float(np.abs(origin).max()), 1e-300))
-    require(away.max() <= 1e-8, "equalities contradict each other: no point satisfies all of them")
-    require(rank != p, f"equalities fix all {p} parameters: they leave nothing to estimate")
-    origin, basis = unit * origin, unit[:, None] * right[rank:].T
-    reduced = retriangulate(np.column_stack([factor[:, :p] @ basis, factor[:, p] - factor[:, :p] @ origin]))
-    found = minimise(reduced[: p - rank + 1], rows @ basis, rows @ origin + offset)
-    whole = origin + basis @ found.values
-    slope = factor[:p, :p].T @ (factor[:p, :p] @ whole - factor[:p, p]) - rows.T @ found.multipliers
-    pushing = np.linalg.lstsq((scaled / size[:, None]).T, slope * unit)[0] / size
-    return replace(
-        found, values=frozen(whole), covariance=frozen(basis @ found.covariance @ basis.T),
-        multipliers=frozen(np.append(found.multipliers, pushing)),
-        slack=frozen(np.append(found.slack, np.zeros(len(equal)))),
-        binding=frozen(np.append(found.binding, np.ones(len(equal), bool)), bool),
-        normals=frozen(np.vstack([rows, equal])),
+    return _frozen(
+        found.values, np.insert(found.multipliers, place, zero), np.insert(found.slack, place, slack),
+        np.insert(found.binding, place, zero > 0.0), np.insert(found.normals, place, normals, axis=0),
     )  # fmt: skip

@@ -1,0 +1,130 @@
+"""The cone program behind constrained least squares, in units of its own, by Clarabel (Goulart & Chen 2024)."""
+
+# pyright: reportAttributeAccessIssue=false
+# clarabel is a compiled extension without stubs
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.arrays import shaped
+from calib.errors import NotConverged
+from calib.estimation.triangles import require_rank
+
+SLACK = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
+ACCURACIES = 1e-10, 1e-8  # of the scaled problem; the second where rounding forbids the first
+
+
+@dataclass(frozen=True, eq=False)
+class Definite:
+    """Matrices M_k(b) = Σ_j A_kj b_j whose eigenvalues must not be below `least`.
+
+    Attributes:
+        matrices: A (K, n, n, p), symmetric.
+        least: above zero.
+        likely: indices of those that bound the optimum of a problem much like this one, to begin with.
+    """
+
+    matrices: np.ndarray
+    least: float
+    likely: np.ndarray | None = None
+
+    def least_eigenvalues(self, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (K,) by how much the smallest eigenvalues are above `least`, and their slopes (K, p) by b (p,)."""
+        size, n, _, p = self.matrices.shape
+        flat = self.matrices.reshape(size, n * n, p)
+        values, vectors = np.linalg.eigh((flat @ b).reshape(size, n, n))
+        pairs = vectors[:, :, None, 0] * vectors[:, None, :, 0]
+        return values[:, 0] - self.least, np.asarray((pairs.reshape(size, 1, n * n) @ flat)[:, 0])
+
+    def satisfied(self, sizes: np.ndarray) -> bool:
+        """Say whether smallest eigenvalues (K,), as above `least`, are those of definite matrices."""
+        return bool((sizes >= -SLACK * self.least).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """The problem in b / unit, with columns of R of unit norm and ‖z‖ = 1, rows A of unit norm.
+
+    Attributes:
+        upper, target: R (p, p), z (p,).
+        unit, length: (p,) of b, and ‖z‖ as they were.
+        rows, offset, sizes: A (c, p), c (c,), and the norms (c,) that A had in these units.
+    """
+
+    upper: np.ndarray
+    target: np.ndarray
+    unit: np.ndarray
+    length: float
+    rows: np.ndarray
+    offset: np.ndarray
+    sizes: np.ndarray
+
+    def h(self, b: np.ndarray) -> np.ndarray:
+        return np.asarray(self.rows @ b + self.offset)
+
+
+def scale(factor: np.ndarray, rows: np.ndarray, offset: np.ndarray) -> Scaled:
+    """Return min ½ ‖R b - z‖² under A b + c >= 0 in units of its own.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        rows, offset: A (c, p), c (c,).
+    """
+    factor = shaped(factor, (len(factor), len(factor)), "triangle [R z]")
+    p = len(factor) - 1
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
+    require_rank(upper, [f"x{k + 1}" for k in range(p)])
+    length = float(np.linalg.norm(factor[:p, p])) or 1.0
+    unit = length / norms
+    sizes = np.linalg.norm(rows * unit, axis=1)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    return Scaled(upper, factor[:p, p] / length, unit, length, rows * unit / sizes[:, None], offset / sizes, sizes)
+
+
+def minimise(
+    problem: Scaled, fixed: Scaled, matrices: np.ndarray, least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return b, and multipliers of rows, of matrices (k, n, n) and of equalities; t = R b - z is a variable too.
+
+    So nothing is squared.
+
+    Raises:
+        NotConverged: where no point satisfies all.
+    """
+    import clarabel
+    from scipy import sparse
+
+    size, n, _, p = matrices.shape
+    i, j = np.tril_indices(n)[::-1]  # upper triangle, column by column
+    weight = np.where(i == j, 1.0, np.sqrt(2.0))
+    flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
+    rows = np.vstack([problem.upper, fixed.rows, -problem.rows, -flat])
+    beside = np.zeros((len(rows), p))
+    beside[:p] = -np.eye(p)
+    right = np.concatenate([
+        problem.target, -fixed.offset, problem.offset, -np.tile(np.where(i == j, least, 0.0), size)
+    ])  # fmt: skip
+    ends = np.cumsum([p, len(fixed.rows), len(problem.rows)])
+    cones = [clarabel.ZeroConeT(int(ends[1]))]
+    if len(problem.rows):
+        cones.append(clarabel.NonnegativeConeT(len(problem.rows)))
+    cones += [clarabel.PSDTriangleConeT(n)] * size
+    settings = clarabel.DefaultSettings()
+    settings.verbose, settings.max_threads = False, 1
+    cost = sparse.diags(np.repeat([0.0, 1.0], p)).tocsc()
+    system = sparse.csc_matrix(np.hstack([rows, beside]))
+    for accuracy in ACCURACIES:
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
+        found = clarabel.DefaultSolver(cost, np.zeros(2 * p), system, right, cones, settings).solve()
+        if str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
+            break
+    b, dual = np.array(found.x)[:p], np.array(found.z)
+    if str(found.status) not in ("Solved", "AlmostSolved"):
+        raise NotConverged(f"the constraints may contradict each other: Clarabel says {found.status}", b * problem.unit)
+    pushes = np.zeros((size, n, n))
+    pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
+    pushes[:, j, i] = pushes[:, i, j]
+    return b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]]
