@@ -4,26 +4,171 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NoReturn
+
+import numpy as np
 
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.errors import MeasurementError, suggestion
+from calib.data.schema import BOUNDS, Column
+from calib.errors import MeasurementError, one_of, suggestion
 
 SUFFIXES = ("", "_meas", "_measured")
-POSITION = ("x", "y", "z")
-QUATERNION = ("qx", "qy", "qz", "qw")
-MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
+POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
+QUATERNION = Column(("qx", "qy", "qz", "qw"))
+MATRIX = Column(tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))
 ANGLES = tuple(tuple(names.split()) for names in ("rx ry rz", "roll pitch yaw", "a b c", "w p r", "rpy_x rpy_y rpy_z"))
-SIGMA = ("sigma_x", "sigma_y", "sigma_z")
-SIGMA_ROTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
-BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
+TURNS = Column(ANGLES[0], "angle", "orientation", BOUNDS.max_turn, "deg")
+SIGMA = Column(
+    ("sigma_x", "sigma_y", "sigma_z"), "length", "sigma",
+    positive="a sigma must be above 0; where it was rounded to 0, set sigma.floor in the options",
+)  # fmt: skip
+SIGMA_ROTATION = Column(
+    ("sigma_rx", "sigma_ry", "sigma_rz"), "angle", "sigma_rotation", positive="a sigma must be above 0"
+)
+DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", positive="a distance must be above 0")
+SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
+BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
-OURS = (*POSITION, *QUATERNION, *MATRIX, *ANGLES[0], *SIGMA, *SIGMA_ROTATION, "sigma_distance", *BASE, *LABELS)
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
+OURS = (
+    tuple(
+        name
+        for column in (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE)
+        for name in column.names
+    )
+    + LABELS
+)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table, and how the options say that it is read.
+
+    Attributes:
+        table: as the file has it.
+        options: names and units that the header does not tell.
+        suffixes: that may stand behind our names of columns that go together.
+    """
+
+    table: Table
+    options: FileOptions = field(default_factory=FileOptions)
+    suffixes: tuple[str, ...] = SUFFIXES
+
+    def fail(self, message: str, column: str | None = None) -> NoReturn:
+        """Refuse the file, or a column of it."""
+        raise MeasurementError(message, self.table.file, column=column)
+
+    def find(self, name: str) -> str:
+        """Return the file's name of the column that we call `name`; "" where it has none."""
+        theirs = self.options.columns.get(name, name)
+        return theirs if theirs in self.table else ""
+
+    def unit(self, column: str, family: str) -> str:
+        """Return the unit that header or options state for a column; "" for none."""
+        ours = {theirs: name for name, theirs in self.options.columns.items()}
+        return self.table.units[self.table.index(column)] or self._stated(ours.get(column, column), column, family)
+
+    def _stated(self, ours: str, column: str, family: str) -> str:
+        units = self.options.units
+        return units.get(ours, units.get(column, units.get(family, "")))
+
+    def numbers(self, names: Sequence[str], column: Column, gaps: bool = False) -> np.ndarray:
+        """Return columns (m, k) in SI, within the bounds of what they are; a gap is NaN."""
+        ours = {theirs: name for name, theirs in self.options.columns.items()}
+        stated = [self._stated(ours.get(name, name), name, column.family) for name in names]
+        values = [self.table.numbers(name, column.dimension, unit, gaps) for name, unit in zip(names, stated)]
+        return column.check(np.stack(values, axis=1), self.table, names)
+
+    def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return joint values (m, n) [rad or m] and the file's names of their columns."""
+        names = self.find_joints(joints)
+        return self.numbers(names, Column(tuple(joints), "joint", "joints")), names
+
+    def check_names(self, joints: Sequence[str]) -> None:
+        """Refuse options that name a column which neither we nor the file have."""
+        ours = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
+        for name, theirs in self.options.columns.items():
+            if name not in ours and not _TARGET.fullmatch(name):
+                message = f"the options map a column '{name}', which is none of ours{suggestion(name, ours)}"
+                self.fail(f"{message}; ours are {', '.join(ours)}", theirs)
+            self.table.index(theirs)
+        for name in (*self.options.groups, *self.options.where):
+            self.table.index(name)
+        for name, unit in self.options.units.items():
+            if name not in (*ours, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
+                message = f"the options give a unit {unit} for '{name}', which is no column"
+                self.fail(message + suggestion(name, (*ours, *UNIT_GROUPS)), name)
+
+    def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return the file's names of the joint columns in the robot's order.
+
+        Accepted: the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these that occurs.
+        """
+        n, table, mapping = len(joints), self.table, self.options.columns
+        numbered = tuple(f"q{i + 1}" for i in range(n))
+        mapped = [mapping.get(joint) or mapping.get(q) for joint, q in zip(joints, numbered)]
+        for form in (tuple(joints), tuple(f"q_{joint}" for joint in joints), numbered):
+            found = tuple(theirs or (name if name in table else "") for name, theirs in zip(form, mapped))
+            if all(found):
+                self._no_extra(found)
+                return found
+            if any(name in table for name in form):
+                missing = next(name for name, there in zip(form, found) if not there)
+                have = ", ".join(name for name in found if name)
+                near = suggestion(missing, table.header)
+                self.fail(f"missing{near}: the robot has {n} joints, the header has only {have}", missing)
+        message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
+        self.fail(f"{message}. Map them in the options' [columns]")
+
+    def _no_extra(self, found: Sequence[str]) -> None:
+        if all(re.fullmatch(r"q\d+", name) for name in found):
+            extra = [name for name in self.table.header if re.fullmatch(r"q\d+", name) and name not in found]
+            if extra:
+                self.fail(
+                    f"the robot has {len(found)} joints, and this is one more: is it the right robot (chain)?", extra[0]
+                )
+
+    def family(self, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
+        """Return the file's names of columns that go together (plain, or with a suffix); () if none is there.
+
+        Where the options map some of them, the others are those that the file has under one of these names.
+
+        Raises:
+            MeasurementError: where one is missing, or the file has them under several of these names.
+        """
+        ours = [name + mark for name in names]
+        if any(name in self.options.columns for name in ours):
+            return tuple(self._mapped(name, ours) for name in ours)
+        forms = [[name + suffix for name in ours] for suffix in self.suffixes]
+        complete = [form for form in forms if all(name in self.table for name in form)]
+        if len(complete) > 1:
+            first, second = (", ".join(form) for form in complete[:2])
+            one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, complete[-1]))
+            message = f"the header has {first} and {second}: which of them are to be read? Map them in the options"
+            self.fail(f"{message}: [columns] {one}", complete[0][0])
+        if complete:
+            return tuple(complete[0])
+        for form in forms:
+            missing = [name for name in form if name not in self.table]
+            if len(missing) < len(form):
+                near = suggestion(missing[0], self.table.header)
+                self.fail(f"missing{near}: {', '.join(form)} go together", missing[0])
+        return ()
+
+    def _mapped(self, name: str, together: Sequence[str]) -> str:
+        """Return the file's name of one of the columns `together`, of which the options map some."""
+        if name in self.options.columns:
+            return self.options.columns[name]
+        found = [name + suffix for suffix in self.suffixes if name + suffix in self.table]
+        if len(found) == 1:
+            return found[0]
+        what = " and ".join(found) + " could be it" if found else f"missing{suggestion(name, self.table.header)}"
+        self.fail(f"{what}: {', '.join(together)} go together, and [columns] maps some of them only; map it, too", name)
 
 
 @dataclass(frozen=True)
@@ -37,10 +182,11 @@ class Layout:
         sigmas: the three sigmas of each target; () where not stated.
         orientation: four names (quaternion), nine (matrix), three (angles, whose meaning the options state), or none.
         sigma_rotation: three names or none.
-        distance, sigma_distance, tool: one name or "".
+        distance: its name, and that of its sigma where there is one.
+        tool: one name or "".
         group: the columns whose labels together name a row's group.
         base: position and quaternion of a frame on the robot's base, seven names, or none.
-        notes: what a user should be told of the choice.
+        notes: what a user should know of the choice.
     """
 
     kind: str
@@ -49,274 +195,166 @@ class Layout:
     sigmas: tuple[tuple[str, ...], ...] = ()
     orientation: tuple[str, ...] = ()
     sigma_rotation: tuple[str, ...] = ()
-    distance: str = ""
-    sigma_distance: str = ""
+    distance: tuple[str, ...] = ()
     tool: str = ""
     group: tuple[str, ...] = ()
     base: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def ignored(self, table: Table) -> tuple[str, ...]:
-        """Return the columns of `table` that are not read, in its order."""
-        return tuple(name for name in table.header if name not in self.used)
-
     @property
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
-        used = {*self.joints, *self.orientation, *self.sigma_rotation, *self.group, *self.base}
-        used |= {self.distance, self.sigma_distance, self.tool}
-        used.update(name for names in (*self.positions, *self.sigmas) for name in names)
-        return frozenset(used)
+        families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
+        return frozenset(name for names in (*families, self.joints, self.base, (self.tool,)) for name in names)
 
 
-def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout:
-    """Return which columns of `table` are to be read for a robot with these joints.
+def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+    """Return which columns of a table are to be read for a robot with these joints.
 
     Raises:
         MeasurementError: where a column is missing or mapped in vain, or the header allows several kinds, or several
             triples, and the options name none.
     """
-    check_names(table, options, joints)
-    found = _layout(table, options, joints)
+    sheet.check_names(joints)
+    found = _layout(sheet, joints)
     numbers = (*found.joints, *(name for names in found.positions for name in names), *found.orientation)
-    twice = sorted({name for name in numbers if numbers.count(name) > 1})
-    if twice:
+    if twice := sorted({name for name in numbers if numbers.count(name) > 1}):
         message = "is read twice, as two different columns: is one of them mapped to it by mistake? See [columns]"
-        raise MeasurementError(message, table.file, column=twice[0])
+        sheet.fail(message, twice[0])
     if found.kind == "pose":
-        _check_one_source(table, options, found.positions[0], found.orientation)
-    for name, theirs in options.columns.items():
+        _check_one_source(sheet, found.positions[0], found.orientation)
+    for name, theirs in sheet.options.columns.items():
         if theirs not in found.used:
-            message = (
-                f"is mapped to '{name}' by the options, yet nothing reads it in a file of kind '{found.kind}': take "
+            sheet.fail(
+                f"is mapped to '{name}' by the options, yet nothing reads it in a file of kind '{found.kind}': take it "
+                "out of [columns], or state another kind",
+                theirs,
             )
-            raise MeasurementError(f"{message}it out of [columns], or state another kind", table.file, column=theirs)
     return found
 
 
-def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout:
-    columns = find_joints(table, options, joints)
-    kind = _find_kind(table, options, columns)
+def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+    columns = sheet.find_joints(joints)
+    kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
-        return _grouped_layout(table, options, kind, columns)
-    positions, sigmas, notes = _find_targets(table, options)
+        return _grouped_layout(sheet, kind, columns)
+    positions, sigmas, notes = _find_targets(sheet)
     if not positions:
-        table.index("x")
-    tool, base = _find(table, options, "tool"), _family(table, options, BASE)
+        sheet.table.index("x")
+    tool, base = sheet.find("tool"), sheet.family(BASE.names)
     if kind == "position":
         return Layout(kind, columns, positions, sigmas, tool=tool, base=base, notes=notes)
-    orientation = _find_orientation(table, options, columns)
+    orientation = _find_orientation(sheet, columns)
     if not orientation:
-        message = "kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them"
-        raise MeasurementError(message, table.file)
+        sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
     if len(positions) > 1:
-        message = "kind 'pose' allows one target per row, found numbered positions"
-        raise MeasurementError(message, table.file, column=positions[1][0])
+        sheet.fail("kind 'pose' allows one target per row, found numbered positions", positions[1][0])
     if orientation[0] not in ("qx", "r11"):
-        meaning = f" as {options.euler}" if len(orientation) == len(ANGLES[0]) else ""
+        meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
-    rotation = _family(table, options, SIGMA_ROTATION)
+    rotation = sheet.family(SIGMA_ROTATION.names)
     return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, base=base, notes=notes)
 
 
-def _check_one_source(table: Table, options: FileOptions, position: Sequence[str], orientation: Sequence[str]) -> None:
+def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
     """Refuse a plain position beside a measured orientation, or the reverse: the plain columns may be the command.
 
     Measured is what is named so, or what the options map though the file has the plain names, too.
     """
-    plain = {len(QUATERNION): QUATERNION, len(MATRIX): MATRIX}.get(len(orientation))
+    plain = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
     names = plain or tuple(re.sub(f"({'|'.join(SUFFIXES[1:])})$", "", name) for name in orientation)
-    families = ((POSITION, position), (names, orientation))
+    families = ((POSITION.names, position), (names, orientation))
     for (names, plain), (others, measured) in (families, families[::-1]):
-        if plain != names or any(name in options.columns for name in names) or measured == others:
+        if plain != names or any(name in sheet.options.columns for name in names) or measured == others:
             continue
-        if measured[0].endswith(SUFFIXES[1:]) or all(name in table for name in others):
+        if measured[0].endswith(SUFFIXES[1:]) or all(name in sheet.table for name in others):
             mapped = ", ".join(f'{name} = "{name}"' for name in names)
-            alone = "" if names == POSITION else ', or read the positions alone (kind = "position")'
-            message = (
+            alone = "" if names == POSITION.names else ', or read the positions alone (kind = "position")'
+            sheet.fail(
                 f"the header has {', '.join(names)} beside {', '.join(measured)}: were the former measured, too, or "
-                f"are they what was commanded? If measured, map them in the options ([columns] {mapped}){alone}"
+                f"are they what was commanded? If measured, map them in the options ([columns] {mapped}){alone}",
+                names[0],
             )
-            raise MeasurementError(message, table.file, column=names[0])
 
 
-def _grouped_layout(table: Table, options: FileOptions, kind: str, joints: tuple[str, ...]) -> Layout:
+def _grouped_layout(sheet: Sheet, kind: str, joints: tuple[str, ...]) -> Layout:
     label = LABEL_OF[kind]
-    measured = kind in ("distance", "bar")
-    for name in (label, "distance") if measured else (label,):
-        table.index(options.columns.get(name, name))
-    own = _find(table, options, label)
-    fixture = tuple(name for name in ("tool_position",) if kind == "sockets" and name in table)
-    others = options.groups or fixture
-    return Layout(
-        kind,
-        joints,
-        distance=_find(table, options, "distance") if measured else "",
-        sigma_distance=_find(table, options, "sigma_distance") if measured else "",
-        tool=_find(table, options, "tool"),
-        group=(*(name for name in others if name != own), own),
-    )
+    measured = (label, "distance") if kind in ("distance", "bar") else (label,)
+    for name in measured:
+        sheet.table.index(sheet.options.columns.get(name, name))
+    own = sheet.find(label)
+    fixture = tuple(name for name in ("tool_position",) if kind == "sockets" and name in sheet.table)
+    group = (*(name for name in sheet.options.groups or fixture if name != own), own)
+    distance = [sheet.find(name) for name in ("distance", "sigma_distance") if len(measured) > 1]
+    return Layout(kind, joints, distance=tuple(filter(None, distance)), tool=sheet.find("tool"), group=group)
 
 
-def check_names(table: Table, options: FileOptions, joints: Sequence[str]) -> None:
-    """Refuse options that name a column which neither we nor the file have."""
-    ours = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
-    for name, theirs in options.columns.items():
-        if name not in ours and not _TARGET.fullmatch(name):
-            message = f"the options map a column '{name}', which is none of ours{suggestion(name, ours)}"
-            raise MeasurementError(f"{message}; ours are {', '.join(ours)}", table.file, column=theirs)
-        table.index(theirs)
-    for name in (*options.groups, *options.where):
-        table.index(name)
-    for name, unit in options.units.items():
-        if name not in (*ours, *UNIT_GROUPS, *table.header) and not _TARGET.fullmatch(name):
-            message = f"the options give a unit {unit} for '{name}', which is no column"
-            raise MeasurementError(message + suggestion(name, (*ours, *UNIT_GROUPS)), table.file, column=name)
-
-
-def find_joints(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the file's names of the joint columns in the robot's order.
-
-    Accepted: the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that occurs.
-    """
-    n = len(joints)
-    numbered = tuple(f"q{i + 1}" for i in range(n))
-    mapped = [options.columns.get(joint) or options.columns.get(q) for joint, q in zip(joints, numbered)]
-    for form in (tuple(joints), tuple(f"q_{joint}" for joint in joints), numbered):
-        found = tuple(theirs or (name if name in table else "") for name, theirs in zip(form, mapped))
-        if all(found):
-            _no_extra(table, found)
-            return found
-        if any(name in table for name in form):
-            missing = next(name for name, there in zip(form, found) if not there)
-            have = ", ".join(name for name in found if name)
-            message = (
-                f"missing{suggestion(missing, table.header)}: the robot has {n} joints, the header has only {have}"
-            )
-            raise MeasurementError(message, table.file, column=missing)
-    message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
-    raise MeasurementError(f"{message}. Map them in the options' [columns]", table.file)
-
-
-def _find_orientation(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
+def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of a quaternion's four columns, a matrix's nine, three angles', or none.
 
     Raises:
         MeasurementError: for three angles whose meaning the options do not state.
     """
-    found = _family(table, options, QUATERNION) or _family(table, options, MATRIX) or _angles(table, options, joints)
-    if len(found) == len(ANGLES[0]) and not options.euler:
-        message = (
+    found = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
+    if len(found) == 3 and not sheet.options.euler:
+        sheet.fail(
             f"{', '.join(found)} look like an orientation. State in the options what they mean: euler = 'vector' "
             "(rotation vector, as Universal Robots have it), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
-            "B, C) ...; or kind = 'position' to leave them out"
+            "B, C) ...; or kind = 'position' to leave them out",
+            found[0],
         )
-        raise MeasurementError(message, table.file, column=found[0])
     return found
 
 
-def _angles(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
+def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of three angles, capital letters or not, that are no joints; () if there are none.
 
     Columns named by one small letter (a, b, c) are anything, unless the options state what angles mean.
     """
-    if any(name in options.columns for name in ANGLES[0]):
-        return _family(table, options, ANGLES[0])
-    any_name = (name for name in table.header if name not in joints)
+    first, options = ANGLES[0], sheet.options
+    if any(name in options.columns for name in first):
+        return sheet.family(first)
+    any_name = (name for name in sheet.table.header if name not in joints)
     known = {name.lower(): name for name in any_name if options.euler or len(name) > 1 or name.isupper()}
     forms = [[name + suffix for name in names] for names in ANGLES for suffix in SUFFIXES]
     complete = [tuple(known[name] for name in form) for form in forms if all(name in known for name in form)]
     if len(complete) > 1:
-        one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ANGLES[0], complete[-1]))
+        one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(first, complete[-1]))
         message = f"the header has {', '.join(complete[0])} and {', '.join(complete[1])}: which are to be read?"
-        raise MeasurementError(f"{message} Map them in the options: [columns] {one}", table.file, column=complete[0][0])
+        sheet.fail(f"{message} Map them in the options: [columns] {one}", complete[0][0])
     return complete[0] if complete else ()
 
 
-def _no_extra(table: Table, found: Sequence[str]) -> None:
-    if all(re.fullmatch(r"q\d+", name) for name in found):
-        extra = [name for name in table.header if re.fullmatch(r"q\d+", name) and name not in found]
-        if extra:
-            message = f"the robot has {len(found)} joints, and this is one more: is it the right robot (chain)?"
-            raise MeasurementError(message, table.file, column=extra[0])
-
-
-def _find_kind(table: Table, options: FileOptions, joints: Sequence[str]) -> str:
-    if options.kind:
-        if options.kind not in KINDS:
-            raise MeasurementError(f"kind '{options.kind}' is none of {', '.join(KINDS)}", table.file)
-        return options.kind
-    kinds = [kind for kind, label in LABEL_OF.items() if _find(table, options, label)]
-    if any(kind in kinds for kind in ("distance", "bar")) and not _find(table, options, "distance"):
+def _find_kind(sheet: Sheet, joints: Sequence[str]) -> str:
+    if sheet.options.kind:
+        return one_of(sheet.options.kind, KINDS, "kind", MeasurementError, sheet.table.file)
+    kinds = [kind for kind, label in LABEL_OF.items() if sheet.find(label)]
+    if not sheet.find("distance"):
         kinds = [kind for kind in kinds if kind not in ("distance", "bar")]
-    if _find_targets(table, options)[0]:
-        kinds.append("pose" if _find_orientation(table, options, joints) else "position")
-    if len(kinds) == 1:
-        return kinds[0]
-    if kinds:
-        message = f"the header allows the kinds {', '.join(kinds)}: say which one in the options (kind = '{kinds[0]}')"
-        raise MeasurementError(message, table.file)
-    needed = "x y z (position), with qx qy qz qw (pose), distance with pair or bar, socket, or plane"
-    message = f"nothing measured found: expected columns {needed}; the header has {', '.join(table.header)}"
-    raise MeasurementError(f"{message}. Map other names in the options' [columns]", table.file)
+    if _find_targets(sheet)[0]:
+        kinds.append("pose" if _find_orientation(sheet, joints) else "position")
+    if len(kinds) > 1:
+        several = ", ".join(kinds)
+        sheet.fail(f"the header allows the kinds {several}: say which one in the options (kind = '{kinds[0]}')")
+    if not kinds:
+        needed = "x y z (position), with qx qy qz qw (pose), distance with pair or bar, socket, or plane"
+        message = f"nothing measured found: expected columns {needed}; the header has {', '.join(sheet.table.header)}"
+        sheet.fail(f"{message}. Map other names in the options' [columns]")
+    return kinds[0]
 
 
-def _find_targets(table: Table, options: FileOptions) -> tuple[tuple, tuple, tuple[str, ...]]:
+def _find_targets(sheet: Sheet) -> tuple[tuple, tuple, tuple[str, ...]]:
     """Return positions, sigmas and notes: the unnumbered triple, else x1 y1 z1, x2 y2 z2, ..."""
-    marks = sorted({int(name[1:]) for name in (*table.header, *options.columns) if re.fullmatch(r"[xyz]\d+", name)})
-    plain = _family(table, options, POSITION)
+    all_names = (*sheet.table.header, *sheet.options.columns)
+    marks = sorted({int(name[1:]) for name in all_names if re.fullmatch(r"[xyz]\d+", name)})
+    plain = sheet.family(POSITION.names)
     chosen = [""] if plain else [str(mark) for mark in marks]
-    positions = tuple(_family(table, options, POSITION, mark) for mark in chosen)
-    common = _family(table, options, SIGMA)
-    sigmas = tuple(_family(table, options, SIGMA, mark) or common for mark in chosen)
+    positions = tuple(sheet.family(POSITION.names, mark) for mark in chosen)
+    common = sheet.family(SIGMA.names)
+    sigmas = tuple(sheet.family(SIGMA.names, mark) or common for mark in chosen)
     notes = ()
     if plain and plain[0] != "x":
         notes = (f"the position is read from {', '.join(plain)}",)
     if plain and marks:
         notes = (*notes, f"the numbered positions x{marks[0]}... are not read beside {', '.join(plain)}")
     return positions, sigmas if all(sigmas) else (), notes
-
-
-def _family(table: Table, options: FileOptions, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
-    """Return the file's names of columns that go together (plain, ``_meas``, ``_measured``); () if none is there.
-
-    Where the options map some of them, the others are those that the file has under one of these names.
-
-    Raises:
-        MeasurementError: where one is missing, or the file has them under several of these names.
-    """
-    ours = [name + mark for name in names]
-    if any(name in options.columns for name in ours):
-        return tuple(_mapped(table, options, name, ours) for name in ours)
-    forms = [[name + suffix for name in ours] for suffix in SUFFIXES]
-    complete = [form for form in forms if all(name in table for name in form)]
-    if len(complete) > 1:
-        first, second = (", ".join(form) for form in complete[:2])
-        one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, complete[-1]))
-        message = f"the header has {first} and {second}: which of them are to be read? Map them in the options"
-        raise MeasurementError(f"{message}: [columns] {one}", table.file, column=complete[0][0])
-    if complete:
-        return tuple(complete[0])
-    for form in forms:
-        missing = [name for name in form if name not in table]
-        if len(missing) < len(form):
-            message = f"missing{suggestion(missing[0], table.header)}: {', '.join(ours)} go together"
-            raise MeasurementError(message, table.file, column=missing[0])
-    return ()
-
-
-def _mapped(table: Table, options: FileOptions, name: str, together: Sequence[str]) -> str:
-    """Return the file's name of one column of a family of which the options map some."""
-    if name in options.columns:
-        return options.columns[name]
-    found = [name + suffix for suffix in SUFFIXES if name + suffix in table]
-    if len(found) == 1:
-        return found[0]
-    what = f"{' and '.join(found)} could be it" if found else f"missing{suggestion(name, table.header)}"
-    message = f"{what}: {', '.join(together)} go together, and [columns] maps some of them only; map it, too"
-    raise MeasurementError(message, table.file, column=name)
-
-
-def _find(table: Table, options: FileOptions, name: str) -> str:
-    theirs = options.columns.get(name, name)
-    return theirs if theirs in table else ""

@@ -31,7 +31,7 @@ from calib.data.camera.corner_file import Detection, Found
 from calib.data.camera.lens import Lens
 from calib.data.csv_table import Table, read_table
 from calib.data.poses import plausible
-from calib.data.poses.columns import find_joints
+from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plausible import Limits
@@ -74,9 +74,9 @@ def read_images(
     path, options = Path(path), options or FileOptions()
     board = read_own_board(path)
     table = joint_table(path)
-    columns = find_joints(table, options, joints)
-    q = np.stack([table.numbers(name, "joint", options.units.get("joints", "")) for name in columns], axis=1)
-    notes = list(plausible.check_joints(q, table, columns, joints, options, kinds, limits))
+    sheet = Sheet(table, options)
+    q, columns = sheet.joints(joints)
+    notes = list(plausible.check_joints(q, sheet, columns, joints, kinds, limits))
     found = find_corners(path, board, table.texts("image"), progress)
     names = table.texts("image")
     rows, said = _usable(names, found, path)

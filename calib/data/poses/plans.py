@@ -15,11 +15,11 @@ from calib import files
 from calib.arrays import shaped
 from calib.data.csv_table import read_table
 from calib.data.poses import plausible
-from calib.data.poses.columns import check_names, find_joints
+from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plausible import Limits
-from calib.data.poses.pose_files import read_joints
+from calib.data.schema import BOUNDS
 from calib.errors import MeasurementError
 
 DIGITS = 9  # of one number or more in a row that was computed: values typed by a person have fewer (our choice)
@@ -71,15 +71,21 @@ def read_poses(
     limits: Limits | None = None,
 ) -> np.ndarray:
     """Read joint values (m, n) [rad or m] in the order of `joints`; columns and checks as for measurements."""
-    options = options or FileOptions()
-    table = read_table(path)
-    check_names(table, options, joints)
-    columns = find_joints(table, options, joints)
-    q = read_joints(table, options, columns)
+    sheet = Sheet(read_table(path), options or FileOptions())
+    sheet.check_names(joints)
+    q, columns = sheet.joints(joints)
     if len(q) > 1:
-        moves = np.ptp(q, axis=0).max() > plausible.STILL  # one pose several times: who drives there says more of it
-        plausible.check_joints(q if moves else q[:1], table, columns, joints, options, kinds, limits)
+        check_planned(q, sheet, columns, joints, kinds, limits)
     return q
+
+
+def check_planned(
+    q: np.ndarray, sheet: Sheet, columns: Sequence[str], joints: Sequence[str], kinds: Sequence[str] | None,
+    limits: Limits | None,
+) -> tuple[str, ...]:  # fmt: skip
+    """Return the notes of `calib.data.poses.plausible.check_joints`; one pose several times is no fault of a plan."""
+    moves = np.ptp(q, axis=0).max() > BOUNDS.min_travel
+    return plausible.check_joints(q if moves else q[:1], sheet, columns, joints, kinds, limits)
 
 
 def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = NEAR) -> tuple[str, ...]:

@@ -27,17 +27,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from calib.data.csv_table import Table, read_header, read_table
+from calib.data.csv_table import read_header, read_table
 from calib.data.poses import plausible, robodk
 from calib.data.poses.base_frame import relative_to_base
-from calib.data.poses.columns import OURS, SUFFIXES, Layout, find_layout
+from calib.data.poses.columns import OURS, POSITION, SIGMA, SIGMA_ROTATION, SUFFIXES, Layout, Sheet, find_layout
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.grouped import labels, read_groups
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.plausible import Limits
-from calib.errors import MeasurementError
+from calib.data.schema import refuse
 
 
 def read_measurements(
@@ -69,8 +68,14 @@ def read_measurements(
         table, options, notes = robodk.read_robodk(path, len(joints), options)
     else:
         table, notes = read_table(path), ()
-    block = _measurements(table, joints, options, kinds=kinds, limits=limits)
-    return [replace(block, notes=(*notes, *block.notes))]
+    sheet = _select_rows(Sheet(table, options))
+    layout = find_layout(sheet, joints)
+    q, _ = sheet.joints(joints)
+    notes = (*notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, joints, kinds, limits))
+    block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)
+    ignored = tuple(name for name in sheet.table.header if name not in layout.used)
+    station = options.station or Path(table.file).stem
+    return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
 
 
 def joint_columns(path: str | Path) -> tuple[str, ...]:
@@ -87,144 +92,79 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
     )
 
 
-def _measurements(
-    table: Table,
-    joints: Sequence[str],
-    options: FileOptions,
-    *,
-    kinds: Sequence[str] | None = None,
-    limits: Limits | None = None,
-) -> PoseMeasurements:
-    """Return what `table` holds, as `read_measurements`."""
-    table = _select_rows(table, options)
-    layout = find_layout(table, options, joints)
-    q = read_joints(table, options, layout.joints)
-    notes = (*layout.notes, *plausible.check_joints(q, table, layout.joints, joints, options, kinds, limits))
-    block = (_read_targets if layout.positions else read_groups)(table, options, layout, q)
-    station = options.station or Path(table.file).stem
-    return replace(block, station=station, ignored=layout.ignored(table), notes=(*notes, *block.notes))
-
-
-def _select_rows(table: Table, options: FileOptions) -> Table:
+def _select_rows(sheet: Sheet) -> Sheet:
     """Return the rows whose cells have the values that ``where`` allows."""
-    keep = np.ones(len(table), dtype=bool)
-    for name, values in options.where.items():
+    table, keep = sheet.table, np.ones(len(sheet.table), dtype=bool)
+    for name, values in sheet.options.where.items():
         texts = table.texts(name)
         keep &= np.isin(texts, list(values))
         if not keep.any():
             found = ", ".join(list(dict.fromkeys(texts))[:10])
-            message = f"no row is left by where = {', '.join(values)}; found {found}"
-            raise MeasurementError(message, table.file, column=name)
-    return table if keep.all() else table.where(keep)
+            sheet.fail(f"no row is left by where = {', '.join(values)}; found {found}", name)
+    return sheet if keep.all() else replace(sheet, table=table.where(keep))
 
 
-def read_joints(table: Table, options: FileOptions, columns: Sequence[str]) -> np.ndarray:
-    """Return joint values (m, n) [rad or m]."""
-    return _numbers(table, options, columns, "joint", "joints")
-
-
-def _numbers(
-    table: Table, options: FileOptions, names: Sequence[str], dimension: str, family: str, gaps: bool = False
-) -> np.ndarray:
-    """Read columns (m, k) in SI; the options may state a column's unit, or that of its family."""
-    ours = {theirs: name for name, theirs in options.columns.items()}
-    units = options.units
-    stated = [units.get(ours.get(name, name), units.get(name, units.get(family, ""))) for name in names]
-    return np.stack([table.numbers(name, dimension, unit, gaps) for name, unit in zip(names, stated)], axis=1)
-
-
-def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> Positions:
+def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
     """Read positions and poses; each target that was seen makes a row, in the file's order."""
-    several = len(layout.positions) > 1
-    position = np.stack([_position(table, options, names, several) for names in layout.positions], axis=1)
+    table, several = sheet.table, len(layout.positions) > 1
+    position = np.stack([_position(sheet, names, several) for names in layout.positions], axis=1)
     seen = np.asarray(~np.isnan(position).any(axis=2))
     index, target = np.nonzero(seen)
     if not len(index):
-        raise MeasurementError("no target was seen in any row", table.file, column=layout.positions[0][0])
-    names, tool = (options.tool,), target
+        sheet.fail("no target was seen in any row", layout.positions[0][0])
+    names, tool = (sheet.options.tool,), target
     if several:
-        names = tuple(f"{options.tool} {k + 1}" for k in range(len(layout.positions)))
+        names = tuple(f"{sheet.options.tool} {k + 1}" for k in range(len(layout.positions)))
     elif layout.tool:
         names, tool = labels(table, (layout.tool,))
-    sigma = _sigma(table, options, layout, seen)
+    sigma = _sigma(sheet, layout, seen)
+    unseen = len(seen) - np.sum(seen, axis=0)
     common: dict[str, Any] = {
         "sigma": None if sigma is None else sigma[index, target], "tool": tool, "tool_names": names,
-        "file": table.file, "rows": table.rows[index], "notes": _unseen(seen, layout),
+        "file": table.file, "rows": table.rows[index],
+        "notes": tuple(
+            f"{', '.join(names)}: not seen in {count} of {len(seen)} rows"
+            for names, count in zip(layout.positions, unseen)
+            if count
+        ),
     }  # fmt: skip
-    q, places = q[index], position[index, target]
-    block = Positions(q, layout.joints, places, **common)
+    block = Positions(q[index], layout.joints, position[index, target], **common)
     if layout.kind == Poses.kind:
-        turns, about = _orientation(table, options, layout), _sigma_rotation(table, options, layout)
-        block = Poses(q, layout.joints, places, turns, sigma_rotation=about, **common)
-    return _seen_from_base(block, table, options, layout, index) if layout.base else block
+        turns, about = plausible.orientation(sheet, layout.orientation), _sigma_rotation(sheet, layout)
+        block = Poses(q[index], layout.joints, block.position, turns, sigma_rotation=about, **common)
+    if not layout.base:
+        return block
+    base = sheet.numbers(layout.base[:3], POSITION)
+    return relative_to_base(block, base[index], plausible.orientation(sheet, layout.base[3:])[index])
 
 
-def _seen_from_base(
-    block: Positions, table: Table, options: FileOptions, layout: Layout, index: np.ndarray
-) -> Positions:
-    """Return a block relative to the base frame that stands in the same rows."""
-    position = _numbers(table, options, layout.base[:3], "length", "position")
-    quaternion = plausible.unit_quaternions(_numbers(table, options, layout.base[3:], "", ""), table, layout.base[3:])
-    return relative_to_base(block, position[index], quaternion[index])
-
-
-def _position(table: Table, options: FileOptions, names: Sequence[str], gaps: bool) -> np.ndarray:
-    position = _numbers(table, options, names, "length", "position", gaps)
+def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
+    position = sheet.numbers(names, POSITION, gaps)
     empty = np.isnan(position)
-    partial = empty.any(axis=1) & ~empty.all(axis=1)
-    if partial.any():
-        row = int(np.argmax(partial))
-        column = names[int(np.argmax(empty[row]))]
-        message = f"is empty while others of {', '.join(names)} are not; a target not seen has none of them"
-        raise MeasurementError(message, table.file, int(table.rows[row]), column)
-    plausible.check_lengths(position, table, names)
+    partial = empty & ~empty.all(axis=1, keepdims=True)
+    message = f"is empty while others of {', '.join(names)} are not; a target not seen has none of them"
+    refuse(sheet.table, partial, names, lambda row, k: message)
     return position
 
 
-def _unseen(seen: np.ndarray, layout: Layout) -> tuple[str, ...]:
-    counts = len(seen) - np.sum(seen, axis=0)
-    return tuple(
-        f"{', '.join(names)}: not seen in {count} of {len(seen)} rows"
-        for names, count in zip(layout.positions, counts)
-        if count
-    )
-
-
-def _orientation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray:
-    if len(layout.orientation) == 3:
-        angles = _numbers(table, options, layout.orientation, "angle", "orientation")
-        return plausible.turns(angles, table, layout.orientation, options.euler)
-    values = _numbers(table, options, layout.orientation, "", "")
-    if len(layout.orientation) == 4:
-        return plausible.unit_quaternions(values, table, layout.orientation)
-    return Rotation.from_matrix(plausible.rotation_matrices(values, table, layout.orientation)).as_quat(canonical=True)
-
-
-def _sigma(table: Table, options: FileOptions, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
+def _sigma(sheet: Sheet, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
     """Return sigmas (m, targets, 3) [m] from columns, else from the options, else None."""
+    stated = sheet.options.sigma
     if not layout.sigmas:
-        return None if options.sigma.position is None else np.tile(options.sigma.position, (*seen.shape, 1))
+        return None if stated.position is None else np.tile(stated.position, (*seen.shape, 1))
     stack = []
     for k, names in enumerate(layout.sigmas):
-        sigma = _numbers(table, options, names, "length", "sigma", gaps=not seen[:, k].all())
-        sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.sigma.floor))
-        advice = "a sigma must be above 0; where it was rounded to 0, set sigma.floor in the options"
-        plausible.check_positive(np.where(seen[:, k : k + 1], sigma, np.nan), table, names, advice)
-        _no_gaps(sigma, seen[:, k], table, names)
+        there = seen[:, k : k + 1]
+        sigma = sheet.numbers(names, replace(SIGMA, positive=""), gaps=not there.all())
+        sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, stated.floor))
+        SIGMA.check(np.where(there, sigma, np.nan), sheet.table, names)
+        refuse(sheet.table, np.isnan(sigma) & there, names, lambda row, k: "is empty where a target was seen")
         stack.append(sigma)
     return np.stack(stack, axis=1)
 
 
-def _no_gaps(sigma: np.ndarray, seen: np.ndarray, table: Table, names: Sequence[str]) -> None:
-    gaps = np.argwhere(np.isnan(sigma) & seen[:, None])
-    if len(gaps):
-        row, column = (int(i) for i in gaps[0])
-        raise MeasurementError("is empty where a target was seen", table.file, int(table.rows[row]), names[column])
-
-
-def _sigma_rotation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray | None:
-    if not layout.sigma_rotation:
-        return None if options.sigma.orientation is None else np.tile(options.sigma.orientation, (len(table), 1))
-    values = _numbers(table, options, layout.sigma_rotation, "angle", "sigma_rotation")
-    plausible.check_positive(values, table, layout.sigma_rotation, "a sigma must be above 0")
-    return values
+def _sigma_rotation(sheet: Sheet, layout: Layout) -> np.ndarray | None:
+    if layout.sigma_rotation:
+        return sheet.numbers(layout.sigma_rotation, SIGMA_ROTATION)
+    stated = sheet.options.sigma.orientation
+    return None if stated is None else np.tile(stated, (len(sheet.table), 1))

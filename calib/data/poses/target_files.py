@@ -43,17 +43,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen
-from calib.data.csv_table import Table, read_table
+from calib.data.csv_table import read_table
 from calib.data.poses import plausible
-from calib.data.poses.columns import MATRIX, POSITION, QUATERNION, find_joints
-from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.columns import MATRIX, POSITION, QUATERNION, Sheet
+from calib.data.poses.plans import check_planned
 from calib.data.poses.plausible import Limits
-from calib.data.poses.pose_files import read_joints
-from calib.errors import MeasurementError, suggestion
+from calib.data.schema import BOUNDS
 from calib.units import ANGLES, LENGTHS
 
 SUFFIXES = ("", "_target")
-MOSTLY = 0.5  # of all rows outside the limits: it is the file, not the row (our choice)
+MAX_OUTSIDE = 0.5  # of all rows outside the limits: it is the file, not the row (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,79 +102,37 @@ def read_targets(
     Raises:
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
-    table = read_table(path)
-    columns = find_joints(table, FileOptions(), joints) if _has_joints(table, joints) else ()
-    position, orientation = _family(table, POSITION), _family(table, QUATERNION) or _family(table, MATRIX)
-    if not columns and not position and not orientation:
+    sheet = Sheet(read_table(path), suffixes=SUFFIXES)
+    table = sheet.table
+    forms = (*joints, *(f"q_{name}" for name in joints), *(f"q{k + 1}" for k in range(len(joints))))
+    position, turned = sheet.family(POSITION.names), sheet.family(QUATERNION.names) or sheet.family(MATRIX.names)
+    q, columns, notes = None, (), ()
+    if any(name in table for name in forms):
+        q, columns = sheet.joints(joints)
+        notes = check_planned(q, sheet, columns, joints, kinds, _kept_by_most(q, limits))
+    if not columns and not position and not turned:
         needed = f"joints ({', '.join(joints)}, or q1 to q{len(joints)}), or x y z with or without qx qy qz qw"
-        raise MeasurementError(f"no targets found: expected {needed}; found {', '.join(table.header)}", table.file)
-    if orientation and not position:
-        raise MeasurementError(f"has {orientation[0]} but no x y z: an orientation alone is no target", table.file)
-    used = {*columns, *position, *orientation}
-    q, notes = _joints(table, columns, joints, kinds, limits) if columns else (None, ())
+        sheet.fail(f"no targets found: expected {needed}; found {', '.join(table.header)}")
+    if turned and not position:
+        sheet.fail(f"has {turned[0]} but no x y z: an orientation alone is no target")
+    used = {*columns, *position, *turned}
+    units = [table.units[table.index(name)] for name in columns]
     return Targets(
         q,
-        _position(table, position) if position else None,
-        _rotation(table, orientation) if orientation else None,
-        tuple(_with_unit(table, name) for name in columns),
-        tuple(_factor(table, name) for name in columns),
+        sheet.numbers(position, POSITION) if position else None,
+        Rotation.from_quat(plausible.orientation(sheet, turned)).as_matrix() if turned else None,
+        tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(columns, units)),
+        tuple((ANGLES | LENGTHS)[unit.lower()] if unit else 1.0 for unit in units),
         tuple(name for name in table.header if name not in used),
         notes,
         table.file,
     )
 
 
-def _has_joints(table: Table, joints: Sequence[str]) -> bool:
-    forms = (*joints, *(f"q_{name}" for name in joints), *(f"q{k + 1}" for k in range(len(joints))))
-    return any(name in table for name in forms)
-
-
-def _family(table: Table, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the file's names of columns that go together; () if none of them is there."""
-    for suffix in SUFFIXES:
-        wanted = [name + suffix for name in names]
-        there = [name in table for name in wanted]
-        if all(there):
-            return tuple(wanted)
-        if any(there):
-            missing = wanted[there.index(False)]
-            message = f"missing{suggestion(missing, table.header)}: {', '.join(wanted)} go together"
-            raise MeasurementError(message, table.file, column=missing)
-    return ()
-
-
-def _joints(
-    table: Table, columns: tuple[str, ...], joints: Sequence[str], kinds: Sequence[str] | None, limits: Limits | None
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    q = read_joints(table, FileOptions(), columns)
-    if limits is not None:
-        lower, upper = (np.asarray(side, dtype=float) for side in limits)
-        outside = ((q < lower - plausible.SLACK) | (q > upper + plausible.SLACK)).any(axis=1)
-        limits = limits if outside.mean() > MOSTLY else None
-    once = (
-        q if np.ptp(q, axis=0).max() > plausible.STILL else q[:1]
-    )  # the same target twice is no robot that stood still
-    return q, plausible.check_joints(once, table, columns, joints, FileOptions(), kinds, limits)
-
-
-def _position(table: Table, names: tuple[str, ...]) -> np.ndarray:
-    position = np.stack([table.numbers(name, "length") for name in names], axis=1)
-    plausible.check_lengths(position, table, names)
-    return position
-
-
-def _rotation(table: Table, names: tuple[str, ...]) -> np.ndarray:
-    values = np.stack([table.numbers(name) for name in names], axis=1)
-    if len(names) == 4:
-        return Rotation.from_quat(plausible.unit_quaternions(values, table, names)).as_matrix()
-    return plausible.rotation_matrices(values, table, names)
-
-
-def _with_unit(table: Table, name: str) -> str:
-    unit = table.units[table.index(name)]
-    return f"{name} [{unit}]" if unit else name
-
-
-def _factor(table: Table, name: str) -> float:
-    unit = table.units[table.index(name)].lower()
-    return (ANGLES | LENGTHS)[unit] if unit else 1.0
+def _kept_by_most(q: np.ndarray, limits: Limits | None) -> Limits | None:
+    """Return `limits` where most rows of q (m, n) are outside: it is the file then, not the row."""
+    if limits is None:
+        return None
+    lower, upper = (np.asarray(side, dtype=float) for side in limits)
+    outside = ((q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)).any(axis=1)
+    return limits if outside.mean() > MAX_OUTSIDE else None

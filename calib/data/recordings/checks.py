@@ -1,30 +1,57 @@
 """Can a recording be what it claims? Each complaint names the row, the column and the likely cause.
 
-What cannot be is refused; what is odd but possible becomes a note. All thresholds are our choice.
+What cannot be is refused; what is odd but possible becomes a note. Thresholds: `RecordingBounds`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from calib.data.poses.plausible import DEGREE, FAR, SLACK, STILL, TURN
 from calib.data.recordings.recording import Joints, Recording
-from calib.errors import MeasurementError
+from calib.data.schema import BOUNDS, check_travel, max_travel, refuse
+from calib.errors import MeasurementError, require
+from calib.units import DEG
 
-FEWEST = 100  # samples; filters at both ends eat some 50
-SLOWEST, FASTEST = 5.0, 50e3  # sampling rates that occur [Hz]
-MOVES = 1e-3  # a joint that goes less far has not moved [rad or m]: above encoder noise
-POSES = 300  # of a recording, among which two alike are looked for
-BACK = 0.05  # of each joint's travel by which two poses may differ to be one
-BEYOND = 3.0  # times its limit: no joint's torque reaches that
-SPIKES = 0.002  # share of the rows, and `FEW` at least, that may be spikes of a torque
-FEW = 3
-OUTSIDE, WILD = 2.0, 10.0  # times what the other rows stay below: a spike beyond the joint's limit, one within
-MANY = 0.05  # share of the rows from which on they are no spikes, but another unit
-HUGE = 1e12  # no quantity of a robot is larger, whatever its unit
-JUMP = 0.02  # no position leaves the slope of the rows around it by that [rad]; real ones do by 7 mrad; in m a tenth
+
+@dataclass(frozen=True)
+class RecordingBounds:
+    """What a recording of a robot stays within; all of them our choice.
+
+    Attributes:
+        min_samples: of a recording; filters at both ends eat some 50.
+        min_rate, max_rate: of sampling [Hz].
+        min_travel: a joint that goes less far has not moved [rad or m]: above encoder noise.
+        max_compared: rows among which two alike poses are looked for.
+        max_apart: share of each joint's travel by which two poses may differ to be one.
+        max_effort: times its limit that a joint's torque reaches.
+        max_spike_share, max_spikes: of the rows (the larger counts) that may be spikes of a torque.
+        max_unit_share: of the rows, from which on they are no spikes but another unit.
+        min_spike_beyond, min_spike: times what the other rows stay below, of a spike beyond the joint's limit, or
+            within it.
+        max_number: of any quantity of a robot, whatever its unit.
+        max_jump: off the slope of the rows around it [rad]; real positions are by 7 mrad; in m a tenth.
+    """
+
+    min_samples: int = 100
+    min_rate: float = 5.0
+    max_rate: float = 50e3
+    min_travel: float = 1e-3
+    max_compared: int = 300
+    max_apart: float = 0.05
+    max_effort: float = 3.0
+    max_spike_share: float = 0.002
+    max_spikes: int = 3
+    max_unit_share: float = 0.05
+    min_spike_beyond: float = 2.0
+    min_spike: float = 10.0
+    max_number: float = 1e12
+    max_jump: float = 0.02
+
+
+LIMITS = RecordingBounds()
 NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
@@ -38,9 +65,9 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     _check_count(recording)
     _check_finite(recording)
     recording = _drop_spikes(recording, joints)
-    _check_finite(recording, HUGE)
+    _check_finite(recording, LIMITS.max_number)
     recording = _drop_repeats(recording)
-    _check_time(recording.t, recording.rows, recording.file)
+    _check_time(recording)
     _check_size(recording, joints)
     _check_speed(recording)
     notes = (*_still(recording), *_effort_notes(recording, joints), *_limit_notes(recording, joints))
@@ -48,59 +75,63 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
 
 
 def _check_count(recording: Recording) -> None:
-    if len(recording) < FEWEST:
-        message = f"{len(recording)} samples are too few to filter and to learn from; at least {FEWEST} are needed"
-        raise MeasurementError(message, recording.file)
+    message = (
+        f"{len(recording)} samples are too few to filter and to learn from; at least {LIMITS.min_samples} are needed"
+    )
+    require(len(recording) >= LIMITS.min_samples, message, MeasurementError, recording.file)
 
 
 def _check_finite(recording: Recording, most: float = np.inf) -> None:
     """Refuse NaN, infinities and what is beyond `most`; NaN in `q_link` says that a joint has no second encoder."""
     for name in NEEDED:
-        values = getattr(recording, name)
-        if values is None or (np.abs(values) < most).all():
-            continue
-        bad = np.argwhere(~(np.abs(values) < most).reshape(len(recording), -1))
-        row, joint = (int(i) for i in bad[0])
-        where = "t" if name == "t" else _column(recording, name, joint)
-        many = f" (and in {len(np.unique(bad[:, 0])) - 1} more rows)" if len(bad) > 1 else ""
-        message = f"found {values.reshape(len(recording), -1)[row, joint]:g}{many}; cut that part out, or leave the"
-        raise MeasurementError(f"{message} rows out", recording.file, int(recording.rows[row]), where)
+        if (values := getattr(recording, name)) is not None and not (np.abs(values) < most).all():
+            values = values.reshape(len(recording), -1)
+            columns = ["t"] if name == "t" else _columns(recording, name)
+            bad = ~(np.abs(values) < most)
+            refuse(recording, bad, columns, partial(_not_finite, values))
+
+
+def _not_finite(values: np.ndarray, row: int, k: int) -> str:
+    return f"found {values[row, k]:g}; cut that part out, or leave the rows out"
 
 
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     """Return the recording without the few rows in which a torque is one that its joint cannot have.
 
-    That is `BEYOND` its limit and `OUTSIDE` of what all but `SPIKES` of its rows stay below, or `WILD` times that.
+    Such a torque is beyond `max_effort` times the limit and `min_spike_beyond` times what all but `max_spike_share` of
+    the rows stay below, or `min_spike` times that.
 
     Raises:
-        MeasurementError: where more rows than that, up to `MANY`, are beyond the limit by as much.
+        MeasurementError: where more rows than that, up to `max_unit_share`, are beyond the limit by as much.
     """
     count = len(recording)
-    few = max(FEW, int(SPIKES * count))
+    few = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
     limit = np.full(recording.n, np.inf)
     if joints is not None and recording.kind == "torque":
-        limit = np.where(np.isfinite(joints.effort) & (joints.effort > 0), BEYOND * joints.effort, np.inf)
+        limit = np.where(np.isfinite(joints.effort) & (joints.effort > 0), LIMITS.max_effort * joints.effort, np.inf)
     size, beyond = np.abs(recording.effort - np.median(recording.effort, axis=0)), np.abs(recording.effort) > limit
     ordered = np.sort(size, axis=0)
     usual = ordered[count - few - 1]
-    wild = ((size > WILD * usual) | ((size > OUTSIDE * usual) & beyond)) & (usual > 0.0)
+    wild = ((size > LIMITS.min_spike * usual) | ((size > LIMITS.min_spike_beyond * usual) & beyond)) & (usual > 0.0)
     if not 0 < wild.any(axis=1).sum() <= few:
-        usual = ordered[count - int(MANY * count) - 1]
-        wild = (size > WILD * usual) & beyond
+        usual = ordered[count - int(LIMITS.max_unit_share * count) - 1]
+        wild = (size > LIMITS.min_spike * usual) & beyond
     rows = wild.any(axis=1)
     if not rows.any():
         return recording
+    columns, median = _columns(recording, "effort"), f"where {1 - LIMITS.max_unit_share:.0%} of the rows are within"
+    if rows.sum() > few:
+        refuse(
+            recording, wild, columns,
+            lambda row, j: f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual[j]:.4g} of "
+            "its median: spikes of the log, too many to be left out? Cut those parts out",
+        )  # fmt: skip
     row = int(np.argmax(rows))
     j = int(np.argmax(wild[row]))
-    found = f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
     more = f" (and in {int(rows.sum()) - 1} more rows)" if rows.sum() > 1 else ""
-    if rows.sum() > few:
-        message = f"{found}{more}, where {1 - MANY:.0%} of the rows are within {usual[j]:.4g} of its median"
-        advice = "spikes of the log, too many to be left out? Cut those parts out"
-        place = _column(recording, "effort", j)
-        raise MeasurementError(f"{message}: {advice}", recording.file, int(recording.rows[row]), place)
     note = (
-        f"row {recording.rows[row]}: the {_column(recording, 'effort', j)} {found}{more}, the other rows are within "
+        f"row {recording.rows[row]}: the {columns[j]} is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
+        f"{more}, the other rows are within "
         f"{size[~rows, j].max():.4g} of its median: a spike of the log; left out"
     )
     return _noted(recording.take(~rows), note)
@@ -118,52 +149,50 @@ def _drop_repeats(recording: Recording) -> Recording:
     return _noted(kept, f"{int(same.sum())} rows repeat the one before, stamp and all (first: row {first}); dropped")
 
 
-def _check_time(t: np.ndarray, rows: np.ndarray, file: str) -> None:
+def _check_time(recording: Recording) -> None:
     """Refuse stamps (N,) [s] that do not rise, and those whose step looks like another unit."""
+    t = recording.t
     step = np.diff(t)
-    if (step < 0).any():
-        i = int(np.argmax(step < 0))
-        if (step < 0).all():
-            raise MeasurementError("time runs backwards in every row: turn the rows around, last one first", file)
-        message = (
-            f"time goes back from {t[i]:.6g} s to {t[i + 1]:.6g} s ({int((step < 0).sum())} times): were two"
-            f" logs joined, or was the clock set? Cut the file there (@{t[0]:g}:{t[i]:g})"
-        )
-        raise MeasurementError(message, file, int(rows[i + 1]), "t")
-    if (step == 0).any():
-        i = int(np.argmax(step == 0))
-        message = (
-            f"two samples have the stamp {t[i]:.6g} s but different values ({int((step == 0).sum())} pairs): is the"
-            " clock too coarse? Number the samples, or leave one of each pair out"
-        )
-        raise MeasurementError(message, file, int(rows[i + 1]), "t")
+    back, stands = np.append(False, step < 0), np.append(False, step == 0)
+    require(
+        not len(step) or not back[1:].all(),
+        "time runs backwards in every row: turn the rows around, last one first",
+        MeasurementError,
+        recording.file,
+    )
+    refuse(
+        recording, back, ["t"],
+        lambda i, _: f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "
+        f"set? Cut the file there (@{t[0]:g}:{t[i - 1]:g})",
+    )  # fmt: skip
+    refuse(
+        recording, stands, ["t"],
+        lambda i, _: f"two samples have the stamp {t[i]:.6g} s but different values: is the clock too coarse? Number "
+        "the samples, or leave one of each pair out",
+    )  # fmt: skip
     rate = 1 / float(np.median(step))
-    if not SLOWEST <= rate <= FASTEST:
+    if not LIMITS.min_rate <= rate <= LIMITS.max_rate:
         units = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-        likely = next((unit for unit, factor in units.items() if SLOWEST <= rate * factor <= FASTEST), "")
+        likely = next(
+            (unit for unit, factor in units.items() if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate), ""
+        )
         hint = f"the stamps look like {likely}; if so, say so (units: t = '{likely}')" if likely else "check the stamps"
-        raise MeasurementError(f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", file, column="t")
+        raise MeasurementError(
+            f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", recording.file, column="t"
+        )
 
 
 def _check_size(recording: Recording, joints: Joints | None = None) -> None:
     """Refuse positions that no joint has: degrees, millimetres, or the columns of another robot."""
-    n = recording.n
-    kinds = joints.kinds if joints else ("revolute",) * n
-    for j, kind in enumerate(kinds):
-        q = recording.q[:, j]
-        most = FAR if kind == "prismatic" else TURN
-        if joints is not None and np.isfinite(joints.lower[j]) and np.isfinite(joints.upper[j]):
-            most = max(most, 2 * np.abs([joints.lower[j], joints.upper[j]]).max())
-        beyond = np.abs(q) > most
-        if kind == "continuous" or not beyond.any():
-            continue
-        row = int(np.argmax(beyond))
-        unit, other = ("m", "mm") if kind == "prismatic" else ("rad", "deg")
-        message = (
-            f"{q[row]:g} {unit} is beyond what a {kind} joint does ({int(beyond.sum())} of {len(q)} rows): looks like "
-            f"{other}; if so, say so (a header 'q{j + 1} [{other}]', or units: q = '{other}')"
-        )
-        raise MeasurementError(message, recording.file, int(recording.rows[row]), _column(recording, "q", j))
+    kinds = joints.kinds if joints else ("revolute",) * recording.n
+    most = max_travel(kinds)
+    if joints is not None:
+        reach = 2 * np.maximum(np.abs(joints.lower), np.abs(joints.upper))
+        most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
+    check_travel(
+        recording.q, most, recording, _columns(recording, "q"), recording.joint_names, kinds,
+        lambda j, other: f"looks like {other}; if so, say so (a header 'q{j + 1} [{other}]', or units: q = '{other}')",
+    )  # fmt: skip
 
 
 def _check_speed(recording: Recording) -> None:
@@ -175,11 +204,11 @@ def _check_speed(recording: Recording) -> None:
     power, own, product = (slope**2).sum(axis=0), (mean**2).sum(axis=0), (slope * mean).sum(axis=0)
     ratio = product / np.maximum(power, 1e-300)
     alike = product > 0.9 * np.sqrt(power * own)  # a joint that hardly moves shows noise alone
-    for j in np.flatnonzero(alike & (np.ptp(recording.q, axis=0) > MOVES)):
-        for factor, wrong in ((1 / DEGREE, "the velocities look like deg/s"), (DEGREE, "the positions look like deg")):
+    for j in np.flatnonzero(alike & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
+        for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
                 message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, say so in the header or the units"
-                raise MeasurementError(message, recording.file, column=_column(recording, "v", int(j)))
+                raise MeasurementError(message, recording.file, column=_columns(recording, "v")[j])
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
@@ -193,7 +222,7 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     usual = np.maximum(np.median(off, axis=0), 1e-9)
     apart = (step[2:-2] < 3 * np.median(step))[:, None]  # not over a gap
     kinds = joints.kinds if joints is not None else ("revolute",) * recording.n
-    least = np.array([JUMP if kind != "prismatic" else JUMP / 10 for kind in kinds])
+    least = np.array([LIMITS.max_jump if kind != "prismatic" else LIMITS.max_jump / 10 for kind in kinds])
     notes = []
     for j in np.flatnonzero(((off > least) & (off > 20 * usual) & apart).any(axis=0)):
         row = int(np.argmax(off[:, j] * apart[:, 0]))
@@ -205,23 +234,27 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     return notes
 
 
-def _column(recording: Recording, name: str, joint: int) -> str:
-    """Return how a message calls a column: ``effort of elbow (joint 3)``."""
+def _columns(recording: Recording, name: str) -> list[str]:
+    """Return how messages call the columns of a series: ``effort of elbow (joint 3)``."""
     label = recording.kind if name == "effort" else name
-    return f"{label} of {recording.joint_names[joint]} (joint {joint + 1})"
+    return [f"{label} of {joint} (joint {j + 1})" for j, joint in enumerate(recording.joint_names)]
 
 
 def _still(recording: Recording) -> list[str]:
-    still = np.ptp(recording.q, axis=0) < MOVES
+    still = np.ptp(recording.q, axis=0) < LIMITS.min_travel
     if still.all():
         return ["no joint moves in this recording: it tells of gravity in one pose, and nothing else"]
     notes = []
     for j, dead in enumerate(np.ptp(recording.effort, axis=0) == 0):
         if dead and not still[j]:
             message = f"is {recording.effort[0, j]:g} in all {len(recording)} rows while the joint moves: was it logged"
-            raise MeasurementError(message + "?", recording.file, column=_column(recording, "effort", j))
+            raise MeasurementError(message + "?", recording.file, column=_columns(recording, "effort")[j])
         if still[j]:
-            travel = "is one number" if np.ptp(recording.q[:, j]) < STILL else f"moves less than {MOVES:g}"
+            travel = (
+                "is one number"
+                if np.ptp(recording.q[:, j]) < BOUNDS.min_travel
+                else f"moves less than {LIMITS.min_travel:g}"
+            )
             own = f", and so is its {recording.kind}" if dead else ""
             notes.append(f"{recording.joint_names[j]} never moves (its position {travel}{own}): what only its motion")
             notes[-1] += " excites cannot be identified from this file"
@@ -239,14 +272,14 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     most, limit = np.abs(recording.effort).max(axis=0), joints.effort
     known = np.isfinite(limit) & (limit > 0)
     usual = np.quantile(np.abs(recording.effort), 0.99, axis=0)  # a spike is no unit
-    if known.any() and (usual[known] > BEYOND * limit[known]).all():
+    if known.any() and (usual[known] > LIMITS.max_effort * limit[known]).all():
         j = int(np.argmax(np.where(known, usual / np.where(known, limit, 1.0), 0.0)))
         message = (
             f"|torque| reaches {usual[j]:.4g} where the joint's limit is {limit[j]:g}, and every joint is beyond "
-            f"{BEYOND:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header 'tau_1 [Nmm]', "
-            "or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
+            f"{LIMITS.max_effort:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header "
+            "'tau_1 [Nmm]', or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
-        raise MeasurementError(message, recording.file, column=_column(recording, "effort", j))
+        raise MeasurementError(message, recording.file, column=_columns(recording, "effort")[j])
     high = known & (most > 1.2 * np.where(known, limit, np.inf))
     notes = [
         f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: another unit?"
@@ -266,7 +299,7 @@ def _limit_notes(recording: Recording, joints: Joints | None) -> list[str]:
     notes = []
     for j, name in enumerate(recording.joint_names):
         over = np.maximum(joints.lower[j] - recording.q[:, j], recording.q[:, j] - joints.upper[j])
-        if (worst := float(np.nanmax(over, initial=-np.inf))) > SLACK:
+        if (worst := float(np.nanmax(over, initial=-np.inf))) > BOUNDS.limit_slack:
             notes.append(f"{name} is beyond its limits by up to {worst:.2g}: are the columns in the robot's order?")
     return notes
 
@@ -289,10 +322,10 @@ def _work_notes(recording: Recording) -> list[str]:
 
 def _round_trip(q: np.ndarray) -> slice | None:
     """Return the steps between two rows of nearly one pose, far apart; None where the motion does not come back."""
-    every = max(1, len(q) // POSES)
-    poses = q[::every] / np.maximum(np.ptp(q, axis=0), MOVES)
+    every = max(1, len(q) // LIMITS.max_compared)
+    poses = q[::every] / np.maximum(np.ptp(q, axis=0), LIMITS.min_travel)
     apart = np.abs(poses[:, None] - poses[None]).max(axis=2)
-    first, last = np.nonzero(apart < BACK)
+    first, last = np.nonzero(apart < LIMITS.max_apart)
     longest = int(np.argmax(last - first))
     if last[longest] - first[longest] < len(poses) // 2:
         return None

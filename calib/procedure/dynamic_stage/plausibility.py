@@ -18,8 +18,9 @@ order    two joints with which exchanged the robot's own masses leave less than 
 sign     joints whose torques one model of bodies and friction explains with the opposite sign only, also of unseen
          recordings (`calib.identification.checks.whole_robot.reversed_signs`), and of none more than `UNTOLD`: fail
 zero     a joint with a right angle or two at whose zero they leave less than `TURNED`, likewise: marginal
-limit    torques of a joint beyond `BEYOND` times its limit, another unit there: fail; beyond `OVER` times, a wrong gain
-         or limit: marginal, as where none at any joint reaches `REACHED` of its limit. Recordings at hand: 0.2 to 0.7
+limit    torques of a joint beyond `RecordingBounds.max_effort` times its limit, another unit there: fail; beyond `OVER`
+         times, a wrong gain or limit: marginal, as where none at any joint reaches `REACHED` of its limit. Recordings
+         at hand: 0.2 to 0.7
 jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
          beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.3).
@@ -36,7 +37,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from calib.data.recordings.checks import BEYOND
+from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged, ReversedSigns
@@ -164,7 +165,10 @@ def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 def _limits(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Compare torques with the joints' limits: what is a thousand times too large or too small is in another unit."""
     known = np.isfinite(each.limits)
-    beyond = [f"{joints[j]} {each.limits[j]:.3g}" for j in np.flatnonzero(known & (each.limits > BEYOND)).tolist()]
+    beyond = [
+        f"{joints[j]} {each.limits[j]:.3g}"
+        for j in np.flatnonzero(known & (each.limits > RECORDED.max_effort)).tolist()
+    ]
     if beyond:
         yield Finding(
             "limit", "fail",

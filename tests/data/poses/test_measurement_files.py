@@ -95,7 +95,7 @@ POSITIONS, TURNS = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
     "header, mapped, plain",
     [
         ("x_meas,y_meas,z_meas,qx,qy,qz,qw", {}, TURNS),
-        ("x_measured,y_measured,z_measured,r11,r12,r13,r21,r22,r23,r31,r32,r33", {}, MATRIX),
+        ("x_measured,y_measured,z_measured,r11,r12,r13,r21,r22,r23,r31,r32,r33", {}, MATRIX.names),
         ("x,y,z,x_meas,y_meas,z_meas,qx,qy,qz,qw", {name: name + "_meas" for name in POSITIONS}, TURNS),
         ("x,y,z,px,py,pz,qx,qy,qz,qw", dict(zip(POSITIONS, ("px", "py", "pz"))), TURNS),
         ("x,y,z,qx_meas,qy_meas,qz_meas,qw_meas", {}, POSITIONS),

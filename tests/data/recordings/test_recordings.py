@@ -181,7 +181,7 @@ def test_broken_and_foreign_files(tmp_path, archive):
 def test_time_that_cannot_be(archive, series):
     t = series["t"].copy()
     t[500:] -= 1.0
-    error = refused(archive(t=t), r"time goes back from 2.495 s to 1.5 s \(1 times\)")
+    error = refused(archive(t=t), r"time goes back from 2.495 s to 1.5 s")
     assert (error.row, error.column) == (501, "t")
     t = series["t"].copy()
     t[500] = t[499]
@@ -204,7 +204,7 @@ def test_rows_written_twice_are_left_out(archive, series):
 def test_values_that_cannot_be(archive, series):
     tau = series["tau"].copy()
     tau[12, 1] = tau[80, 2] = np.nan
-    error = refused(archive(tau=tau), r"found nan \(and in 1 more rows\)")
+    error = refused(archive(tau=tau), r"found nan; .* \(and in 1 more rows\)")
     assert (error.row, error.column) == (13, "torque of b (joint 2)")
     refused(archive(q=np.degrees(series["q"])), r"looks like deg; if so, say so \(a header 'q1 \[deg\]'")
     refused(archive(dq=np.degrees(series["dq"])), "the velocities look like deg/s")

@@ -1,0 +1,148 @@
+"""Columns of tables, declared once: their names, dimension and bounds; and the one complaint about a cell.
+
+Poses, targets, waypoints and recordings read their tables by these declarations. A value that cannot be is refused by
+`refuse`: the value first, what to do last, then how many more rows are like it; the error carries file, row and column.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from calib.errors import MeasurementError
+from calib.units import DEG
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What measured values stay within; all of them our choice.
+
+    Attributes:
+        max_turn: of a turning joint without limits [rad].
+        max_length: of a tool from its instrument, and of a sliding joint's travel [m].
+        min_sigma: of an instrument [m or rad].
+        min_travel: a joint that moves less has not moved [rad or m].
+        limit_slack: by which encoders stand beyond a limit [rad or m].
+        max_norm_error: of a quaternion or a matrix, rounding that is corrected.
+    """
+
+    max_turn: float = 2.1 * math.pi
+    max_length: float = 50.0
+    min_sigma: float = 1e-10
+    min_travel: float = 1e-6
+    limit_slack: float = 1e-3
+    max_norm_error: float = 1e-3
+
+
+BOUNDS = Bounds()
+
+
+class Rows(Protocol):
+    """What a complaint is about: a table, a recording or a block of measurements.
+
+    Attributes:
+        file: where it came from.
+        rows: (m,) number of each row in the file, from 1.
+    """
+
+    @property
+    def file(self) -> str: ...
+
+    @property
+    def rows(self) -> np.ndarray: ...
+
+
+def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable[[int, int], str]) -> None:
+    """Refuse the rows at which `bad` (m,) or (m, k) holds; nothing happens where it never does.
+
+    Args:
+        columns: the file's names of the k columns.
+        says: the sentence for the first bad cell, of its row and column (from 0).
+
+    Raises:
+        MeasurementError: with file, row and column of the first bad cell, and the number of further rows.
+    """
+    bad = np.reshape(bad, (len(bad), -1))
+    if not bad.any():
+        return
+    row, column = (int(i) for i in np.argwhere(bad)[0])
+    others = int(bad.any(axis=1).sum()) - 1
+    more = f" (and in {others} more rows)" if others else ""
+    raise MeasurementError(says(row, column) + more, source.file, int(source.rows[row]), columns[column])
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table, or several that go together.
+
+    Attributes:
+        names: ours, in their order.
+        dimension: angle, length, joint, or "" for a plain number.
+        family: name under which options state a unit for all of them.
+        most: largest absolute value [SI].
+        likely: the unit that larger values are likely in.
+        positive: advice where a value is not above zero; "" where it may be anything.
+    """
+
+    names: tuple[str, ...]
+    dimension: str = ""
+    family: str = ""
+    most: float = math.inf
+    likely: str = ""
+    positive: str = ""
+
+    def check(self, values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
+        """Return values (m, k) [SI], NaN where a cell may be empty; those beyond the column's bounds are refused."""
+        unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
+
+        def other_unit(row: int, k: int) -> str:
+            header = f"{columns[k]} [{self.likely}]"
+            return f"found {values[row, k]:g}{unit}; if it is in {self.likely}, name the column '{header}'"
+
+        refuse(source, np.abs(values) > self.most, columns, other_unit)
+        if self.positive:
+            low, high = BOUNDS.min_sigma, BOUNDS.max_length
+            within = f"expected {low:g} to {high:g}, in SI: is the unit right?"
+            refuse(source, values <= 0.0, columns, lambda row, k: f"found {values[row, k]:g}: {self.positive}")
+            refuse(
+                source, (values < low) | (values > high), columns, lambda row, k: f"found {values[row, k]:g}: {within}"
+            )
+        return values
+
+
+def joint_unit(kind: str) -> tuple[str, str, float]:
+    """Return the SI unit of a joint of URDF's type `kind`, the unit that is mistaken for it, and its size in SI."""
+    return ("m", "mm", 1e-3) if kind == "prismatic" else ("rad", "deg", DEG)
+
+
+def max_travel(kinds: Sequence[str]) -> np.ndarray:
+    """Return the largest values (n,) [rad or m] that joints of these types reach where no limits are known."""
+    most = {"prismatic": BOUNDS.max_length, "continuous": math.inf}
+    return np.array([most.get(kind, BOUNDS.max_turn) for kind in kinds])
+
+
+def check_travel(
+    q: np.ndarray,
+    most: np.ndarray,
+    source: Rows,
+    columns: Sequence[str],
+    joints: Sequence[str],
+    kinds: Sequence[str],
+    advice: Callable[[int, str], str],
+) -> None:
+    """Refuse joint values (m, n) [rad or m] beyond `most` (n,).
+
+    Args:
+        advice: what to do about joint j, whose values look like another unit.
+    """
+
+    def says(row: int, j: int) -> str:
+        unit, other, _ = joint_unit(kinds[j])
+        travel = "cannot be the travel" if kinds[j] == "prismatic" else "is more than a turn"
+        return f"{q[row, j]:g} {unit} {travel} of {joints[j]}: {advice(j, other)}"
+
+    refuse(source, np.abs(q) > most, columns, says)
