@@ -146,13 +146,14 @@ def formats(
 @app.command()
 def explain(
     code: Annotated[
-        str | None, typer.Argument(help="of a finding, as metrics.json names it; default: list all")
+        str | None,
+        typer.Argument(help="a finding's code in metrics.json, or a term such as 'held out'; default: list all"),
     ] = None,
 ) -> None:
-    """Print what a finding means and what to do."""
+    """Print what a finding or a term means, and what to do."""
     from calib.procedure import findings
 
-    print(findings.explain(code) if code else "\n".join(findings.catalogue()))
+    print(findings.explain(code) if code else "\n".join([*findings.catalogue(), *findings.glossary()]))
 
 
 @app.command("next")

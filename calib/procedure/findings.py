@@ -203,14 +203,24 @@ def _line(one: Finding, entry: Entry) -> str:
     return "; ".join(filter(None, words))
 
 
+@cache
+def glossary() -> Mapping[str, str]:
+    """Return the field's terms that messages and reports use, term -> what it means."""
+    return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
+
+
 def explain(code: str) -> str:
-    """Return what a code of the catalogue means and what to do.
+    """Return what a code of the catalogue means and what to do, or what a term of the glossary means.
 
     Raises:
-        UsageError: for a code that there is none of.
+        UsageError: for a code or term that there is none of.
     """
+    terms = {term.lower(): f"{term}\n  {meaning}" for term, meaning in glossary().items()}
+    if (meaning := terms.get(code.lower())) and code not in catalogue():
+        return meaning
     if (entry := catalogue().get(code)) is None:
-        raise UsageError(f"no finding '{code}'{suggestion(code, catalogue())}; calib explain lists them")
+        near = suggestion(code, [*catalogue(), *glossary()])
+        raise UsageError(f"no finding or term '{code}'{near}; calib explain lists them")
     rules = [
         f"{level} where {value} > {limit:g}" for value, steps in entry.limits.items() for level, limit in steps.items()
     ]

@@ -73,6 +73,13 @@ def test_a_part_without_its_value_is_left_out():
 def test_the_command_explains_a_code(calib):
     code, out, _ = calib("explain", "moved")
     assert code == 0 and "fail where times > 5" in out and 'accept = ["moved"]' in out
-    assert calib("explain")[1].split() == list(catalogue())
+    assert calib("explain")[1].splitlines() == [*catalogue(), *findings.glossary()]
+    assert "left out of the fit" in calib("explain", "Cross-validated")[1]
     code, _, err = calib("explain", "mover")
     assert code == 2 and "did you mean 'moved'" in err
+
+
+def test_the_glossary_is_plain_and_complete():
+    for term, meaning in findings.glossary().items():
+        assert not re.search(PRIVATE, meaning) and len(meaning.split()) <= 32 and meaning.endswith("."), term
+    assert 50 <= len(findings.glossary()) <= 80 and not set(findings.glossary()) & set(catalogue())
