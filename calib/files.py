@@ -13,11 +13,10 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,23 +27,9 @@ if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
 
 MAKER = "armature-calib"  # by which figures and recordings are known as ours
-LARGEST = 1 << 26  # bytes of a table that an earlier run may have left (our choice)
+Results = Sequence[tuple[Path, Sequence[str]]]
+RESULTS = ".armature-calib.json"  # SHA-256 of the results in a folder, by name, as they were written
 _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", default=None)
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A result that is one file, and how one of an earlier run is told from a person's own.
-
-    Attributes:
-        what: in words.
-        suffixes: that it may have.
-        ours: tells whether an earlier run left a file, and nobody has added to it since.
-    """
-
-    what: str
-    suffixes: tuple[str, ...]
-    ours: Callable[[Path], bool]
 
 
 @contextmanager
@@ -70,6 +55,53 @@ def together() -> Iterator[None]:
             os.unlink(temporary)
 
 
+@contextmanager
+def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> Iterator[None]:
+    """Write files inside as results of their own: checked (`check_results`), together, and known as ours afterwards."""
+    check_results(targets, inputs, overwrite)
+    with together():
+        yield
+        for folder in {target.parent for target, _ in targets}:
+            staged = {path: Path(temporary) for temporary, path in _staged.get() or ()}
+            now = {path.name: staged.get(path, path) for path, _ in targets if path.parent == folder}
+            made = {name: fingerprint(path) for name, path in now.items() if path.exists()}
+            write(
+                folder / RESULTS, json.dumps(_written(staged.get(folder / RESULTS, folder / RESULTS)) | made, indent=2)
+            )
+
+
+def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> None:
+    """Refuse, before any work is done, files that cannot be written or are read (`check_target`), or are one file.
+
+    Args:
+        targets: to be written, each with the suffixes that it may have; what stands there is replaced where an earlier
+            run left it and nobody has changed it since (`RESULTS` says so), or with `overwrite`.
+        inputs: what is read.
+
+    Raises:
+        UsageError: with the file concerned.
+    """
+    inputs = tuple(inputs)
+    for number, (target, suffixes) in enumerate(targets):
+        check_target(target, inputs, suffixes)
+        if any(same_file(target, other) for other, _ in targets[:number]):
+            raise UsageError(f"{target} is to be written twice; give each file a name of its own")
+        known = _written(target.parent / RESULTS).get(target.name)
+        if not overwrite and target.exists() and target.stat().st_size and fingerprint(target) != known:
+            raise UsageError(
+                f"{target} is there already, and not as an earlier run left it; nothing was changed. Write elsewhere, "
+                "or say --overwrite (in Python overwrite=True)"
+            )
+
+
+def _written(path: Path) -> dict[str, str]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def write(path: str | Path, content: str | bytes) -> Path:
     """Write `content` to `path` by way of a temporary file in the same folder and a rename (see `together`).
 
@@ -90,7 +122,7 @@ def write(path: str | Path, content: str | bytes) -> Path:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
+        os.chmod(temporary, 0o666 & ~umask())
         if (staged := _staged.get()) is not None:
             staged.append((temporary, path))
         else:
@@ -147,82 +179,6 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     check_not_input([out], inputs)
     if suffixes and out.suffix not in suffixes:
         raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
-
-
-def check_results(
-    targets: Sequence[tuple[Path, Kind]], inputs: Sequence[str | Path | None] = (), overwrite: bool = False
-) -> None:
-    """Refuse, before any work is done, files that cannot be written or are read (`check_target`), or are one file.
-
-    Args:
-        targets: to be written; what stands there is replaced where an earlier run left it, or with `overwrite`.
-        inputs: what is read.
-
-    Raises:
-        UsageError: with the file concerned.
-    """
-    for number, (target, kind) in enumerate(targets):
-        check_target(target, inputs, kind.suffixes)
-        if any(same_file(target, other) for other, _ in targets[:number]):
-            raise UsageError(f"{target} is to be written twice; give each file a name of its own")
-        if not overwrite and target.exists() and target.stat().st_size and not _left_by_us(target, kind):
-            raise UsageError(
-                f"{target} holds {_begins(target)}: no {kind.what} as an earlier run left it; nothing was changed. "
-                "Write elsewhere, or say --overwrite (in Python overwrite=True)"
-            )
-
-
-def _left_by_us(path: Path, kind: Kind) -> bool:
-    try:
-        return path.is_file() and path.stat().st_size <= LARGEST and kind.ours(path)
-    except Exception:  # what cannot be read as that kind, for whatever reason, is not of it
-        return False
-
-
-def _begins(path: Path) -> str:
-    """Say what a file begins with."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(200)
-    except OSError as error:
-        return f"what cannot be read ({error.strerror})"
-    size = f"{path.stat().st_size} bytes"
-    line = head.lstrip().partition(b"\n")[0]
-    return f"{size} that begin with '{line.decode()[:80].strip()}'" if line.isascii() and b"\0" not in head else size
-
-
-def marked(what: str, suffix: str, mark: bytes) -> Kind:
-    """Return the kind of files that carry `mark` among their first letters."""
-
-    def ours(path: Path) -> bool:
-        with path.open("rb") as file:
-            return mark in file.read(1 << 14)
-
-    return Kind(what, (suffix,), ours)
-
-
-def table(what: str, fits: Callable[[list[str], list[list[str]]], bool]) -> Kind:
-    """Return the kind of CSV tables (`write_table`) whose header and rows `fits`."""
-    return Kind(what, (".csv",), partial(_fits, fits))
-
-
-def _fits(fits: Callable[[list[str], list[list[str]]], bool], path: Path) -> bool:
-    """Tell whether a table is as `write_table` writes it, to the letter, and `fits`."""
-    text = path.read_text(encoding="utf-8")
-    header, *rows = csv.reader(io.StringIO(text, newline=""))
-    again = _headed(header)
-    csv.writer(again, lineterminator="\n").writerows([_again(cell) for cell in row] for row in rows)
-    return again.getvalue() == text and all(len(row) == len(header) for row in rows) and fits(header, rows)
-
-
-def _again(cell: str) -> str:
-    try:
-        return f"{float(cell):.12g}"
-    except ValueError:
-        return cell
-
-
-PICTURE = marked("figure", ".png", MAKER.encode())
 
 
 def check_writable(folder: Path, target: Path | None = None) -> None:
@@ -394,7 +350,8 @@ def _headed(header: Sequence[str]) -> io.StringIO:
     return text
 
 
-def _umask() -> int:
+def umask() -> int:
+    """Return the bits of permission that new files of this process leave out."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

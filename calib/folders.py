@@ -76,7 +76,7 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], None]
         raise UsageError(f"cannot write beside {out}: {reason}; nothing was changed there") from error
     try:
         write(staging)
-        os.chmod(staging, 0o777 & ~_umask())
+        os.chmod(staging, 0o777 & ~files.umask())
         if out.exists():
             _move_files(staging, out, ours)
         else:
@@ -101,9 +101,3 @@ def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

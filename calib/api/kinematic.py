@@ -23,7 +23,7 @@ from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import selection_prediction
-from calib.procedure.measuring.run import run_kind, write_run
+from calib.procedure.measuring.run import write_run
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain
@@ -63,9 +63,8 @@ class PoseSelection:
         from calib.procedure.report.style import save
 
         path = Path(path)
-        selection.check_targets(path, self.chosen.chain, plots, chosen=self.chosen, overwrite=overwrite)
-        beside = selection.targets(path, plots)
-        with files.together():
+        beside = selection.beside_poses(path, plots)
+        with files.results(selection.targets(path, plots), overwrite=overwrite):
             for name, figure in self.plot().items() if plots else ():
                 save(figure, beside[name])
             return selection.write(self.chosen, path)
@@ -73,8 +72,8 @@ class PoseSelection:
     @checked
     def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
-        files.check_results([(Path(path), run_kind(self.chosen.chain.joint_names))], overwrite=overwrite)
-        return write_run(Path(path), self.chosen.run, self.chosen.chain)
+        with files.results([(Path(path), (".csv",))], overwrite=overwrite):
+            return write_run(Path(path), self.chosen.run, self.chosen.chain)
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
@@ -229,10 +228,10 @@ class JointCommands:
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
         """Write the commands as CSV; `partial` writes what is reached, even where some targets are not.
 
-        A file that holds anything but an earlier run's commands is refused unless `overwrite`.
+        A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
         """
-        files.check_results([(Path(path), compensation_file.COMMANDS)], overwrite=overwrite)
-        return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
+        with files.results([(Path(path), (".csv",))], overwrite=overwrite):
+            return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
 
     def __repr__(self) -> str:
         return f"<JointCommands: {int(self.commands.reached.sum())} of {len(self.q)} targets reached>"

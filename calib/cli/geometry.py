@@ -137,10 +137,9 @@ def select(
     """
     from calib.api.kinematic import select_poses
     from calib.data.poses.fit_options import FitOptions
-    from calib.files import together
+    from calib.files import check_results, together
+    from calib.procedure.kinematic_stage import selection
     from calib.procedure.kinematic_stage.inputs import load_robot
-    from calib.procedure.kinematic_stage.selection import check_targets
-    from calib.procedure.kinematic_stage.selection import targets as targets_of
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.measuring.run import RunSettings
@@ -148,8 +147,9 @@ def select(
 
     named = beside(constraints).values() if constraints else ()
     refuse_parallel(robot, "choosing poses", "spread them over its workspace by hand")
-    chain, _ = load_robot(robot, existing, FitOptions(), base, tip)
-    check_targets(out, chain, plots, [robot, existing, constraints, *named], run=run, overwrite=overwrite)
+    load_robot(robot, existing, FitOptions(), base, tip)
+    written = [*selection.targets(out, plots), *([(run, (".csv",))] if run else [])]
+    check_results(written, [robot, existing, constraints, *named], overwrite)
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -170,7 +170,7 @@ def select(
     if run:
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
-    if told := targets_of(out, plots, chosen.chosen):
+    if told := selection.beside_poses(out, plots, chosen.chosen):
         say(f"what they will tell: {', '.join(str(path) for path in told.values())}")
     say(f"{m} poses written to {out}")
 
@@ -200,7 +200,7 @@ def export(
     A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
     """
     from calib.errors import UsageError
-    from calib.files import together
+    from calib.files import results
     from calib.procedure.export import delivery, geometry
     from calib.procedure.parallel_stage.robots import refuse_parallel
 
@@ -220,9 +220,9 @@ def export(
             "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
         )
     found = geometry.read(folder)
-    geometry.check_targets(folder, urdf, out, ur_kinematics, offsets, overwrite)
+    targets = geometry.targets(urdf, out, ur_kinematics, offsets)
     own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
-    with together():
+    with results(targets, [urdf, *geometry.results(folder)], overwrite):
         read = geometry.export_urdf(found, urdf, out, for_corrections, own.remark) if urdf and out else ""
         if ur_kinematics:
             geometry.export_ur_kinematics(found, ur_kinematics, own.remark)
@@ -281,11 +281,10 @@ def compensate(
     from calib.api import kinematic
     from calib.files import check_results
     from calib.procedure.export.geometry import results
-    from calib.procedure.kinematic_stage.compensation_file import COMMANDS
 
     may = numbers(tolerance, 2, "--tolerance")
     fitted = kinematic.read_fitted(folder)
-    check_results([(out, COMMANDS)], [targets, *results(fitted.folder)], overwrite)
+    check_results([(out, (".csv",))], [targets, *results(fitted.folder)], overwrite)
     with progress() as show:
         found = kinematic.compensate(
             fitted, targets, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,

@@ -93,11 +93,12 @@ def recall(
     overwrite: Overwrite = False,
 ) -> None:
     """Find a designed motion in a log, and average its periods. What comes out is a recording for calib identify."""
+    from calib.files import results
     from calib.procedure.excitation import recall as excitation_recall
 
-    excitation_recall.check_target(out, folder, log, overwrite)
-    found = excitation_recall.find(folder, log, skip)
-    excitation_recall.write(found, out)
+    with results([(out, excitation_recall.SUFFIXES)], excitation_recall.inputs(folder, log), overwrite):
+        found = excitation_recall.find(folder, log, skip)
+        excitation_recall.write(found, out)
     say_written(excitation_recall.lines(found), out)
 
 

@@ -268,19 +268,19 @@ def view(
     overwrite: Overwrite = False,
 ) -> None:
     """Show robot, errors, poses, motions or torques in Rerun."""
-    from calib.files import check_results
+    from calib.files import results
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.report import viewer
 
     refuse_parallel(folder, "calib view")
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
+    scene = None
     if save:
         inside = folder.iterdir() if folder.is_dir() else ()
         read = [folder, robot, *(path for path in inside if path.suffix != ".rrd")]
-        check_results([(save, viewer.RECORDING)], read, overwrite)
-    scene = viewer.write(folder, save, robot) if save else None
-    if save:
+        with results([(save, (".rrd",))], read, overwrite):
+            scene = viewer.write(folder, save, robot)
         size = f"{1e-6 * save.stat().st_size:.1f} MB"
         say(f"{save}: {size}; {command_line(save, program='rerun')} shows it")
     if spawn or (spawn is None and save is None):

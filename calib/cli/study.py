@@ -86,10 +86,10 @@ def compare(
     from calib.procedure.dynamic_stage import inputs
     from calib.procedure.report import console
     from calib.procedure.study import method_table
-    from calib.procedure.study.method_comparison import COMPARISON, caveats, compare_methods, write_table
+    from calib.procedure.study.method_comparison import caveats, compare_methods, write_table
 
-    if out is not None:
-        files.check_results([(out, COMPARISON)], [robot, *recordings, *(validate or []), options], overwrite)
+    table = [] if out is None else [(out, (".csv",))]
+    files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)
     chosen = _names(methods)
     with reporting() as (say_now, progress):
         given = inputs.gather(
@@ -101,7 +101,8 @@ def compare(
         )  # fmt: skip
     say(*console.section(method_table.section(found, caveats(given, found))))
     if out is not None:
-        say(f"written to {write_table(found, out)}")
+        with files.results(table, overwrite=overwrite):
+            say(f"written to {write_table(found, out)}")
     if all(one.failure for one in found):
         raise typer.Exit(3)
     exit_failed(next(one.verdict.level for one in found if one.verdict is not None))

@@ -45,17 +45,6 @@ def write_poses(
     return files.write_numbers(path, header, values)
 
 
-def poses_kind(joint_names: Sequence[str]) -> files.Kind:
-    """Return the kind of files that `write_poses` writes in rad of one arm: joints and nothing that was measured."""
-
-    def fits(header: list[str], rows: list[list[str]]) -> bool:
-        n = len(joint_names)
-        planned = all(any(len(_DIGIT.findall(cell)) >= DIGITS for cell in row[:n]) for row in rows)
-        return header[:n] == list(joint_names) and planned and not any(cell for row in rows for cell in row[n:])
-
-    return files.table("list of planned poses", fits)
-
-
 def filled_in(path: Path, joints: int) -> bool:
     """Tell whether a list of planned poses of an arm holds anything beside its joints: measurements, by hand."""
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:]

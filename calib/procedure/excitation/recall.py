@@ -8,7 +8,6 @@ there were: the mean's variance is that over their number.
 from __future__ import annotations
 
 import io
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,33 +50,9 @@ class AveragedMotion:
     following: np.ndarray
 
 
-def check_target(out: Path, folder: Path, log: str, overwrite: bool = False) -> None:
-    """Refuse, before any work is done, a name that is not a recording's, or that of the log or the designed motion.
-
-    So is a recording that is no averaged period of this motion, unless `overwrite`.
-    """
-    kind = files.Kind("averaged period of this motion", SUFFIXES, lambda path: _is_average(path, folder))
-    read = [folder, *(folder / name for name in (coefficients.NAME, METRICS)), log]
-    files.check_results([(out, kind)], read, overwrite)
-
-
-def _is_average(path: Path, folder: Path) -> bool:
-    """Tell whether `write` made a file of the motion in `folder`: an archive with variances, or one period of CSV.
-
-    A log has the columns of an average; but it hardly begins at 0, ends with one period, and counts time in equal steps
-    between, written as we write them.
-    """
-    if path.suffix == ".npz":
-        with zipfile.ZipFile(path) as archive:
-            return {"periods.npy", "variance_q.npy"} <= set(archive.namelist())
-    motion = coefficients.read(folder)
-
-    def fits(header: list[str], rows: list[list[str]]) -> bool:
-        t = np.array([float(row[0]) for row in rows])
-        count = round(motion.period * (len(t) - 1) / t[-1])
-        return header[0] == "t" and len(t) == count and bool(np.allclose(t, np.arange(count) * t[1], rtol=1e-9))
-
-    return files.table("", fits).ours(path)
+def inputs(folder: Path, log: str) -> list[str | Path]:
+    """Return what is read to find the motion of `folder` in a log, which nothing may be written over."""
+    return [folder, folder / coefficients.NAME, folder / METRICS, log]
 
 
 def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:

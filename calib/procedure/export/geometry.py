@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +21,7 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert
 
-UR_KINEMATICS = files.Kind("UR kinematics", (".yaml", ".yml"), lambda path: b" calib_" in path.read_bytes())
 OFFSETS_HEADER = ("joint", "unit", "offset", "sigma")
-OFFSETS = files.table("list of joint offsets", lambda header, _: tuple(header) == OFFSETS_HEADER)
-_ORIGIN, _COMPUTED = re.compile(r"<origin\b[^>]*>"), re.compile(r"\.\d{9}")
-_JUDGED = re.compile(r"<!-- verdict .*? -->", re.S)
 SAME = 1e-9  # poses read back by Pinocchio have to agree to this [m, and as a rotation matrix]
 
 
@@ -44,38 +39,20 @@ def read(folder: Path) -> CalibratedChain:
     return robot
 
 
-def check_targets(
-    folder: Path,
-    source: Path | None,
-    out: Path | None = None,
-    ur_kinematics: Path | None = None,
-    offsets: Path | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Refuse, before any work is done, files that cannot be written, are read, not an earlier export's, or one file.
+def targets(
+    source: Path | None, out: Path | None = None, ur_kinematics: Path | None = None, offsets: Path | None = None
+) -> files.Results:
+    """Return the files to be written, with their suffixes: URDF edited from a source, UR kinematics YAML, offsets.
 
-    Args:
-        folder: of the fit; source: the URDF to edit.
-        out, ur_kinematics, offsets: to be written.
-        overwrite: replace whatever stands there.
+    Raises:
+        UsageError: where one is the source.
     """
-    calibrated_urdf = files.Kind("calibrated form of that URDF", (".urdf",), lambda path: _is_calibrated(path, source))
-    asked = [(out, calibrated_urdf), (ur_kinematics, UR_KINEMATICS), (offsets, OFFSETS)]
-    targets = [(target, kind) for target, kind in asked if target is not None]
-    for target, _ in targets:
+    asked = [(out, (".urdf",)), (ur_kinematics, (".yaml", ".yml")), (offsets, (".csv",))]
+    written = [(path, suffixes) for path, suffixes in asked if path is not None]
+    for target, _ in written:
         if source is not None and files.same_file(source, target):
             raise UsageError(f"{target} is the source URDF, which stays as it is; give another name to write to")
-    files.check_results(targets, [source, *results(folder)], overwrite)
-
-
-def _is_calibrated(path: Path, source: Path | None) -> bool:
-    """Tell whether `export_urdf` made a file of a source: it differs in origins alone, and those were computed."""
-    if source is None:
-        return False
-    theirs, ours = (_JUDGED.sub("", text(one)[0]) for one in (source, path))
-    new = set(_ORIGIN.findall(ours)) - set(_ORIGIN.findall(theirs))
-    rest = [_ORIGIN.sub("", one).split() for one in (theirs, ours)]
-    return any(map(_COMPUTED.search, new)) and rest[0] == rest[1]
+    return written
 
 
 def results(folder: Path) -> list[Path]:

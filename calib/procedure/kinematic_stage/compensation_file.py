@@ -23,9 +23,6 @@ def _header(names: Sequence[str]) -> list[str]:
     return ["row", *names, "status", *COLUMNS, "reason"]
 
 
-COMMANDS = files.table("list of joint commands", lambda header, _: header == _header(header[1 : -len(COLUMNS) - 2]))
-
-
 def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, partial: bool = False) -> Path:
     """Write COMMANDS.csv, see `calib.data.poses.target_files`.
 

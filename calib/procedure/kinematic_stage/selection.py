@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.fit_options import FitOptions
-from calib.data.poses.plans import poses_kind, read_poses, write_poses
+from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot
@@ -23,9 +23,9 @@ from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, Seen, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
-from calib.procedure.measuring.run import Run, RunSettings, run_kind
+from calib.procedure.measuring.run import Run, RunSettings
 from calib.procedure.measuring.run import lines as ways
-from calib.procedure.measuring.selection_prediction import NOISES, SelectionPrediction, beside, left_by_select
+from calib.procedure.measuring.selection_prediction import NOISES, SelectionPrediction, beside
 from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
@@ -36,7 +36,6 @@ from poses.select import SearchSettings, Selection, select_poses
 from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
-PREDICTION = files.Kind("prediction of calib select", (".json",), left_by_select)
 VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
 FIGURES = ("predicted", "outlook")  # sigma of the tool over the workspace, and by the number of poses
 
@@ -259,37 +258,16 @@ def _blind(
     return other.value, foretold(seen, np.concatenate([free.jacobian(other.joints), past]), typical, m)
 
 
-def targets(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
+def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
     """Return the files of a selection beside its CSV, of any or of a given one: the prediction, and figures by name."""
     figures = () if not plots else FIGURES if chosen is None else chosen.figures
-    told = {} if chosen is not None and chosen.prediction is None else {"prediction": beside(out)}
-    return told | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
+    predicted = {} if chosen is not None and chosen.prediction is None else {"prediction": beside(out)}
+    return predicted | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
 
 
-def check_targets(
-    out: Path,
-    chain: Chain,
-    plots: bool,
-    inputs: Sequence[str | Path | None] = (),
-    *,
-    run: Path | None = None,
-    chosen: Chosen | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Refuse, before any work is done, files of a selection that cannot be written or are not an earlier one's.
-
-    Args:
-        out: CSV of the poses; run: of the run; chosen: the selection, where there is one already.
-        chain: the arm: a CSV that has more than its joints holds what was measured there.
-        inputs: what is read.
-        overwrite: replace whatever stands there.
-    """
-    told = [
-        (path, PREDICTION if name == "prediction" else files.PICTURE)
-        for name, path in targets(out, plots, chosen).items()
-    ]
-    driven = [(run, run_kind(chain.joint_names))] if run else []
-    files.check_results([(out, poses_kind(chain.joint_names)), *driven, *told], inputs, overwrite)
+def targets(out: Path, plots: bool) -> files.Results:
+    """Return all files that a selection may write, with their suffixes."""
+    return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside_poses(out, plots).values())]
 
 
 def write(chosen: Chosen, path: Path) -> Path:

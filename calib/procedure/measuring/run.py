@@ -11,7 +11,7 @@ The file of a run has a row per stop, in time order::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
@@ -259,15 +259,6 @@ def lines(run: Run, settings: RunSettings) -> list[str]:
         pairs = ", ".join(f"{k + 1} to {k + 2}" for k in run.blocked)
         found.append(f"NO clear way was found from pose {pairs}: drive there by hand, or leave a pose out")
     return found
-
-
-def run_kind(joint_names: Sequence[str]) -> files.Kind:
-    """Return the kind of files that `write_run` writes of one arm."""
-
-    def fits(header: list[str], rows: list[list[str]]) -> bool:
-        return header[:2] == ["t", "pose"] and [name.rpartition(" [")[0] for name in header[2:]] == list(joint_names)
-
-    return files.table("run through poses", fits)
 
 
 def write_run(path: Path, run: Run, chain: Chain) -> Path:

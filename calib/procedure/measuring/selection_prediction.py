@@ -8,7 +8,7 @@ reads it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -59,11 +59,6 @@ class SelectionPrediction:
 def beside(poses: Path) -> Path:
     """Return where the prediction of a CSV of chosen poses lies."""
     return poses.parent / (poses.stem + SUFFIX)
-
-
-def left_by_select(path: Path) -> bool:
-    """Tell whether a file is a prediction as `write` leaves it."""
-    return set(read_json(path)) == {field.name for field in fields(SelectionPrediction)}
 
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:

@@ -19,7 +19,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from calib import files
 
@@ -169,9 +168,7 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
     palette[palette > 251] = 255  # the paper is white; the search for a palette misses it by a digit
     image.putpalette(palette.tolist())
     buffer = io.BytesIO()
-    told = PngInfo()
-    told.add_text("Software", files.MAKER)
-    image.save(buffer, "png", dpi=(dpi, dpi), pnginfo=told)
+    image.save(buffer, "png", dpi=(dpi, dpi))
     return buffer.getvalue()
 
 

@@ -29,7 +29,6 @@ ARM, BEFORE, AFTER, SEEN, LIMIT = (
 GAP = 1.0  # between one part and the next [s]
 EACH = 0.2  # that a pose stands still [s]
 FILE = "session.rrd"
-RECORDING = files.marked("recording for Rerun", ".rrd", files.MAKER.encode())
 
 
 def available() -> bool:

@@ -266,7 +266,6 @@ HEADER = [
     "worst_joint_percent", "behind", "behind_sigma", "as_good", "take", "parameters", "seconds", "iterations",
     "simulations", "failure",
 ]  # fmt: skip
-COMPARISON = files.table("comparison of methods", lambda header, _: header == HEADER)
 
 
 def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
