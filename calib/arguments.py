@@ -6,14 +6,12 @@ Loads nothing heavy: the command line builds default settings before it knows wh
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, wraps
 from inspect import Signature, isgenerator, signature
-from math import inf
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 C = TypeVar("C")
 _PLAIN = {int: (Integral,), float: (Real,)}
@@ -23,32 +21,11 @@ _WORDS = {
 _TABLE = "found a DataFrame: write it, frame.to_csv('table.csv', index=False), and give the file"
 
 
-@dataclass(frozen=True)
-class Within:
-    """Where a number may lie, as an annotation: ``Annotated[float, Within(above=0.0, most=1e6)]``; never NaN.
-
-    Attributes:
-        least, above: from, or beyond, which it lies; most: up to which.
-    """
-
-    least: float = -inf
-    most: float = inf
-    above: float = -inf
-
-    def holds(self, value: Any) -> bool:
-        return bool(self.above < value <= self.most and value >= self.least)
-
-    @property
-    def words(self) -> str:
-        low = f"above {self.above:g}" if self.above > -inf else f"from {self.least:g}" if self.least > -inf else ""
-        high = f"up to {self.most:g}" if self.most < inf else ""
-        return " ".join(part for part in (low, high) if part)
-
-
 def checked(given: C) -> C:
-    """Return a function, or a dataclass, that refuses arguments of other types than annotated.
+    """Return a function, or a dataclass of settings, that refuses other arguments than its annotations allow.
 
-    A function runs with one thread of BLAS, `calib.workers.threads`.
+    A function runs with one thread of BLAS, `calib.workers.threads`. Settings are read as an option file's table is,
+    see `calib.config.parse`; without arguments nothing is loaded for that.
 
     Numbers may be numpy's, and any sequence or array stands for a tuple; text is neither number nor sequence.
 
@@ -57,28 +34,56 @@ def checked(given: C) -> C:
     """
     function: Any = given
     if not isinstance(given, type):
-        return _checked(function, function.__name__, given)
-    function.__init__ = _checked(function.__init__, function.__name__, given, method=True)
+        return _checked(function)
+    function.__init__, function.__pydantic_config__ = _read_by_type(function), {"extra": "forbid"}
     return given
 
 
-def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bool = False) -> Any:
+def _read_by_type(kind: Any) -> Any:
+    init = kind.__init__
+
+    @wraps(init)
+    def call(self: Any, *args: Any, **kwargs: Any) -> None:
+        from calib.config import parse
+        from calib.errors import quiet
+
+        with quiet():
+            bound = _bound(signature(init), kind.__name__, (self, *args), kwargs)
+            given = {key: _plain(value) for key, value in bound.items() if key != "self"}
+            vars(self).update(vars(parse(kind, given, kind.__name__)) if given else {})
+            if not given:
+                init(self)
+
+    return call
+
+
+def _plain(value: Any) -> Any:
+    """Return numpy's numbers and arrays, and tuples, as the numbers and lists of a file."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+
+
+def _bound(wanted: Signature, name: str, args: tuple, kwargs: dict[str, Any]) -> dict[str, Any]:
+    from calib.errors import UsageError
+
+    try:
+        return wanted.bind(*args, **kwargs).arguments
+    except TypeError as wrong:
+        raise UsageError(f"{name}: {wrong}") from None
+
+
+def _checked(function: Callable[..., Any]) -> Any:
     @cache
-    def expected() -> tuple[Any, dict[str, Any]]:
-        return signature(function), get_type_hints(
-            annotated, include_extras=True
-        )  # at the first call: modules load each other no more
+    def expected() -> tuple[Any, dict[str, Any]]:  # at the first call: modules load each other no more
+        return signature(function), get_type_hints(function)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         from calib.errors import quiet
         from calib.workers.threads import limited_steps, one_blas_thread
 
-        if len(args) > method or kwargs:  # something is given beside the defaults
-            _refuse_other_types(name, *expected(), args, kwargs)
-        if method:
-            with quiet():
-                return function(*args, **kwargs)
+        _refuse_other_types(function.__name__, *expected(), args, kwargs)
         with one_blas_thread(), quiet():
             result = function(*args, **kwargs)
         return limited_steps(result) if isgenerator(result) else result
@@ -90,25 +95,16 @@ def _refuse_other_types(name: str, wanted: Signature, hints: dict[str, Any], arg
     from calib.config_types import shown
     from calib.errors import UsageError
 
-    try:
-        bound = wanted.bind(*args, **kwargs)
-    except TypeError as wrong:
-        raise UsageError(f"{name}: {wrong}") from None
-    for argument, value in bound.arguments.items():
+    for argument, value in _bound(wanted, name, args, kwargs).items():
         variadic = wanted.parameters[argument].kind in (2, 4)  # *args, **kwargs
         if argument in hints and not variadic and not _fits(value, hints[argument]):
-            hint = hints[argument]
-            if get_origin(hint) is Annotated and _fits(value, get_args(hint)[0]):  # of its type, beyond its range
-                raise UsageError(f"{argument} {shown(value)}: expected {_words(hint)}")
             found = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
-            raise UsageError(f"{name}: {argument}: expected {_words(hint)}, {found}")
+            raise UsageError(f"{name}: {argument}: expected {_words(hints[argument])}, {found}")
 
 
 def _fits(value: Any, hint: Any) -> bool:
     """Say whether a value is of an annotated type; what the annotation leaves open fits."""
     kind, inner = get_origin(hint), get_args(hint)
-    if kind is Annotated:
-        return _fits(value, inner[0]) and all(one.holds(value) for one in inner[1:] if isinstance(one, Within))
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
     if kind is Literal:
@@ -133,8 +129,6 @@ def _fits(value: Any, hint: Any) -> bool:
 def _words(hint: Any) -> str:
     """Return an annotated type in words."""
     kind, inner = get_origin(hint), get_args(hint)
-    if kind is Annotated:
-        return " ".join([_words(inner[0]), *(one.words for one in inner[1:] if isinstance(one, Within))])
     if kind in (Union, UnionType):
         *first, last = dict.fromkeys(map(_words, inner))
         return f"{', '.join(first)} or {last}" if first else last

@@ -14,6 +14,7 @@ import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -24,8 +25,12 @@ from calib.files import check_regular
 T = TypeVar("T")
 LARGEST = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
 DEEPEST = 32
-_PLAIN = {"float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false"}  # of pydantic's
+_PLAIN = {  # pydantic's words
+    "float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false", "tuple": "a list",
+    "too_short": "at least one number",
+}  # fmt: skip
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+_ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)  # of a docstring: names, and what they are
 
 
 def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[str, Any]:
@@ -156,6 +161,16 @@ def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
     return None
 
 
+def described(given: Any) -> dict[str, str]:
+    """Return what the docstrings of a function, or a class and its bases, say of each argument or attribute."""
+    found: dict[str, str] = {}
+    for one in reversed(getattr(given, "__mro__", (given,))):
+        text = re.split("^(?:Args|Attributes):$", cleandoc(one.__doc__ or ""), maxsplit=1, flags=re.M)
+        for names, words in _ENTRY.findall(text[-1] if len(text) > 1 else ""):
+            found |= dict.fromkeys(names.split(", "), " ".join(words.replace("`", "").split()).removesuffix("."))
+    return found
+
+
 # ---- complaints -----------------------------------------------------------------------------------------------------
 
 
@@ -208,7 +223,7 @@ def _complaint(errors: list[Any], kind: type, place: str, whole: Any) -> str:
         at and isinstance(at[-1], int) and name not in (UNKNOWN, "missing", "dataclass_type")
     ):  # one of several values
         at = at[:-1]
-    where = f"{place}: {located(at)}" if at else place
+    where = ": ".join(filter(None, (place, located(at))))
     if name == UNKNOWN and len(loc) == 3 and loc[0] == "files" and isinstance(found, dict) and "." not in loc[1]:
         return f'{where}: the dot needs quotes: [files."{loc[1]}.{loc[2]}"]'
     if name == UNKNOWN:
@@ -223,9 +238,9 @@ def _complaint(errors: list[Any], kind: type, place: str, whole: Any) -> str:
     elif name == "expected":
         words, found = first["msg"], _written(whole, loc, found)
     else:
-        words = {"tuple_type": f"a list of tables, [[{loc[-1]}]]", "too_short": "at least one number"}.get(
-            name, _PLAIN.get(name.split("_")[0], "a table")
-        )
+        words = _PLAIN.get(name, _PLAIN.get(name.split("_")[0], "a table"))
+        if name == "tuple_type" and is_dataclass(_type_at(kind, (*loc, 0))):
+            words = f"a list of tables, [[{loc[-1]}]]"
     hint = f"; {context['hint']}" if context.get("hint") else ""
     return f"{where}: expected {words}, found {shown(found)}{hint}"
 

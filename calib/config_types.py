@@ -13,7 +13,8 @@ import operator
 import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from importlib import import_module
+from typing import Annotated, Any, get_args
 
 from calib.errors import CalibError, UsageError
 from calib.units import QUANTITIES
@@ -219,15 +220,32 @@ class _Index:
 
 @dataclass(frozen=True)
 class OneOf:
-    """A text that is one of a few; `hint` follows the complaint."""
+    """A text that is one of a few; `hint` follows the complaint.
 
-    allowed: tuple[str, ...]
+    Attributes:
+        allowed: the texts; or ``module:Name`` of the `Literal` that holds them, of a module that is loaded late.
+    """
+
+    allowed: tuple[str, ...] | str
     hint: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The texts."""
+        if not isinstance(self.allowed, str):
+            return self.allowed
+        module, _, name = self.allowed.partition(":")
+        return get_args(getattr(import_module(module), name))
+
+    @property
+    def words(self) -> str:
+        """The texts as a sentence lists them; nothing of a module that is loaded late."""
+        return "" if isinstance(self.allowed, str) else " or ".join((", ".join(self.allowed[:-1]), self.allowed[-1]))
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema as core
 
-        inner, context = core.literal_schema(list(self.allowed)), {"allowed": list(self.allowed), "hint": self.hint}
+        inner, context = core.literal_schema([*self.names]), {"allowed": [*self.names], "hint": self.hint}
         return core.custom_error_schema(inner, "one_of", custom_error_message="", custom_error_context=context)
 
 
@@ -329,6 +347,14 @@ class Hidden:
 
 
 @dataclass(frozen=True)
+class Typed:
+    """How a setting is typed on the command line: the option's name, and the unit of its number, which is SI here."""
+
+    name: str = ""
+    unit: str = ""
+
+
+@dataclass(frozen=True)
 class About:
     """What a key is about: the description in the JSON schema, and the comment in a file that we write."""
 
@@ -383,6 +409,8 @@ Name = Annotated[str, Expect("a text"), Checked(_filled)]
 Names = Annotated[tuple[str, ...], Expect("a list of names")]
 Label = Annotated[str, Checked(_label, {"type": ["string", "number"]})]
 Positive = Annotated[float, Real(above=0)]
+Holdout = Annotated[float, Real(least=0.0, most=0.99, words="a share from 0 to 0.99")]
+Seed = Annotated[int, Whole(0, 2**63 - 1)]
 NotNegative = Annotated[float, Real(least=0)]
 JointNumber = Annotated[int, _Index()]
 Length = Annotated[float, Real(quantity="length")]

@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, progress, say, say_written
+from calib.cli.options import command
+from calib.cli.shared import Base, Out, Plots, Robot, Seed, Tip, progress, say, say_written
 
 app = typer.Typer()
 
 
-@app.command("identify")
+@command(app, "identify")
 def identify_dynamics(
     robot: Robot,
-    recordings: Annotated[list[str], typer.Argument(help="recordings of q and torque or current; log.npz@0:9.4 cuts")],
-    out: Annotated[Path, typer.Option(help="folder for the identified model and its report")],
-    validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
-    method: Annotated[str | None, typer.Option(help="wls and others: calib study --list-methods")] = None,
-    friction: Annotated[
-        str | None, typer.Option(help="auto, standard, or one rung: load, presliding, cable, stribeck, ...")
-    ] = None,
-    options: Annotated[
-        Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")
-    ] = None,
-    excitation: Annotated[
-        Path | None, typer.Option(help="folder of calib excite: what it predicted is held against what is found")
-    ] = None,
+    recordings: list[str],
+    out: Out,
+    validate: list[str] | None = None,
+    method: str | None = None,
+    friction: str | None = None,
+    options: Path | None = None,
+    excitation: Path | None = None,
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
     plots: Plots = True,
 ) -> None:
-    """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted."""
+    """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
+
+    Args:
+        recordings: recordings of q and torque or current; log.npz@0:9.4 cuts
+        out: folder for the identified model and its report
+        validate: recording of other motion; may be repeated
+        method: wls and others: calib study --list-methods
+        friction: auto, standard, or one rung: load, presliding, cable, stribeck, ...
+        options: TOML: drives, payloads, gains, filters, how to identify
+        excitation: folder of calib excite: what it predicted is held against what is found
+    """
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.parallel_stage.destination import check_destination
     from calib.procedure.report import console as shown

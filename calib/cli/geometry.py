@@ -7,52 +7,38 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, exit_failed, numbers, progress, say, say_written
+from calib.cli.options import command
+from calib.cli.shared import (  # fmt: skip
+    Base,
+    Out,
+    Overwrite,
+    Plots,
+    Robot,
+    Seed,
+    Tip,
+    Workers,
+    exit_failed,
+    numbers,
+    progress,
+    say,
+    say_written,
+)
+from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 
 app = typer.Typer()
 
 
-@app.command()
+@command(app)
 def fit(
     robot: Robot,
-    measured: Annotated[
-        list[Path],
-        typer.Argument(
-            help="CSV files of measured poses (calib formats measurements), or folders of images (calib formats images)"
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="folder for the calibrated robot and its report")],
-    validate: Annotated[list[Path] | None, typer.Option(help="CSV file of unseen poses; may be repeated")] = None,
-    holdout: Annotated[float, typer.Option(help="share of each file's poses kept from the fit")] = 0.0,
-    refit_frames: Annotated[bool, typer.Option(help="validation files: base and tool placement of their own")] = False,
-    options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="auto, frames, offsets, geometry, stiffness, bending, coupling, harmonics or wobble: that rung and "
-            "all below it"
-        ),
-    ] = None,
-    loss: Annotated[str | None, typer.Option(help="auto, none, huber or cauchy")] = None,
-    selection: Annotated[
-        Path | None,
-        typer.Option(help="CSV of calib select, or its folder: what it predicted is held against what is found"),
-    ] = None,
-    folds: Annotated[
-        str,
-        typer.Option(help="rows the ladder sets aside: transfer (stations, files, regions), regions, random or poses"),
-    ] = "transfer",
-    stations: Annotated[str, typer.Option(help="base placement: each file its own, or one for all")] = "each",
-    tools: Annotated[str, typer.Option(help="one tool for all files, or each its own")] = "one",
-    tolerance: Annotated[
-        float | None, typer.Option(metavar="MM", help="rms on unseen poses, in mm, above which the verdict is fail")
-    ] = None,
-    deliverable: Annotated[
-        str, typer.Option(help="what the verdict is about: urdf (robot.urdf alone), or corrections (with them)")
-    ] = "urdf",
+    measured: list[Path],
+    out: Out,
+    settings: FitSettings,
+    validate: list[Path] | None = None,
+    options: Path | None = None,
+    selection: Path | None = None,
     base: Base = None,
     tip: Tip = None,
-    seed: Seed = 0,
     plots: Plots = True,
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and judge it.
@@ -61,17 +47,19 @@ def fit(
     error that nobody foresaw.
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
+
+    Args:
+        measured: CSV files of measured poses (calib formats measurements), or folders of images (calib formats images)
+        out: folder for the calibrated robot and its report
+        validate: CSV file of unseen poses; may be repeated
+        options: TOML, see calib formats options
+        selection: CSV of calib select, or its folder: what it predicted is held against what is found
     """
     from calib.api.kinematic import fit_geometry
-    from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.parallel_stage.destination import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import geometry_section
 
-    settings = FitSettings(
-        model, loss, folds, stations, tools, holdout, refit_frames,
-        None if tolerance is None else 1e-3 * tolerance, deliverable, seed,
-    )  # fmt: skip
     check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
     def read(given: Any) -> None:
@@ -88,45 +76,18 @@ def fit(
     say_written(found.renderables(), out, found.verdict.level)
 
 
-@app.command()
+@command(app)
 def select(
     robot: Robot,
-    out: Annotated[Path, typer.Option(help="CSV file of the chosen joint values, rad")],
+    out: Out,
+    settings: SelectionSettings,
     m: Annotated[int, typer.Option("-m", "--poses", help="how many poses")] = 30,
-    kind: Annotated[str, typer.Option(help="what will be measured: pose or position")] = "pose",
-    tool: Annotated[
-        list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
-    ] = None,
-    index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
-    method: Annotated[str | None, typer.Option(help="detmax (default), polish, local, multistart or tabu")] = None,
-    starts: Annotated[int, typer.Option(help="random sets that multistart begins at")] = 8,
-    evaluations: Annotated[int, typer.Option(help="most evaluations of the index in one local search")] = 5000,
-    seconds: Annotated[float | None, typer.Option(help="processor time for the search; without: to its end")] = None,
-    climbs: Annotated[
-        int, typer.Option(help="searches for feasible poses beyond the bound; 0: it covers the candidates only")
-    ] = 0,
-    constraints: Annotated[Path | None, typer.Option(help="TOML, see calib formats constraints")] = None,
-    without: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="self-collision, floor, joint-margin, view: not kept; instrument, box, obstacles: not there; may be "
-            "repeated"
-        ),
-    ] = None,
-    run: Annotated[
-        Path | None, typer.Option(help="CSV of the run: t, pose (0: via-point), joints; calib view rehearses it")
-    ] = None,
-    speed: Annotated[float, typer.Option(help="share of the joints' speeds that the run is driven at")] = 0.3,
-    dwell: Annotated[float, typer.Option(help="seconds that each pose takes to settle and be measured")] = 6.0,
-    candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
-    existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
-    sigma: Annotated[
-        str | None, typer.Option(help="of a position [m] and an orientation [rad], e.g. 1e-4,1e-4")
-    ] = None,
-    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
+    constraints: Path | None = None,
+    run: Path | None = None,
+    existing: Path | None = None,
+    workers: Workers = "1",
     base: Base = None,
     tip: Tip = None,
-    seed: Seed = 0,
     plots: Plots = True,
     overwrite: Overwrite = False,
 ) -> None:
@@ -134,15 +95,19 @@ def select(
 
     Beside OUT.csv, OUT_prediction.json holds what the poses will tell (calib fit --selection), OUT_predicted.png shows
     how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more poses would tell.
+
+    Args:
+        out: CSV file of the chosen joint values, rad
+        constraints: TOML, see calib formats constraints
+        run: CSV of the run: t, pose (0: via-point), joints; calib view rehearses it
+        existing: CSV of poses measured before, which count
     """
     from calib.api.kinematic import select_poses
     from calib.data.poses.fit_options import FitOptions
     from calib.files import check_results, together
     from calib.procedure.kinematic_stage import selection
     from calib.procedure.kinematic_stage.inputs import load_robot
-    from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.constraints_file import beside
-    from calib.procedure.measuring.run import RunSettings
     from calib.procedure.parallel_stage.robots import refuse_parallel
 
     named = beside(constraints).values() if constraints else ()
@@ -150,13 +115,6 @@ def select(
     load_robot(robot, existing, FitOptions(), base, tip)
     written = [*selection.targets(out, plots), *([(run, (".csv",))] if run else [])]
     check_results(written, [robot, existing, constraints, *named], overwrite)
-    targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
-    sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
-    stated = None if sigmas is None else (sigmas[0], sigmas[1])
-    settings = SelectionSettings(
-        kind, targets, index, method or DEFAULT_SELECTION.method, candidates, stated, seed, starts, evaluations,
-        seconds, climbs, tuple(without or ()), RunSettings(speed, dwell),
-    )  # fmt: skip
     with progress() as show:
         chosen = select_poses(
             robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,
@@ -175,29 +133,31 @@ def select(
     say(f"{m} poses written to {out}")
 
 
-@app.command()
+@command(app)
 def export(
-    folder: Annotated[Path, typer.Argument(help="the folder of a fit, or of an identification")],
-    urdf: Annotated[
-        Path | None, typer.Option(help="the URDF to put the calibrated geometry into (it stays as it is)")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="the URDF to write")] = None,
-    ur_kinematics: Annotated[Path | None, typer.Option(help="write ur_description's kinematics YAML")] = None,
-    offsets: Annotated[Path | None, typer.Option(help="write a CSV of joint offsets")] = None,
-    into: Annotated[
-        Path | None, typer.Option(help="folder for all forms, with identified dynamics: calib formats exports")
-    ] = None,
-    for_corrections: Annotated[
-        bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
-    ] = False,
+    folder: Path,
+    urdf: Path | None = None,
+    out: Path | None = None,
+    ur_kinematics: Path | None = None,
+    offsets: Path | None = None,
+    into: Path | None = None,
+    for_corrections: Annotated[bool, typer.Option("--for-corrections")] = False,
     overwrite: Overwrite = False,
-    prior: Annotated[
-        str, typer.Option(help="with --into: what draws masses that the torques do not tell, entropic or euclidean")
-    ] = "entropic",
+    prior: str = "entropic",
 ) -> None:
     """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included.
 
     A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
+
+    Args:
+        folder: the folder of a fit, or of an identification
+        urdf: the URDF to put the calibrated geometry into (it stays as it is)
+        out: the URDF to write
+        ur_kinematics: write ur_description's kinematics YAML
+        offsets: write a CSV of joint offsets
+        into: folder for all forms, with identified dynamics: calib formats exports
+        for_corrections: the URDF that joint_corrections.csv belongs to, worse without it
+        prior: with --into: what masses that the torques do not identify are regularised towards, entropic or euclidean
     """
     from calib.errors import UsageError
     from calib.files import results
@@ -244,29 +204,17 @@ def export(
     exit_failed(own.level)
 
 
-@app.command()
+@command(app)
 def compensate(
-    folder: Annotated[Path, typer.Argument(metavar="FIT", help="the folder of a fit, or of a session that has one")],
-    targets: Annotated[Path, typer.Argument(help="CSV of nominal joints or tool poses: calib formats targets")],
-    out: Annotated[Path, typer.Option(help="CSV file of joint commands")],
-    frame: Annotated[
-        str, typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station")
-    ] = "base",
-    tool: Annotated[
-        str, typer.Option(help="what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]")
-    ] = "flange",
-    dof: Annotated[
-        int | None, typer.Option(help="how much counts: 6; 5, free to turn about the tool's z; 3, position only")
-    ] = None,
-    start: Annotated[
-        str | None, typer.Option(help="q1,...,qn [rad, m] near which targets without joints are sought")
-    ] = None,
-    tolerance: Annotated[
-        str, typer.Option(metavar="MM,MRAD", help="what a command may leave by the calibrated model")
-    ] = "0.001,0.01",
-    partial: Annotated[
-        bool, typer.Option("--partial", help="write what is reached, even where some targets are not")
-    ] = False,
+    folder: Annotated[Path, typer.Argument(metavar="FIT")],
+    targets: Path,
+    out: Out,
+    frame: str = "base",
+    tool: str = "flange",
+    dof: int | None = None,
+    start: str | None = None,
+    tolerance: Annotated[str, typer.Option(metavar="MM,MRAD")] = "0.001,0.01",
+    partial: Annotated[bool, typer.Option("--partial")] = False,
     overwrite: Overwrite = False,
     seed: Seed = 0,
 ) -> None:
@@ -277,6 +225,17 @@ def compensate(
     Targets taught with the robot, or commands that are to change least: --frame nominal.
 
     Targets of an offline model of the cell, which stand in the robot's base: --frame base.
+
+    Args:
+        folder: the folder of a fit, or of a session that has one
+        targets: CSV of nominal joints or tool poses: calib formats targets
+        out: CSV file of joint commands
+        frame: what the targets are in: base (of the calibrated robot), nominal, or a station
+        tool: what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]
+        dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only
+        start: q1,...,qn [rad, m] near which targets without joints are sought
+        tolerance: what a command may leave by the calibrated model
+        partial: write what is reached, even where some targets are not
     """
     from calib.api import kinematic
     from calib.files import check_results

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.shared import Base, Overwrite, Plots, Seed, Tip, exit_failed, make_console, reporting, say
+from calib.cli.options import command
+from calib.cli.shared import Base, Overwrite, Plots, Seed, Tip, Workers, exit_failed, make_console, reporting, say
 from calib.errors import CalibError, UsageError, command_line
 
 if TYPE_CHECKING:
@@ -18,56 +19,29 @@ app = typer.Typer()
 Folder = Annotated[Path, typer.Argument(help="the session's folder")]
 
 
-@app.command()
+@command(app)
 def new(
     folder: Folder,
-    robot: Annotated[
-        str | None, typer.Option(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")
-    ] = None,
-    instrument: Annotated[
-        str | None,
-        typer.Option(help="cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none"),
-    ] = None,
-    tool: Annotated[
-        str | None, typer.Option(help="x,y,z: where the target roughly sits in the tip's frame [m]")
-    ] = None,
-    limits: Annotated[Path | None, typer.Option(help="TOML: where, how fast the arm may go; poses and motions")] = None,
-    instrument_at: Annotated[
-        str | None, typer.Option(help="x,y,z: where the instrument stands in the robot's base frame [m], or unknown")
-    ] = None,
-    cone: Annotated[
-        str | None, typer.Option(help="half angle in which the target sees the instrument [deg], or unknown")
-    ] = None,
-    facing: Annotated[str | None, typer.Option(help="where the target faces in the tip's frame: z, -x …")] = None,
-    box: Annotated[
-        str | None, typer.Option(help="x,x,y,y,z,z that no part of the arm leaves [m]; unknown, or none")
-    ] = None,
-    obstacle: Annotated[
-        list[str] | None, typer.Option(help="'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]; unknown, none; repeatable")
-    ] = None,
-    mounting: Annotated[
-        str | None, typer.Option(help="of a camera: in hand (the arm carries it), to hand (the board), or unknown")
-    ] = None,
-    lens: Annotated[str | None, typer.Option(help="camera_info YAML of the camera, roughly right; or unknown")] = None,
-    board: Annotated[str | None, typer.Option(help="board.toml, or unknown")] = None,
-    carried: Annotated[
-        str | None, typer.Option(help="'x,y,z facing z': camera or board in the tip's frame [m]; or unknown")
-    ] = None,
-    stands: Annotated[
-        str | None, typer.Option(help="'x,y,z facing z': the other in the base frame [m]; or unknown")
-    ] = None,
-    dynamics: Annotated[
-        bool | None, typer.Option("--dynamics/--geometry-only", help="identify the dynamics, too (default)")
-    ] = None,
-    dynamics_only: Annotated[
-        bool, typer.Option("--dynamics-only", help="measure nothing: the description is taken as calibrated")
-    ] = False,
-    payload: Annotated[
-        list[str] | None, typer.Option(help="label=kg of a body to record with as well; may be repeated")
-    ] = None,
-    torques: Annotated[str | None, typer.Option(help="motor, link, or both: what the log holds")] = None,
-    poses: Annotated[int, typer.Option(help="poses to choose for the fit")] = 40,
-    validation: Annotated[int, typer.Option(help="poses to measure and never fit; 0 for none")] = 20,
+    robot: str | None = None,
+    instrument: str | None = None,
+    tool: str | None = None,
+    limits: Path | None = None,
+    instrument_at: str | None = None,
+    cone: str | None = None,
+    facing: str | None = None,
+    box: str | None = None,
+    obstacle: list[str] | None = None,
+    mounting: str | None = None,
+    lens: str | None = None,
+    board: str | None = None,
+    carried: str | None = None,
+    stands: str | None = None,
+    dynamics: Annotated[bool | None, typer.Option("--dynamics/--geometry-only")] = None,
+    dynamics_only: Annotated[bool, typer.Option("--dynamics-only")] = False,
+    payload: list[str] | None = None,
+    torques: str | None = None,
+    poses: int = 40,
+    validation: int = 20,
     base: Base = "",
     tip: Tip = "",
     seed: Seed = 0,
@@ -78,6 +52,28 @@ def new(
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
     session). Without --robot or --instrument, at a terminal, it asks; what is not known of the cell is not checked, and
     stands on the certificate.
+
+    Args:
+        robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit
+        instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none
+        tool: x,y,z: where the target roughly sits in the tip's frame [m]
+        limits: TOML: where, how fast the arm may go; poses and motions
+        instrument_at: x,y,z: where the instrument stands in the robot's base frame [m], or unknown
+        cone: half angle in which the target sees the instrument [deg], or unknown
+        facing: where the target faces in the tip's frame: z, -x …
+        box: x,x,y,y,z,z that no part of the arm leaves [m]; unknown, or none
+        obstacle: 'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]; unknown, none; repeatable
+        mounting: of a camera: in hand (the arm carries it), to hand (the board), or unknown
+        lens: camera_info YAML of the camera, roughly right; or unknown
+        board: board.toml, or unknown
+        carried: 'x,y,z facing z': camera or board in the tip's frame [m]; or unknown
+        stands: 'x,y,z facing z': the other in the base frame [m]; or unknown
+        dynamics: identify the dynamics, too (default)
+        dynamics_only: measure nothing: the description is taken as calibrated
+        payload: label=kg of a body to record with as well; may be repeated
+        torques: motor, link, or both: what the log holds
+        poses: poses to choose for the fit
+        validation: poses to measure and never fit; 0 for none
     """
     from calib.api.sessions import new_session
     from calib.procedure.parallel_stage.robots import refuse_parallel
@@ -121,20 +117,17 @@ def _asked(given: Answers) -> Answers:
     return given
 
 
-@app.command()
+@command(app)
 def formats(
-    topic: Annotated[
-        str | None,
-        typer.Argument(
-            help="measurements, images, targets, options, identify-options, identified, exports, constraints, mdh, "
-            "parallel, robot, session, limits, waypoints, excitation, study or recordings"
-        ),
-    ] = None,
-    schema: Annotated[
-        bool, typer.Option("--schema", help="the JSON schema of a TOML file, for editors that complete its keys")
-    ] = False,
+    topic: Annotated[str | None, typer.Argument()] = None, schema: Annotated[bool, typer.Option("--schema")] = False
 ) -> None:
-    """Print what files hold: columns, keys, units."""
+    """Print what files hold: columns, keys, units.
+
+    Args:
+        topic: measurements, images, targets, options, identify-options, identified, exports, constraints, mdh,
+            parallel, robot, session, limits, waypoints, excitation, study or recordings
+        schema: the JSON schema of a TOML file, for editors that complete its keys
+    """
     from calib.procedure import formats as documents
 
     if schema:
@@ -143,36 +136,35 @@ def formats(
         print(documents.describe(topic) if topic else "\n".join(documents.overview()))
 
 
-@app.command()
-def explain(
-    code: Annotated[
-        str | None,
-        typer.Argument(help="a finding's code in metrics.json, or a term such as 'held out'; default: list all"),
-    ] = None,
-) -> None:
-    """Print what a finding or a term means, and what to do."""
+@command(app)
+def explain(code: Annotated[str | None, typer.Argument()] = None) -> None:
+    """Print what a finding or a term means, and what to do.
+
+    Args:
+        code: a finding's code in metrics.json, or a term such as 'held out'; default: list all
+    """
     from calib.procedure import findings
 
     print(findings.explain(code) if code else "\n".join([*findings.catalogue(), *findings.glossary()]))
 
 
-@app.command("next")
+@command(app, "next")
 def next_step(folder: Folder, plots: Plots = True) -> None:
     """Go on in a session, then say what to do at the robot."""
     _go_on(folder, "next", plots=plots)
 
 
-@app.command()
-def redo(
-    folder: Folder,
-    step: Annotated[str, typer.Argument(help="a step's name or number, see calib status")],
-    plots: Plots = True,
-) -> None:
-    """Make a step of a session again, and all that rests on it."""
+@command(app)
+def redo(folder: Folder, step: str, plots: Plots = True) -> None:
+    """Make a step of a session again, and all that rests on it.
+
+    Args:
+        step: a step's name or number, see calib status
+    """
     _go_on(folder, "redo", step, plots)
 
 
-@app.command()
+@command(app)
 def status(folder: Folder) -> None:
     """Show how far a session is, and what is stale."""
     from calib.procedure.session import commands
@@ -182,18 +174,27 @@ def status(folder: Folder) -> None:
         console.print(renderable, soft_wrap=True)
 
 
-@app.command()
+@command(app)
 def demo(
-    out: Annotated[Path, typer.Option(help="the session's folder")] = Path("calib-demo"),
-    robot: Annotated[str, typer.Option(help="a robot of the library")] = "lwr4plus",
-    geometry_only: Annotated[bool, typer.Option("--geometry-only", help="leave the dynamics out")] = False,
-    instrument: Annotated[str, typer.Option(help="cmm, or camera: rendered images of a board")] = "cmm",
-    guided: Annotated[bool, typer.Option("--guided", help="stop where an engineer would")] = False,
-    bring: Annotated[Path | None, typer.Option(help="let the simulated cell bring what this session waits for")] = None,
+    out: Path = Path("calib-demo"),
+    robot: str = "lwr4plus",
+    geometry_only: Annotated[bool, typer.Option("--geometry-only")] = False,
+    instrument: str = "cmm",
+    guided: Annotated[bool, typer.Option("--guided")] = False,
+    bring: Path | None = None,
     seed: Seed = 0,
     plots: Plots = True,
 ) -> None:
-    """Calibrate a simulated robot; compare with the hidden truth."""
+    """Calibrate a simulated robot; compare with the hidden truth.
+
+    Args:
+        out: the session's folder
+        robot: a robot of the library
+        geometry_only: leave the dynamics out
+        instrument: cmm, or camera: rendered images of a board
+        guided: stop where an engineer would
+        bring: let the simulated cell bring what this session waits for
+    """
     from calib.procedure.session import demo as demonstration
 
     with reporting() as (say, progress):
@@ -214,15 +215,14 @@ def demo(
     exit_failed(found.verdict)
 
 
-@app.command("run")
-def run(
-    sessions: Annotated[list[Path], typer.Argument(help="session.toml files, or the sessions' folders")],
-    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
-    plots: Plots = True,
-) -> None:
+@command(app)
+def run(sessions: list[Path], workers: Workers = "1", plots: Plots = True) -> None:
     """Run many SESSIONS, one folder per robot, as far as they go. A table at the end says how they stand.
 
     A robot that fails does not stop the others; its folder's run.log says why. The exit code is the worst of all.
+
+    Args:
+        sessions: session.toml files, or the sessions' folders
     """
     import time
 
@@ -255,19 +255,22 @@ def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> N
     exit_failed(stop.verdict)
 
 
-@app.command()
+@command(app)
 def view(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="of a fit, a session, an identification, a motion; or a CSV")
-    ],
-    save: Annotated[Path | None, typer.Option(help="write a Rerun recording (.rrd), and open no window")] = None,
-    spawn: Annotated[
-        bool | None, typer.Option("--spawn/--no-spawn", help="open Rerun's window; by default where nothing is saved")
-    ] = None,
-    robot: Annotated[str | None, typer.Option(help="the arm to draw, where the folder does not say")] = None,
+    folder: Annotated[Path, typer.Argument(metavar="DIR")],
+    save: Path | None = None,
+    spawn: Annotated[bool | None, typer.Option("--spawn/--no-spawn")] = None,
+    robot: str | None = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Show robot, errors, poses, motions or torques in Rerun."""
+    """Show robot, errors, poses, motions or torques in Rerun.
+
+    Args:
+        folder: of a fit, a session, an identification, a motion; or a CSV
+        save: write a Rerun recording (.rrd), and open no window
+        spawn: open Rerun's window; by default where nothing is saved
+        robot: the arm to draw, where the folder does not say
+    """
     from calib.files import results
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.report import viewer

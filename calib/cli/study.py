@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, exit_failed, reporting, say
+from calib.cli.options import command
+from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, Workers, exit_failed, reporting, say
 from calib.errors import UsageError
 
 app = typer.Typer()
@@ -15,24 +16,31 @@ SHOWN = 3  # conditions whose tables are printed in full
 LOGGED = 30.0  # [s] between two lines on progress where the output is no terminal
 
 
-@app.command()
+@command(app)
 def study(
-    studies: Annotated[
-        list[str] | None, typer.Argument(metavar="STUDY...", help="study files, or shipped ones: MCS-TX40-1-1, 'MCS-*'")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="folder of its rows and report; default: the study's name")] = None,
-    methods: Annotated[str | None, typer.Option(help="in place of the file's: wls,iv,didim")] = None,
-    runs: Annotated[int | None, typer.Option(min=0, help="data sets per condition, in place of the file's")] = None,
-    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
-    report_only: Annotated[bool, typer.Option("--report-only", help="run nothing: report what is there")] = False,
-    list_methods: Annotated[bool, typer.Option("--list-methods", help="all methods, and what each needs")] = False,
-    list_studies: Annotated[bool, typer.Option("--list", help="the studies that come with the toolkit")] = False,
+    studies: Annotated[list[str] | None, typer.Argument(metavar="STUDY...")] = None,
+    out: Path | None = None,
+    methods: str | None = None,
+    runs: Annotated[int | None, typer.Option(min=0)] = None,
+    workers: Workers = "1",
+    report_only: Annotated[bool, typer.Option("--report-only")] = False,
+    list_methods: Annotated[bool, typer.Option("--list-methods")] = False,
+    list_studies: Annotated[bool, typer.Option("--list")] = False,
     plots: Plots = True,
 ) -> None:
     """Compare identification methods where the truth is known. Runs STUDY, or what of it is missing (Monte Carlo).
 
     Rows go to the disk as they come: a study that was stopped, or lost workers, goes on from there when the same
     command is given again; asked for more runs, it adds them. What a study file holds: calib formats study.
+
+    Args:
+        studies: study files, or shipped ones: MCS-TX40-1-1, 'MCS-*'
+        out: folder of its rows and report; default: the study's name
+        methods: in place of the file's: wls,iv,didim
+        runs: data sets per condition, in place of the file's
+        report_only: run nothing: report what is there
+        list_methods: all methods, and what each needs
+        list_studies: the studies that come with the toolkit
     """
     from calib.procedure.report import console
     from calib.procedure.study import outcome, report
@@ -59,19 +67,15 @@ def study(
     say(*found.described(), f"written to {folder}: {outcome.REPORT} shows it")
 
 
-@app.command()
+@command(app)
 def compare(
     robot: Robot,
-    recordings: Annotated[list[str], typer.Argument(help="recordings to learn from; log.npz@0:9.4 cuts")],
-    validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
-    methods: Annotated[str | None, typer.Option(help="wls,iv,didim; default: all that the options allow")] = None,
-    friction: Annotated[
-        str, typer.Option(help="as of calib identify; loops are simulated with standard friction")
-    ] = "standard",
-    options: Annotated[
-        Path | None, typer.Option(help="TOML, as of calib identify; with [loop], all methods run")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="CSV to write the table to")] = None,
+    recordings: list[str],
+    validate: list[str] | None = None,
+    methods: str | None = None,
+    friction: str = "standard",
+    options: Path | None = None,
+    out: Path | None = None,
     overwrite: Overwrite = False,
     base: Base = None,
     tip: Tip = None,
@@ -80,6 +84,14 @@ def compare(
     """Rank identification methods on recordings of your robot. What counts is how well they predict other motion.
 
     The one to take is judged as calib identify judges it; where its verdict is fail, none is to take: exit code 1.
+
+    Args:
+        recordings: recordings to learn from; log.npz@0:9.4 cuts
+        validate: recording of other motion; may be repeated
+        methods: wls,iv,didim; default: all that the options allow
+        friction: as of calib identify; loops are simulated with standard friction
+        options: TOML, as of calib identify; with [loop], all methods run
+        out: CSV to write the table to
     """
     from calib import files
     from calib.identification.identify_options import read_options

@@ -74,14 +74,14 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.new_session("s", "ur5", "cmm", poses=4.5), "new_session: poses: expected a whole number"),
         (lambda: calib.new_session("s", "ur5", "cmm", periode=4.5), "no key 'periode' .did you mean 'period'"),
         (lambda: calib.ExcitationSettings(period="a"), "ExcitationSettings: period: expected a number above 0"),
-        (lambda: calib.ExcitationSettings(goals="raw=35"), "ExcitationSettings: goals: expected several, each a text"),
-        (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected True or False, found 1"),
-        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected several, each"),
-        (lambda: calib.FitSettings(tolerance="0.1"), "FitSettings: tolerance: expected a number or None, found '0.1'"),
-        (lambda: calib.FitSettings(tolerance=0.0), "tolerance 0 mm: expected a length above 0"),
-        (lambda: calib.FitSettings(stations="two"), "^stations two: expected one of each, one"),
-        (lambda: calib.SelectionSettings(kind="positions"), "^kind positions: expected one of pose, position"),
-        (lambda: calib.SelectionSettings(method="detmx"), "^method detmx: expected one of detmax"),
+        (lambda: calib.ExcitationSettings(goals="raw=35"), "ExcitationSettings: goals: expected a list, found 'raw=35'"),
+        (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected true or false, found 1"),
+        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected a list, found 1"),
+        (lambda: calib.FitSettings(tolerance="low"), "FitSettings: tolerance: cannot read 'low' as a number"),
+        (lambda: calib.FitSettings(tolerance=0.0), "tolerance: expected a number above 0"),
+        (lambda: calib.FitSettings(stations="two"), "stations: expected one of each, one, found 'two'"),
+        (lambda: calib.SelectionSettings(kind="positions"), "kind: expected one of pose, position .did you mean 'position'"),
+        (lambda: calib.SelectionSettings(method="detmx"), "method: expected one of detmax"),
         (lambda: calib.ExcitationSettings(goals=("foo=3",)), "goal 'foo=3': 'foo' is none of raw"),
         (lambda: calib.ExcitationSettings(hard=("logdet",)), "goal 'logdet': expected NAME=NUMBER"),
         (lambda: calib.load(""), "an empty text names no robot"),
@@ -95,7 +95,7 @@ def test_an_argument_of_another_type_is_refused_by_its_name(call, words):
 def test_numbers_and_sequences_of_numpy_are_numbers_and_sequences():
     start, tool = np.zeros(6), np.array([[0.1, 0.0, 0.0]])
     assert calib.ExcitationSettings(period=np.float32(5), seed=np.int64(3), start=start, goals=["raw=35"]).seed == 3
-    assert calib.SelectionSettings(tools=tool, seconds=2).tools is tool  # type: ignore[arg-type]
+    assert calib.SelectionSettings(tools=tool, seconds=2).tools == ((0.1, 0.0, 0.0),)  # type: ignore[arg-type]
 
 
 def test_a_data_frame_is_refused_by_its_name():
@@ -259,9 +259,9 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
 
 
 def test_wrong_settings_are_refused_where_they_are_made():
-    with pytest.raises(calib.CalibError, match=r"holdout 1\.5"):
+    with pytest.raises(calib.CalibError, match="holdout: expected a number"):
         calib.FitSettings(holdout=1.5)
-    with pytest.raises(calib.CalibError, match="model geometri: expected one of"):
+    with pytest.raises(calib.CalibError, match="model: expected one of"):
         calib.FitSettings(model="geometri")
 
 

@@ -52,6 +52,7 @@ from typing import Annotated, Any
 
 from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread  # fmt: skip
+from calib.data.poses.choices import FINEST, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import UsageError, suggestion
 from calib.units import ANGLES, LENGTHS
@@ -59,10 +60,7 @@ from calib.units import ANGLES, LENGTHS
 FORMATS = ("csv", "robodk", "three_smr")
 AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
 EULER = ("vector", "wpr", "xyz", *(f"{axes} {how}" for axes in AXES for how in ("fixed", "moving")))
-MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coupling", "harmonics", "wobble")
-LOSSES = ("auto", "none", "huber", "cauchy")
 
-FINEST = 1e-10  # no instrument's sigma is smaller [m or rad]; our choice
 Metres = Annotated[float, Real(above=0, least=FINEST, most=0.1, unit="m")]
 Radians = Annotated[float, Real(above=0, least=FINEST, most=1.0, unit="rad")]
 Prior = Annotated[float, Real(above=0, least=1e-12, most=1e6)]  # [m, rad, or a deflection's unit]
@@ -143,8 +141,8 @@ class FitOptions(FileOptions):
     """
 
     files: Mapping[str, FileOptions] = field(default_factory=dict)
-    model: Annotated[str, OneOf(MODELS)] = "auto"
-    loss: Annotated[str, OneOf(LOSSES)] = "auto"
+    model: Model = "auto"
+    loss: Loss = "auto"
     loss_scale: Positive | None = None
     beta: Flag = True
     fix: Names = ()

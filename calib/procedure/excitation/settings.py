@@ -4,77 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from calib.arguments import Within, checked
+from calib.arguments import checked
+from calib.config_types import Checked, Flag, OneOf, Real, Seed, Text, Typed, Whole
 from calib.errors import UsageError
 
-Rate = Annotated[float, Within(above=0.0, most=1e5)]  # [Hz]
-Slower = Annotated[float, Within(1.0, 1000.0)]
 HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
-FAMILIES = ("fourier", "bspline")
 GOALS = ("raw", "normalised", "duration", "coverage", "wrist")  # and joint1, joint2, …
 AIMS: tuple[Literal["logdet", "smallest"], ...] = ("logdet", "smallest")
 COARSE = 5  # harmonics that a search begins with (our choice)
-
-
-@checked
-@dataclass(frozen=True)
-class ExcitationSettings:
-    """How an exciting motion is designed and played.
-
-    Attributes:
-        goals, hard: ``raw=35``, ``normalised=6`` (condition numbers), ``wrist=0.1`` or ``joint6=0.1`` (mean torque as a
-            share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way),
-            ``duration=12`` [s]; hard ones must be met. Without any the logarithms of both condition numbers are
-            minimised in equal parts; ``logdet`` or ``smallest`` among the goals: that index in their place.
-        period: T0 of the motion [s], at most; shortest: what the search may shorten it to [s]; None: it is kept.
-        harmonics: frequencies per joint, or control points beside the rest conditions of splines; None: `HARMONICS`, or
-            as many as stay below the limits' resonance.
-        family: "fourier" or "bspline".
-        drives: terms of each joint's drive, where no identified model has its own.
-        rate: of the controller [Hz].
-        samples: instants over the period at which the search evaluates.
-        starts: random starts of the search; evaluations: most of one start; seed: of the starts.
-        front: motions on the front between the normalised condition number and the first torque goal; 0 for none.
-        start: (n,) where the robot stands [rad or m], for an approach; None for none.
-        repeat: periods to run one after the other.
-        slower: factor of a slow rehearsal, 1 for none.
-        existing: recordings (``log.npz@0:9.4`` cuts), or folders of earlier excitations, that count already; the new
-            motion counts `repeat` times.
-        lock: joints that stay, ``joint4`` or ``joint4=0.5`` [rad or m].
-        noise: of the torques, what no parameter explains, as a share of their limits; for the prediction alone. None:
-            `calib.procedure.excitation.prediction.NOISE`.
-        outlook: whether to look at what other periods would tell.
-    """
-
-    goals: tuple[str, ...] = ()
-    hard: tuple[str, ...] = ()
-    period: Annotated[float, Within(above=0.0, most=3600.0)] = 20.0
-    shortest: Annotated[float, Within(above=0.0, most=3600.0)] | None = None
-    harmonics: Annotated[int, Within(1, 200)] | None = None
-    family: str = "fourier"
-    drives: str = "Fv Fc off"
-    rate: Rate = 1000.0
-    samples: Annotated[int, Within(10, 100_000)] = 200
-    starts: Annotated[int, Within(1, 10_000)] = 4
-    evaluations: Annotated[int, Within(1, 10_000_000)] = 1500
-    seed: Annotated[int, Within(0, 2**63)] = 0
-    front: Annotated[int, Within(0, 1000)] = 0
-    start: tuple[float, ...] | None = None
-    repeat: Annotated[int, Within(1, 10_000)] = 1
-    slower: Slower = 1.0
-    existing: tuple[str, ...] = ()
-    lock: tuple[str, ...] = ()
-    noise: Annotated[float, Within(above=0.0, most=1.0)] | None = None
-    outlook: bool = True
-
-    def __post_init__(self) -> None:
-        if self.family not in FAMILIES:
-            raise UsageError(f"family '{self.family}' is none of {', '.join(FAMILIES)}")
-        for text in (*self.goals, *self.hard):
-            if text not in AIMS or text in self.hard:
-                split_goal(text)
 
 
 def split_goal(text: str) -> tuple[str, float]:
@@ -93,6 +32,77 @@ def split_goal(text: str) -> tuple[str, float]:
     return name, value
 
 
+def _goal(text: Any, aims: tuple[str, ...] = AIMS) -> Any:
+    if isinstance(text, str) and text not in aims:
+        split_goal(text)
+    return text
+
+
+Goal = Annotated[str, Checked(_goal)]
+HardGoal = Annotated[str, Checked(lambda text: _goal(text, ()))]
+Rate = Annotated[float, Real(above=0.0, most=1e5, unit="Hz")]
+Period = Annotated[float, Real(above=0.0, most=3600.0, unit="s")]
+Slower = Annotated[float, Real(least=1.0, most=1000.0)]
+Starts = Annotated[int, Whole(1, 10_000)]
+Evaluations = Annotated[int, Whole(1, 10_000_000)]
+Harmonics = Annotated[int, Whole(1, 200)]
+Start = tuple[Annotated[float, Real(infinite=True, quantity="1")], ...]  # joint values [rad or m]
+
+
+@checked
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """How an exciting motion is designed and played.
+
+    Without goals the logarithms of both condition numbers are minimised in equal parts.
+
+    Attributes:
+        goals: raw=35, normalised=6 (condition numbers), wrist=0.1 or joint6=0.1 (mean torque as a share of the limit,
+            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; logdet, smallest: that
+            index in place of the condition numbers; repeatable
+        hard: a goal that must be met; repeatable
+        period: T0 of the motion [s], at most
+        shortest: what the search may shorten the period to [s]; default: it is kept
+        harmonics: frequencies per joint; control points of splines; default 12, or as many as stay below resonance
+        family: of the motion's functions of time
+        drives: terms of each drive to identify, where no identified model has its own
+        rate: of the controller [Hz]
+        samples: instants over the period at which the search evaluates
+        starts: random starts of the search
+        evaluations: most evaluations per start
+        seed: reproduces everything random
+        front: motions on the front of normalised condition number and first torque goal; 0: none
+        start: joint values with commas [rad or m]: an approach from there
+        repeat: periods to run one after the other
+        slower: factor of a slow rehearsal, written beside the motion; 1: none
+        existing: a recording (log.npz@0:9.4 cuts), or folder of an earlier design, that counts already; repeatable
+        lock: joints that stay: joint4, or joint4=0.5 [rad or m]; repeatable
+        noise: torques that no parameter explains, as a share of their limits; for predicted sigmas alone
+        outlook: look at what other periods would tell
+    """
+
+    goals: tuple[Goal, ...] = ()
+    hard: tuple[HardGoal, ...] = ()
+    period: Period = 20.0
+    shortest: Period | None = None
+    harmonics: Harmonics | None = None
+    family: Annotated[str, OneOf(("fourier", "bspline"))] = "fourier"
+    drives: Text = "Fv Fc off"
+    rate: Rate = 1000.0
+    samples: Annotated[int, Whole(10, 100_000)] = 200
+    starts: Starts = 4
+    evaluations: Evaluations = 1500
+    seed: Seed = 0
+    front: Annotated[int, Whole(0, 1000)] = 0
+    start: Start | None = None
+    repeat: Annotated[int, Whole(1, 10_000)] = 1
+    slower: Slower = 1.0
+    existing: tuple[str, ...] = ()
+    lock: tuple[str, ...] = ()
+    noise: Annotated[float, Real(above=0.0, most=1.0)] | None = None
+    outlook: Flag = True
+
+
 DEFAULT_DESIGN = ExcitationSettings()
 
 
@@ -102,21 +112,21 @@ class PlanSettings:
     """How a motion through waypoints is planned.
 
     Attributes:
-        payloads: labels of identified payloads on board.
-        lines: the tool runs straight from waypoint to waypoint, and rests at each.
-        rate: of the controller [Hz].
-        shorten: timings to spend on a faster shape between waypoints (`trajectories.timing.shape`); 0 for none.
-        stray: how far that shape may leave the spline, per joint [rad or m].
-        start: (n,) where the robot stands [rad or m], for an approach; None for none.
-        slower: factor of a slow rehearsal, 1 for none.
+        payloads: label of an identified payload on board; repeatable
+        lines: the tool runs straight from waypoint to waypoint, and rests at each
+        rate: of the controller [Hz]
+        shorten: timings to spend on a faster shape between waypoints (`trajectories.timing.shape`); 0: none
+        stray: how far that shape may leave the spline, per joint [rad or m]
+        start: joint values with commas [rad or m]: an approach from there
+        slower: factor of a slow rehearsal, written beside the motion; 1: none
     """
 
     payloads: tuple[str, ...] = ()
-    lines: bool = False
+    lines: Annotated[Flag, Typed("--line")] = False
     rate: Rate = 1000.0
-    shorten: Annotated[int, Within(0, 100_000)] = 0
-    stray: Annotated[float, Within(0.0, 10.0)] = 0.0
-    start: tuple[float, ...] | None = None
+    shorten: Annotated[int, Whole(0, 100_000)] = 0
+    stray: Annotated[float, Real(least=0.0, most=10.0)] = 0.0
+    start: Start | None = None
     slower: Slower = 1.0
 
 

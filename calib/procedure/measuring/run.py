@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from calib import files
 from calib.data.csv_table import read_table
-from calib.errors import UsageError
+from calib.procedure.measuring.run_settings import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
 from trajectories.tour import move_times, tour
 from trajectories.ways import Room, way
@@ -40,28 +40,6 @@ NEAR = 8  # turns of a pose, and poses to come from, that are tried to tell whet
 FORBIDDEN = 1e4  # [s] a move for which no way was found
 Progress = Callable[[str], None]
 Ways = dict[tuple[int, int], np.ndarray]  # by the numbers of two poses, the smaller one first
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """How a run is driven.
-
-    Attributes:
-        speed: share of the joints' largest speeds.
-        dwell: that the arm stands still at each pose, to settle and to be measured [s].
-    """
-
-    speed: float = 0.3
-    dwell: float = 6.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.speed <= 1.0:
-            raise UsageError(f"--speed {self.speed:g}: expected a share of the joints' speeds, above 0 and up to 1")
-        if not 0.0 <= self.dwell < 3600.0:
-            raise UsageError(f"--dwell {self.dwell:g}: expected the seconds that each pose takes to be measured")
-
-
-DEFAULT_RUN = RunSettings()
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,8 @@ from calib.config_types import (  # fmt: skip
     Whole,
     shown,
 )
-from calib.data.poses.fit_options import LOSSES, MODELS, FitOptions, MetresOrZero, RadiansOrZero
+from calib.data.poses.choices import LOSSES, MODELS
+from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS

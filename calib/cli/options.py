@@ -1,0 +1,130 @@
+"""Commands made of functions: parameters are options, settings one per field, and docstrings say what each is about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, cleandoc, signature
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import typer
+from typer.models import ParameterInfo
+
+from calib.config import described, parse
+from calib.config_types import OneOf, Typed
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def command(app: typer.Typer, name: str | None = None) -> Callable[[F], F]:
+    """Return a decorator that adds a function to `app` as a command.
+
+    What ``Args:`` of its docstring says of a parameter is the option's help. A parameter that is annotated with a
+    settings dataclass becomes an option per field, described under ``Attributes:`` of that class; fields that the
+    function takes itself are left to it.
+    """
+
+    def add(function: F) -> F:
+        hints, about = get_type_hints(function, include_extras=True), described(function)
+        own, made = signature(function).parameters, list[Parameter]()
+        settings = {key: hint for key, hint in hints.items() if key in own and is_dataclass(hint)}
+        for key, one in own.items():
+            if key in settings:
+                made += [option for option in _options(settings[key]) if option.name not in own]
+            else:
+                annotation = _with_help(hints[key], about.get(key, ""), one.default is Parameter.empty)
+                made.append(one.replace(annotation=annotation, kind=Parameter.KEYWORD_ONLY))
+
+        @wraps(function)
+        def call(**given: Any) -> Any:
+            built = {key: _built(kind, given) for key, kind in settings.items()}
+            return function(**built, **{key: value for key, value in given.items() if key in own})
+
+        call.__signature__ = signature(function).replace(parameters=made)  # type: ignore[attr-defined]
+        call.__annotations__ = {}
+        app.command(name, help=cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0])(call)
+        return function
+
+    return add
+
+
+def _with_help(hint: Any, words: str, positional: bool) -> Any:
+    """Return an annotation whose option, or argument, has a help; its metadata may say what else typer is to know."""
+    kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    option = next((copy(one) for one in metadata if isinstance(one, ParameterInfo)), None)
+    option = option or (typer.Argument() if positional else typer.Option())
+    option.help = option.help or words
+    return Annotated[kind, option]
+
+
+def _options(kind: Any) -> Iterator[Parameter]:
+    """Yield the options of a settings dataclass, those of settings inside it included."""
+    hints, about = get_type_hints(kind, include_extras=True), described(kind)
+    for field in fields(kind):
+        if is_dataclass(hints[field.name]):
+            yield from _options(hints[field.name])
+            continue
+        plain, metadata = _plain(hints[field.name])
+        typed = next((one for one in metadata if isinstance(one, Typed)), Typed())
+        words = [about.get(field.name, ""), *(one.words for one in metadata if isinstance(one, OneOf))]
+        names, metavar = [typed.name] if typed.name else [], typed.unit.upper() or None
+        if get_origin(plain) is tuple:
+            names = names or [f"--{field.name.removesuffix('s')}"]
+            metavar = "NUMBERS" if _plain(get_args(plain)[0])[0] is not str else None
+            plain = list[str] if _is_repeated(plain) else str
+        elif typed.unit:
+            plain = str
+        option = typer.Option(*names, help="; ".join(filter(None, words)), metavar=metavar)
+        default = field.default if isinstance(field.default, int | float | str) else None
+        annotation = Annotated[plain if default is not None else plain | None, option]
+        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Return a type without None, and its metadata."""
+    if get_origin(hint) is Annotated:
+        plain, metadata = _plain(get_args(hint)[0])
+        return plain, (*metadata, *hint.__metadata__)
+    if get_origin(hint) in (Union, UnionType):
+        return _plain(next(one for one in get_args(hint) if one is not NoneType))
+    return hint, ()
+
+
+def _is_repeated(plain: Any) -> bool:
+    """Say whether an option is given once for each item of a tuple; numbers stand in one text with commas."""
+    first, last = get_args(plain)[0], get_args(plain)[-1]
+    return last is ... and _plain(first)[0] is not float
+
+
+def _built(kind: Any, given: dict[str, Any]) -> Any:
+    """Return settings of what the command line gave; what it did not is left to their defaults, which load nothing."""
+    chosen = _chosen(kind, given)
+    return parse(kind, chosen, "") if chosen else kind()
+
+
+def _chosen(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
+    result, hints = {}, get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        if is_dataclass(hints[field.name]):
+            value = _chosen(hints[field.name], given)
+        else:
+            value = given.get(field.name)
+        if value not in (None, field.default, [], {}):
+            result[field.name] = _read(hints[field.name], value)
+    return result
+
+
+def _read(hint: Any, value: Any) -> Any:
+    """Return a value as an option file would hold it: texts with commas as lists, a unit behind a number."""
+    plain, metadata = _plain(hint)
+    typed = next((one for one in metadata if isinstance(one, Typed)), Typed())
+    if typed.unit:
+        return f"{value} {typed.unit}"
+    if get_origin(plain) is not tuple:
+        return value
+    if isinstance(value, str):
+        return value.split(",")
+    return [_read(get_args(plain)[0], one) for one in value]
