@@ -18,7 +18,7 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from calib.config_types import TAG, UNKNOWN, Hidden, shown
+from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
 from calib.files import check_regular
 
@@ -88,7 +88,7 @@ def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = Usage
     try:
         return _adapter(kind).validate_python(found)
     except ValidationError as wrong:
-        raise error(_complaint(wrong.errors(include_url=False), kind, place, found)) from None
+        raise error(_complaint(wrong.errors(include_url=False), kind, place)) from None
 
 
 def strict(kind: type[T]) -> type[T]:
@@ -118,10 +118,15 @@ def _for_toml(found: Any) -> Any:
         return [_for_toml(item) for item in found]
     if not isinstance(found, dict):
         return found
-    result = {}
+    result, words = {}, found.get("description")
+    about = _entries(words) if isinstance(words, str) else {}
     for key, value in found.items():
         if key in ("properties", "$defs"):
-            result[key] = {name: _for_toml(item) for name, item in value.items() if item.get("not") != {}}
+            said = {name: {"description": about[name]} for name in about if key == "properties"}
+            known = {name: item for name, item in value.items() if item.get("not") != {}}
+            result[key] = {name: _for_toml(item) | said.get(name, {}) for name, item in known.items()}
+        elif key == "description" and isinstance(value, str):
+            result[key] = value.partition("\n\nAttributes:")[0]
         elif key == "default" and value not in (None, [None]):  # None of a list: infinity, which JSON does not have
             result[key] = value
         elif key not in ("title", "default"):
@@ -165,10 +170,18 @@ def described(given: Any) -> dict[str, str]:
     """Return what the docstrings of a function, or a class and its bases, say of each argument or attribute."""
     found: dict[str, str] = {}
     for one in reversed(getattr(given, "__mro__", (given,))):
-        text = re.split("^(?:Args|Attributes):$", cleandoc(one.__doc__ or ""), maxsplit=1, flags=re.M)
-        for names, words in _ENTRY.findall(text[-1] if len(text) > 1 else ""):
-            found |= dict.fromkeys(names.split(", "), " ".join(words.replace("`", "").split()).removesuffix("."))
+        found |= _entries(one.__doc__ or "")
     return found
+
+
+def _entries(docstring: str) -> dict[str, str]:
+    """Return the names under ``Args:`` or ``Attributes:`` with their words, without marks for code."""
+    parts = re.split("^(?:Args|Attributes):$", cleandoc(docstring), maxsplit=1, flags=re.M)
+    return {
+        name: " ".join(words.replace("``", "").split()).removesuffix(".")
+        for names, words in (_ENTRY.findall(parts[1]) if len(parts) > 1 else ())
+        for name in names.split(", ")
+    }
 
 
 # ---- complaints -----------------------------------------------------------------------------------------------------
@@ -200,23 +213,10 @@ def _no_key(key: str, keys: Collection[str]) -> str:
     return f"there is no key '{key}'{suggestion(key, keys)}; {there}"
 
 
-def _written(table: Any, loc: Sequence[Any], found: Any) -> Any:
-    """Return what a file holds at a place, where that is a text that `found`, a number in SI, was made of."""
-    for part in loc:
-        if isinstance(table, str):  # one text for all of a list
-            break
-        try:
-            table = table[part]
-        except (KeyError, IndexError, TypeError):
-            return found
-    return table if isinstance(table, str) else found
-
-
-def _complaint(errors: list[Any], kind: type, place: str, whole: Any) -> str:
+def _complaint(errors: list[Any], kind: type, place: str) -> str:
     """Return the first of pydantic's errors in our form; a key that is not known explains one that is missing."""
     first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
-    loc = tuple(part for part in first["loc"] if not (isinstance(part, str) and part.startswith(TAG)))
-    name, found, context = first["type"], first["input"], first.get("ctx", {})
+    loc, name, found = tuple(first["loc"]), first["type"], first["input"]
     table = _type_at(kind, loc[:-1]) if name in (UNKNOWN, "missing") else None
     at = loc if table is None else loc[:-1]
     while (
@@ -231,18 +231,11 @@ def _complaint(errors: list[Any], kind: type, place: str, whole: Any) -> str:
     if name == "missing":
         return f"{where}: there is no '{loc[-1]}'{_needed(table)}"
     if name == "value_error":
-        return f"{where}: {context['error']}"
-    if name == "one_of":
-        near = suggestion(found, context["allowed"]) if isinstance(found, str) else ""
-        words = f"one of {', '.join(context['allowed'])}{near}"
-    elif name == "expected":
-        words, found = first["msg"], _written(whole, loc, found)
-    else:
-        words = _PLAIN.get(name, _PLAIN.get(name.split("_")[0], "a table"))
-        if name == "tuple_type" and is_dataclass(_type_at(kind, (*loc, 0))):
-            words = f"a list of tables, [[{loc[-1]}]]"
-    hint = f"; {context['hint']}" if context.get("hint") else ""
-    return f"{where}: expected {words}, found {shown(found)}{hint}"
+        return f"{where}: {first['ctx']['error']}"
+    words = _PLAIN.get(name, _PLAIN.get(name.split("_")[0], "a table"))
+    if name == "tuple_type" and is_dataclass(_type_at(kind, (*loc, 0))):
+        words = f"a list of tables, [[{loc[-1]}]]"
+    return f"{where}: expected {words}, found {shown(found)}"
 
 
 def _keys(kind: Any) -> list[str]:

@@ -11,16 +11,16 @@ import datetime
 import math
 import operator
 import reprlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Annotated, Any, get_args
 
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, suggestion
 from calib.units import QUANTITIES
 
 LONGEST = 200  # signs of an expression (our choice)
-TAG = "\0"  # begins the names of alternatives, which are no part of a place
 UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 
@@ -119,18 +119,42 @@ def _evaluated(node: ast.expr) -> float:
     raise ValueError(ast.dump(node))
 
 
-def _or_zero(value: Any, otherwise: Callable[[Any], Any]) -> Any:
-    return 0.0 if isinstance(value, (int, float)) and not isinstance(value, bool) and value == 0 else otherwise(value)
+def _float(value: Any) -> float:
+    """Return a number of TOML as a float; NaN for anything else."""
+    try:
+        return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        return math.nan
 
 
-def _not_nan(value: float) -> float:
-    if value != value:
-        raise ValueError("nan")
-    return value
+class _Refused(ValueError):
+    """What was expected of a value, and what was found."""
+
+    def __init__(self, expected: str, value: Any, hint: str = "") -> None:
+        super().__init__(f"expected {expected}, found {shown(value)}{hint and f'; {hint}'}")
+
+
+class _Read(ABC):
+    """What a key may hold: pydantic hands it to `read`, which returns the value, or raises the complaint."""
+
+    @abstractmethod
+    def read(self, value: Any) -> Any: ...
+
+    @property
+    @abstractmethod
+    def json(self) -> Mapping[str, Any]: ...
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema as core
+
+        return core.no_info_plain_validator_function(self.read)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        return dict(self.json)
 
 
 @dataclass(frozen=True)
-class Real:
+class Real(_Read):
     """A finite number, made a float.
 
     Attributes:
@@ -152,31 +176,32 @@ class Real:
     zero: bool = False
     words: str = ""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema as core
+    def read(self, value: Any) -> float:
+        found = _number(value, self.quantity) if self.quantity and isinstance(value, str) else _float(value)
+        if self.zero and found == 0.0:
+            return found
+        if not (math.isfinite(found) or (self.infinite and found == found)):
+            raise _Refused(self.words or self._expected, value)
+        if self.above is not None and found <= self.above:
+            raise _Refused(self.words or self._expected, value)
+        if (self.least is not None and found < self.least) or (self.most is not None and found > self.most):
+            raise _Refused(self.words or self._span, value)
+        return found
 
-        words, later = self.words or ("a number" if self.above is None else f"a number above {self.above:g}"), None
-        if self.above is not None and self.most is not None:
-            later = self.least
-        elif not self.words and self.least is not None:
-            words = f"{self.least:g} or more"
-        least = self.least if later is None else None
-        inner = core.float_schema(strict=True, gt=self.above, ge=least, allow_inf_nan=self.infinite)
-        if self.infinite:
-            inner = core.no_info_after_validator_function(_not_nan, inner)
-        result = core.custom_error_schema(inner, "expected", custom_error_message=words)
-        if self.most is not None:
-            hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
-            span = f"{'' if later is None else f'at least {later:g} and '}at most {self.most:g}"
-            bound = core.float_schema(ge=later, le=self.most)
-            words = f"{self.unit or 'a number'}, {span}{hint}"
-            bound = core.custom_error_schema(bound, "expected", custom_error_message=words)
-            result = core.chain_schema([result, bound])
-        if self.zero:
-            result = core.no_info_wrap_validator_function(_or_zero, result)
-        return Checked(self._read).around(result) if self.quantity else result
+    @property
+    def _expected(self) -> str:
+        return "a number" if self.above is None else f"a number above {self.above:g}"
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+    @property
+    def _span(self) -> str:
+        if self.most is None:
+            return f"{self.least:g} or more"
+        hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
+        low = "" if self.least is None else f"at least {self.least:g} and "
+        return f"{self.unit or 'a number'}, {low}at most {self.most:g}{hint}"
+
+    @property
+    def json(self) -> Mapping[str, Any]:
         bounds = {"exclusiveMinimum": self.above, "minimum": self.least, "maximum": self.most}
         if self.zero:
             bounds = {"minimum": 0.0, "maximum": self.most}
@@ -185,41 +210,29 @@ class Real:
         found = {"type": "number", **{key: value for key, value in bounds.items() if value is not None}}
         return {"anyOf": [found, {"type": "string"}]} if self.quantity else found
 
-    def _read(self, value: Any) -> Any:
-        return _number(value, self.quantity) if isinstance(value, str) else value
-
 
 @dataclass(frozen=True)
-class Whole:
-    """A whole number from `least` to `most`; `of` says in a complaint what it counts."""
+class Whole(_Read):
+    """A whole number from `least` to `most`, made one that counts from `start`; `of` says what it counts."""
 
     least: int = 0
-    most: int | None = None
+    most: int = 2**63 - 1
     of: str = ""
+    start: int = 0
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema as core
+    def read(self, value: Any) -> int:
+        if type(value) is int and self.least <= value <= self.most:
+            return value - self.start
+        span = f", {self.least} or more" if self.most == Whole.most else f" from {self.least} to {self.most}"
+        raise _Refused(f"a whole number{self.of}{span}", value)
 
-        span = f", {self.least} or more" if self.most is None else f" from {self.least} to {self.most}"
-        inner = core.int_schema(strict=True, ge=self.least, le=self.most)
-        return core.custom_error_schema(inner, "expected", custom_error_message=f"a whole number{self.of}{span}")
-
-
-@dataclass(frozen=True)
-class _Index:
-    """A whole number counted from 1 in the file, from 0 here."""
-
-    most: int = 99
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema as core
-
-        counted = Whole(1, self.most).__get_pydantic_core_schema__(int, handler)
-        return core.no_info_after_validator_function(lambda number: number - 1, counted)
+    @property
+    def json(self) -> Mapping[str, Any]:
+        return {"type": "integer", "minimum": self.least, "maximum": self.most}
 
 
 @dataclass(frozen=True)
-class OneOf:
+class OneOf(_Read):
     """A text that is one of a few; `hint` follows the complaint.
 
     Attributes:
@@ -242,11 +255,15 @@ class OneOf:
         """The texts as a sentence lists them; nothing of a module that is loaded late."""
         return "" if isinstance(self.allowed, str) else " or ".join((", ".join(self.allowed[:-1]), self.allowed[-1]))
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema as core
+    def read(self, value: Any) -> str:
+        if isinstance(value, str) and value in self.names:
+            return value
+        near = suggestion(value, self.names) if isinstance(value, str) else ""
+        raise _Refused(f"one of {', '.join(self.names)}{near}", value, self.hint)
 
-        inner, context = core.literal_schema([*self.names]), {"allowed": [*self.names], "hint": self.hint}
-        return core.custom_error_schema(inner, "one_of", custom_error_message="", custom_error_context=context)
+    @property
+    def json(self) -> Mapping[str, Any]:
+        return {"enum": [*self.names], "type": "string"}
 
 
 @dataclass(frozen=True)
@@ -256,10 +273,16 @@ class Expect:
     words: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import ValidationError
         from pydantic_core import core_schema as core
 
-        inner = _unconverted(handler(source))
-        return core.custom_error_schema(inner, "expected", custom_error_message=self.words)
+        def read(value: Any, inner: Callable[[Any], Any]) -> Any:
+            try:
+                return inner(value)
+            except ValidationError:
+                raise _Refused(self.words, value) from None
+
+        return core.no_info_wrap_validator_function(read, _unconverted(handler(source)))
 
 
 def _unconverted(one: Any) -> Any:
@@ -355,34 +378,19 @@ class Typed:
 
 
 @dataclass(frozen=True)
-class About:
-    """What a key is about: the description in the JSON schema, and the comment in a file that we write."""
-
-    words: str
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
-        return {**handler(schema), "description": self.words}
-
-
-@dataclass(frozen=True)
-class OneOrMany:
+class OneOrMany(_Read):
     """A number, or a list of them, which means something else: made a float or a tuple."""
 
     of: Real
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema as core
+    def read(self, value: Any) -> Any:
+        if value in ([], ()):
+            raise _Refused("at least one number", value)
+        return tuple(map(self.of.read, value)) if isinstance(value, (list, tuple)) else self.of.read(value)
 
-        one = self.of.__get_pydantic_core_schema__(float, handler)
-        several = core.tuple_variable_schema(one, min_length=1)
-        return core.tagged_union_schema(
-            {f"{TAG}one": one, f"{TAG}several": several},
-            lambda value: f"{TAG}{'several' if isinstance(value, (list, tuple)) else 'one'}",
-        )
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
-        one = self.of.__get_pydantic_json_schema__(schema, handler)
-        return {"anyOf": [one, {"type": "array", "items": one, "minItems": 1}]}
+    @property
+    def json(self) -> Mapping[str, Any]:
+        return {"anyOf": [self.of.json, {"type": "array", "items": self.of.json, "minItems": 1}]}
 
 
 def _label(value: Any) -> str:
@@ -412,7 +420,7 @@ Positive = Annotated[float, Real(above=0)]
 Holdout = Annotated[float, Real(least=0.0, most=0.99, words="a share from 0 to 0.99")]
 Seed = Annotated[int, Whole(0, 2**63 - 1)]
 NotNegative = Annotated[float, Real(least=0)]
-JointNumber = Annotated[int, _Index()]
+JointNumber = Annotated[int, Whole(1, 99, start=1)]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
 Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]

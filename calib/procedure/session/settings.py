@@ -10,36 +10,41 @@ from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
 from textwrap import wrap
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tomlkit
 from tomlkit.items import Comment, Trivia
 
-from calib.config import parse, read_toml, strict
+from calib.config import described, parse, read_toml, strict
 from calib.config_types import (  # fmt: skip
-    About,
     Checked,
     Expect,
     Flag,
+    Holdout,
     Name,
     NotNegative,
     OneOf,
-    Positive,
     Real,
+    Seed,
     Text,
     Whole,
     shown,
 )
-from calib.data.poses.choices import LOSSES, MODELS
+from calib.data.poses.choices import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.excitation.settings import DEFAULT_DESIGN, HARMONICS
-from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, DELIVERABLES, FitSettings
-from poses.indices import Index
-from poses.select import Method
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, HARMONICS, Evaluations, Harmonics, Period, Rate, Starts
+from calib.procedure.kinematic_stage.settings import (  # fmt: skip
+    DEFAULT_SELECTION,
+    Deliverable,
+    FitSettings,
+    Index,
+    Method,
+    Stations,
+)
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
@@ -67,121 +72,130 @@ Beside = Annotated[str, Expect("the name of a file beside session.toml, or an em
 @strict
 @dataclass(frozen=True)
 class RobotSection:
-    """Which robot."""
+    """Which robot.
+
+    Attributes:
+        given: what it was called
+        base: URDF: the link the arm starts at, empty: the root
+        tip: URDF: the link the arm ends at, empty: the longest chain's end
+    """
 
     file: Annotated[Name, Checked(_beside)]
-    given: Annotated[Text, About("what it was called")] = ""
-    base: Annotated[Text, About("URDF: the link the arm starts at, empty: the root")] = ""
-    tip: Annotated[Text, About("URDF: the link the arm ends at, empty: the longest chain's end")] = ""
+    given: Text = ""
+    base: Text = ""
+    tip: Text = ""
 
 
 @strict
 @dataclass(frozen=True)
 class InstrumentSection:
-    """What measures, and how well."""
+    """What measures, and how well.
+
+    Attributes:
+        measures: pose (with orientation), position or pixels; nothing: the geometry is taken as it is described
+        sigma_position: of one measurement, per axis; 0: to be estimated
+        tool: where the target roughly sits in the tip's frame; only pose selection uses it
+    """
 
     name: Text
-    measures: Annotated[
-        str,
-        OneOf(("pose", "position", "pixels", NOTHING)),
-        About("pose (with orientation), position or pixels; nothing: the geometry is taken as it is described"),
-    ]
-    sigma_position: Annotated[MetresOrZero, About("of one measurement, per axis; 0: to be estimated")] = 0.0
+    measures: Annotated[str, OneOf(("pose", "position", "pixels", NOTHING))]
+    sigma_position: MetresOrZero = 0.0
     sigma_orientation: RadiansOrZero = 0.0
-    tool: Annotated[
-        tuple[float, float, float],
-        Expect("three numbers [m]"),
-        About("where the target roughly sits in the tip's frame; only pose selection uses it"),
-    ] = (0.05, 0.0, 0.05)
+    tool: Annotated[tuple[float, float, float], Expect("three numbers [m]")] = (0.05, 0.0, 0.05)
 
 
 @strict
 @dataclass(frozen=True)
 class PosesSection:
-    """Which poses to measure."""
+    """Which poses to measure.
 
-    fit: Annotated[int, Whole(1), About("how many poses to choose for the fit")] = 30
-    validation: Annotated[int, Whole(0), About("how many more to measure and never fit; 0: no validation")] = 15
-    plan: Annotated[Flag, About("false: measured files hold other poses than those chosen here")] = True
-    index: Annotated[str, OneOf(get_args(Index))] = DEFAULT_SELECTION.index
-    method: Annotated[str, OneOf(get_args(Method))] = DEFAULT_SELECTION.method
-    constraints: Annotated[Beside, About("a TOML file beside this one; see `calib formats constraints`")] = ""
+    Attributes:
+        fit: how many poses to choose for the fit
+        validation: how many more to measure and never fit; 0: no validation
+        plan: false: measured files hold other poses than those chosen here
+        constraints: a TOML file beside this one; see `calib formats constraints`
+    """
+
+    fit: Annotated[int, Whole(1)] = 30
+    validation: Annotated[int, Whole(0)] = 15
+    plan: Flag = True
+    index: Index = DEFAULT_SELECTION.index
+    method: Method = DEFAULT_SELECTION.method
+    constraints: Beside = ""
 
 
 @strict
 @dataclass(frozen=True)
 class FitSection:
-    """How to fit and to judge the geometry."""
+    """How to fit and to judge the geometry.
 
-    model: Annotated[str, OneOf(MODELS), About(f"or {', '.join(MODELS[1:])}")] = FitOptions.model
-    loss: Annotated[str, OneOf(LOSSES), About("or none, huber, cauchy; auto: robust where rows are grossly wrong")] = (
-        FitOptions.loss
-    )
-    options: Annotated[
-        Beside, About("a TOML file beside this one: column names, units; see `calib formats options`")
-    ] = ""
-    stations: Annotated[
-        str, OneOf(("each", "one")), About("each measured file has its own base placement, or one for all")
-    ] = FitSettings.stations
-    validation_frames: Annotated[
-        str, OneOf(("fit", "own")), About("own: base and tool placement are fitted anew on validation files")
-    ] = "fit"
-    tolerance_mm: Annotated[
-        NotNegative,
-        About(
-            "largest rms [mm] on unseen poses that is good enough: above it the verdict is fail; 0: none, and pass "
-            "only means better than the nominal robot"
-        ),
-    ] = 0.0
-    deliverable: Annotated[
-        str,
-        OneOf(DELIVERABLES),
-        About("what the verdict is about: robot.urdf alone, or corrections: with joint_corrections.csv"),
-    ] = FitSettings.deliverable
-    holdout: Annotated[
-        float,
-        Real(least=0.0, most=0.9, words="a share from 0 to 0.9"),
-        About("share of the measured poses that is not fitted but judged on, for want of a validation file; 0: none"),
-    ] = FitSettings.holdout
+    Attributes:
+        model: or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
+        loss: or none, huber, cauchy; auto: robust where rows are grossly wrong
+        options: a TOML file beside this one: column names, units; see `calib formats options`
+        stations: each measured file has its own base placement, or one for all
+        validation_frames: own: base and tool placement are fitted anew on validation files
+        tolerance_mm: largest rms [mm] on unseen poses that is good enough: above it the verdict is fail; 0: none, and
+            pass only means better than the nominal robot
+        deliverable: what the verdict is about: robot.urdf alone, or corrections: with joint_corrections.csv
+        holdout: share of the measured poses that is not fitted but judged on, for want of a validation file; 0: none
+    """
+
+    model: Model = FitOptions.model
+    loss: Loss = FitOptions.loss
+    options: Beside = ""
+    stations: Stations = FitSettings.stations
+    validation_frames: Annotated[str, OneOf(("fit", "own"))] = "fit"
+    tolerance_mm: NotNegative = 0.0
+    deliverable: Deliverable = FitSettings.deliverable
+    holdout: Holdout = FitSettings.holdout
 
 
 @strict
 @dataclass(frozen=True)
 class DynamicsSection:
-    """Whether and how to identify and to judge the dynamics."""
+    """Whether and how to identify and to judge the dynamics.
 
-    wanted: Annotated[Flag, About("false: geometry only")] = True
-    plan: Annotated[Flag, About("false: recorded files hold other motions than those designed here")] = True
-    validation: Annotated[Flag, About("false: no second motion is designed or asked for")] = True
-    period: Annotated[Positive, About("of the designed motion [s]; the validation motion's is 0.8 of it")] = (
-        DEFAULT_DESIGN.period
+    Attributes:
+        wanted: false: geometry only
+        plan: false: recorded files hold other motions than those designed here
+        validation: false: no second motion is designed or asked for
+        period: of the designed motion [s]; the validation motion's is 0.8 of it
+        harmonics: frequencies per joint
+        rate: of the controller [Hz]
+        repeats: how often the robot plays each motion
+        starts: random starts of the search for a motion
+        evaluations: most per start
+        limits: a TOML file beside this one; see `calib formats limits`
+        torques: motor, link, or both: sensors behind the gears beside the motors' torques
+        friction: or standard, or one rung of the ladder; see calib identify --friction
+        method: or ols, irls, tls
+        options: a TOML file beside this one; see `calib formats identify-options`
+        holdout: share of each recording, its end, that is not identified from but judged on, for want of another; 0:
+            none
+        tolerance_percent: largest torque error on unseen motion that is good enough; 0: none
+        payloads: label = mass [kg] of bodies at the flange: loaded = 3.28
+    """
+
+    wanted: Flag = True
+    plan: Flag = True
+    validation: Flag = True
+    period: Period = DEFAULT_DESIGN.period
+    harmonics: Harmonics = HARMONICS
+    rate: Rate = DEFAULT_DESIGN.rate
+    repeats: Annotated[int, Whole(1)] = 3
+    starts: Starts = DEFAULT_DESIGN.starts
+    evaluations: Evaluations = DEFAULT_DESIGN.evaluations
+    limits: Beside = ""
+    torques: Annotated[str, OneOf(TORQUES)] = "motor"
+    friction: Annotated[str, OneOf(FRICTION)] = IdentificationSettings.friction
+    method: Annotated[str, OneOf(tuple(METHODS))] = IdentificationSettings.method
+    options: Beside = ""
+    holdout: Holdout = 0.0
+    tolerance_percent: NotNegative = 0.0
+    payloads: Mapping[str, Annotated[float, Real(above=0, words="its mass [kg], a number above 0")]] = field(
+        default_factory=dict
     )
-    harmonics: Annotated[int, Whole(1), About("frequencies per joint")] = HARMONICS
-    rate: Annotated[float, Real(above=0, most=1e5, unit="Hz"), About("of the controller [Hz]")] = DEFAULT_DESIGN.rate
-    repeats: Annotated[int, Whole(1), About("how often the robot plays each motion")] = 3
-    starts: Annotated[int, Whole(1), About("random starts of the search for a motion")] = DEFAULT_DESIGN.starts
-    evaluations: Annotated[int, Whole(1), About("most per start")] = DEFAULT_DESIGN.evaluations
-    limits: Annotated[Beside, About("a TOML file beside this one; see `calib formats limits`")] = ""
-    torques: Annotated[
-        str, OneOf(TORQUES), About("motor, link, or both: sensors behind the gears beside the motors' torques")
-    ] = "motor"
-    friction: Annotated[
-        str, OneOf(FRICTION), About("or standard, or one rung of the ladder; see calib identify --friction")
-    ] = IdentificationSettings.friction
-    method: Annotated[str, OneOf(tuple(METHODS)), About("or ols, irls, tls")] = IdentificationSettings.method
-    options: Annotated[Beside, About("a TOML file beside this one; see `calib formats identify-options`")] = ""
-    holdout: Annotated[
-        float,
-        Real(least=0.0, most=0.9, words="a share from 0 to 0.9"),
-        About("share of each recording, its end, that is not learnt from but judged on, for want of another; 0: none"),
-    ] = 0.0
-    tolerance_percent: Annotated[
-        NotNegative, About("largest torque error on unseen motion that is good enough; 0: none")
-    ] = 0.0
-    payloads: Annotated[
-        Mapping[str, Annotated[float, Real(above=0, words="its mass [kg], a number above 0")]],
-        About("label = mass [kg] of bodies at the flange: loaded = 3.28"),
-    ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.repeats > MOST_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
@@ -194,11 +208,15 @@ class DynamicsSection:
 @strict
 @dataclass(frozen=True)
 class SessionSettings:
-    """What ``session.toml`` says, section by section."""
+    """What ``session.toml`` says, section by section.
+
+    Attributes:
+        seed: of pose selection, cross-validation and everything else random
+    """
 
     name: Text
     created: Text
-    seed: Annotated[int, Whole(0), About("of pose selection, cross-validation and everything else random")]
+    seed: Seed
     robot: RobotSection
     instrument: InstrumentSection
     poses: PosesSection
@@ -262,10 +280,9 @@ def written(settings: SessionSettings) -> str:
 
 def _fill(table: Any, section: Any) -> None:
     """Add the keys of a section to a table of the document, comments in one column; tables come last."""
-    hints = get_type_hints(type(section), include_extras=True)
+    words = described(type(section))
     for key in fields(section):
-        value = getattr(section, key.name)
-        about = next((one.words for one in getattr(hints[key.name], "__metadata__", ()) if isinstance(one, About)), "")
+        value, about = getattr(section, key.name), words.get(key.name, "")
         if is_dataclass(value) or isinstance(value, Mapping):
             inner = tomlkit.table()
             if about:
