@@ -79,7 +79,7 @@ def model(logs: Path) -> calib.DynamicsModel:
             "ExcitationSettings: goals: expected a list, found 'raw=35'",
         ),
         (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected true or false, found 1"),
-        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected a list, found 1"),
+        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected x,y,z .m., found 1"),
         (lambda: calib.FitSettings(tolerance="low"), "FitSettings: tolerance: cannot read 'low' as a number"),
         (lambda: calib.FitSettings(tolerance=0.0), "tolerance: expected a number above 0"),
         (lambda: calib.FitSettings(stations="two"), "stations: expected one of each, one, found 'two'"),
@@ -265,7 +265,7 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
 
 
 def test_wrong_settings_are_refused_where_they_are_made():
-    with pytest.raises(calib.CalibError, match="holdout: expected a number"):
+    with pytest.raises(calib.CalibError, match="holdout: expected a share"):
         calib.FitSettings(holdout=1.5)
     with pytest.raises(calib.CalibError, match="model: expected one of"):
         calib.FitSettings(model="geometri")
