@@ -20,7 +20,6 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
-from calib.files import check_regular
 
 T = TypeVar("T")
 LARGEST = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
@@ -40,6 +39,8 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
         CalibError: `error`, for a file that is missing, too large, no TOML, nested too deeply, or with a whole number
             of more than 64 bits.
     """
+    from calib.files import check_regular
+
     try:
         check_regular(path, streams=True)
         with open(path, "rb") as file:

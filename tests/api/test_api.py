@@ -79,7 +79,7 @@ def model(logs: Path) -> calib.DynamicsModel:
             "ExcitationSettings: goals: expected a list, found 'raw=35'",
         ),
         (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected true or false, found 1"),
-        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected x,y,z .m., found 1"),
+        (lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)), "SelectionSettings: tools: expected x,y,z"),
         (lambda: calib.FitSettings(tolerance="low"), "FitSettings: tolerance: cannot read 'low' as a number"),
         (lambda: calib.FitSettings(tolerance=0.0), "tolerance: expected a number above 0"),
         (lambda: calib.FitSettings(stations="two"), "stations: expected one of each, one, found 'two'"),
