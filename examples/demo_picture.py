@@ -16,9 +16,9 @@ from PIL import Image
 
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.report.style import AFTER, BEFORE, QUIET, WIDE, legend, log_axis, sheet, styled
-from calib.procedure.session import demo
 from calib.procedure.session.folder import Session
 from calib.records import read_record
+from calib.rooms.cells import demo
 
 PICTURE = Path(__file__).with_name("demo.png")
 README = Path(__file__).parents[1] / "README.md"

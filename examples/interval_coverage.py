@@ -32,10 +32,10 @@ from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.calibrated import as_calibrated
-from calib.simulation.cells.truth import true_base
-from calib.simulation.cells.unmodelled import TorqueErrors
-from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, record
-from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.rooms.cells.truth import true_base
+from calib.rooms.cells.unmodelled import TorqueErrors
+from calib.rooms.cells.virtual_arm import MovingArm, moving_arm, record
+from calib.rooms.cells.virtual_cells import virtual_cell
 from calib.simulation.loop.references import random_fourier
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import calib
-from calib.procedure.session import demo
-from calib.simulation.cells import cell, measured_files, virtual_arm, virtual_cells
+from calib.rooms.cells import cell, demo, measured_files, virtual_arm, virtual_cells
 from calib.simulation.loop.references import random_fourier
 
 NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]

@@ -31,8 +31,8 @@ from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.session.folder import StateFile
 from calib.procedure.session.settings import SessionSettings, example
-from calib.studies import conditions
-from calib.studies.conditions import StudyFile
+from calib.rooms.studies import conditions
+from calib.rooms.studies.conditions import StudyFile
 
 FEW = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import folder, identify, inputs, metric_tables
 from calib.procedure.findings import Verdict
-from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
+from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
@@ -116,7 +116,7 @@ class DynamicsModel:
 
 @checked
 def identify_dynamics(
-    robot: str | Path | CalibratedChain | FoundRobot,
+    robot: str | Path | CalibratedChain | Mechanism,
     recordings: Recorded | Sequence[Recorded],
     *,
     validate: Recorded | Sequence[Recorded] = (),
@@ -135,8 +135,8 @@ def identify_dynamics(
     estimate: Σ = Σ_torque + S Σ_geometry Sᵀ.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result is a
-            `calib.api.parallel.ParallelDynamics`, with the same members and an outcome of its own.
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
+            the same members and an outcome of its own.
         recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or what `read_recording` returned.
         validate: the same of other motion.
         method, friction: in place of the options'; see ``calib identify --help``.
@@ -150,28 +150,15 @@ def identify_dynamics(
         Unidentifiable: where the motion tells no parameter.
     """
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
-    robot = recognised(robot)
-    if isinstance(robot, FoundRobot):
-        refuse_links(base, tip)
-        return _of_parallel(robot, listed(recordings), listed(validate), chosen, method, friction, seed, progress)
+    if (stage := stage_of(robot, "identify", base, tip)) is not None:
+        return stage.run(
+            listed(recordings), listed(validate), options=chosen, method=method, friction=friction, seed=seed,
+            progress=progress,
+        )  # fmt: skip
     given = inputs.gather(
-        robot, listed(recordings), listed(validate), options=chosen, method=method, friction=friction, base=base,
-        tip=tip, seed=seed, progress=progress,
+        cast(Any, robot), listed(recordings), listed(validate), options=chosen, method=method, friction=friction,
+        base=base, tip=tip, seed=seed, progress=progress,
     )  # fmt: skip
     if on_read is not None:
         on_read(given)
     return DynamicsModel(identify.run(given, progress))
-
-
-def _of_parallel(
-    robot: FoundRobot, recordings: Sequence[Recorded], validate: Sequence[Recorded], options: IdentifyOptions,
-    method: str | None, friction: str | None, seed: int, progress: Callable[[str], None] | None,
-) -> Any:  # fmt: skip
-    from calib.api.parallel import ParallelDynamics
-    from calib.procedure.parallel_stage.identify import identify_parallel
-
-    return ParallelDynamics(
-        identify_parallel(
-            robot, recordings, validate, options=options, method=method, friction=friction, seed=seed, progress=progress
-        )
-    )

@@ -8,18 +8,17 @@ from pathlib import Path
 from calib.api.dynamic import DynamicsModel
 from calib.api.given import optional, saved
 from calib.api.kinematic import GeometryFit
-from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError
 from calib.procedure.export import delivery, dynamics, geometry
 from calib.procedure.export.identified import is_identified
-from calib.procedure.parallel_stage.robots import refuse_parallel
+from calib.procedure.robot_kinds import MechanismResult, stage_of
 from calib.robot.load import resolve
 
 
 @checked
 def export(
-    result: GeometryFit | DynamicsModel | ParallelGeometry | ParallelDynamics | str | Path,
+    result: GeometryFit | DynamicsModel | MechanismResult | str | Path,
     into: str | Path,
     *,
     urdf: str | Path | None = None,
@@ -46,7 +45,7 @@ def export(
     """
     into = Path(into)
     with saved(result) as place:
-        refuse_parallel(place, "export", "a URDF holds no closed loops: take its robot.toml and dynamics.json")
+        stage_of(place, "export")
         identified = is_identified(place)
         delivery.check_into(into, place, optional(urdf), dynamics.WRITTEN if identified else delivery.WRITTEN)
         if identified:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -24,8 +24,8 @@ from calib.procedure.kinematic_stage import compensation, compensation_file, fit
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import selection_prediction
 from calib.procedure.measuring.run import write_run
-from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
+from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import joint_kinds
 from calib.workers.threads import one_blas_thread
@@ -272,7 +272,7 @@ def select_poses(
     """
     from calib.workers import workers as opened
 
-    refuse_parallel(robot, "choosing poses", "spread them over its workspace by hand")
+    stage_of(robot, "choosing poses")
     say, lost = progress or (lambda words: None), []
     with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
@@ -284,7 +284,7 @@ def select_poses(
 
 @checked
 def fit_geometry(
-    robot: str | Path | CalibratedChain | FoundRobot,
+    robot: str | Path | CalibratedChain | Mechanism,
     measured: Several,
     settings: FitSettings | None = None,
     *,
@@ -299,9 +299,8 @@ def fit_geometry(
     """Fit a robot's geometry to measured poses, and judge it on poses it has not seen.
 
     Args:
-        robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result is
-            a `calib.api.parallel.ParallelGeometry`, with the same members and an outcome of its own; its measurements
-            are files.
+        robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result
+            has the same members and an outcome of its own; its measurements are files.
         measured: CSV files, what `read_poses` returned, or several of either.
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
         validate: unseen poses, like `measured`.
@@ -317,21 +316,19 @@ def fit_geometry(
         NotConverged: where the fit did not come to an end.
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
-    robot = recognised(robot)
     prediction = (
         poses.chosen.prediction
         if isinstance(poses, PoseSelection)
         else poses and selection_prediction.read(Path(poses))
     )
-    if isinstance(robot, FoundRobot):
-        refuse_links(base, tip)
-        if poses is not None:
-            raise UsageError("poses of a parallel robot are not chosen here, so that nothing was predicted of its fit")
-        return _of_parallel(robot, listed(measured), listed(validate), settings, chosen, progress)
+    if (stage := stage_of(robot, "fit", base, tip)) is not None:
+        return stage.run(
+            listed(measured), listed(validate), settings=settings, options=chosen, poses=poses, progress=progress
+        )
     if progress is not None:
         progress("reading")
     given = inputs.gather(
-        robot, listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
+        cast(Any, robot), listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
     )
     if on_read is not None:
         on_read(given)
@@ -348,7 +345,7 @@ def read_fitted(folder: str | Path) -> compensation.Fitted:
     try:
         return compensation.read(folder)
     except CalibError:  # looked at again only where reading failed
-        refuse_parallel(folder, "compensation", "its controller takes the calibrated robot.toml")
+        stage_of(folder, "compensation")
         raise
 
 
@@ -391,20 +388,3 @@ def compensate(
         found, targets, frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed, progress=progress
     )
     return JointCommands(commands, targets, found)
-
-
-def _of_parallel(
-    robot: FoundRobot, measured: Sequence[Measured], validate: Sequence[Measured], settings: FitSettings | None,
-    options: FitOptions, progress: Progress | None,
-) -> Any:  # fmt: skip
-    from calib.api.parallel import ParallelGeometry
-    from calib.procedure.parallel_stage.fit import fit_parallel
-
-    files, unseen = ([_file(one) for one in part] for part in (measured, validate))
-    return ParallelGeometry(fit_parallel(robot, files, unseen, settings=settings, options=options, progress=progress))
-
-
-def _file(measured: Measured) -> Path:
-    if isinstance(measured, PoseMeasurements):
-        raise UsageError("a parallel robot's measurements are CSV files (calib formats parallel), not values in memory")
-    return Path(measured)

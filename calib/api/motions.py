@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.given import optional, saved
-from calib.api.parallel import ParallelDynamics
 from calib.arguments import checked
 from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
-from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
+from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
@@ -102,10 +101,10 @@ class MotionPlan:
 
 @checked
 def design_excitation(
-    robot: str | Path | CalibratedChain | FoundRobot,
+    robot: str | Path | CalibratedChain | Mechanism,
     settings: ExcitationSettings = DEFAULT_DESIGN,
     *,
-    model: DynamicsModel | ParallelDynamics | str | Path | None = None,
+    model: DynamicsModel | MechanismResult | str | Path | None = None,
     limits: str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
@@ -115,8 +114,8 @@ def design_excitation(
     """Design a motion that excites a robot's dynamics within its limits.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result is a
-            `calib.api.parallel.ParallelExcitation`, with the same members but ``plot``.
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
+            the same members but ``plot``.
         settings: period, harmonics, goals, effort of the search, playback, seed.
         model: identified dynamics, in memory or in a folder: they predict the torques.
         limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``).
@@ -129,33 +128,26 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
-    lost, robot = [], recognised(robot)
+    lost, stage = [], stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
         crew = stack.enter_context(opened(workers))
-        if isinstance(robot, FoundRobot):
-            from calib.api.parallel import ParallelExcitation
-            from calib.procedure.parallel_stage.excite import excite_parallel
-
-            refuse_links(base, tip)
-            made = excite_parallel(
-                robot, settings, model=place, limits=optional(limits), map=crew.map, progress=progress
-            )
-            return cast(Any, ParallelExcitation(robot, made, settings.rate))
+        if stage is not None:
+            return stage.run(settings, model=place, limits=optional(limits), map=crew.map, progress=progress)
         designed = design.excite(
-            robot, settings, model=place, limits=optional(limits), base=base, tip=tip, map=crew.map_without(lost),
-            progress=progress,
+            cast(Any, robot), settings, model=place, limits=optional(limits), base=base, tip=tip,
+            map=crew.map_without(lost), progress=progress,
         )  # fmt: skip
     return ExcitationDesign(replace(designed, notes=(*designed.notes, *map(str, lost))))
 
 
 @checked
 def plan_motion(
-    robot: str | Path | CalibratedChain | FoundRobot,
+    robot: str | Path | CalibratedChain | Mechanism,
     waypoints: str | Path,
     settings: PlanSettings = DEFAULT_PLAN,
     *,
-    model: DynamicsModel | ParallelDynamics | str | Path | None = None,
+    model: DynamicsModel | MechanismResult | str | Path | None = None,
     limits: str | Path | None = None,
     drives: str | Path | None = None,
     base: str | None = None,
@@ -165,8 +157,8 @@ def plan_motion(
     """Plan the fastest motion through waypoints, within a robot's speeds and torques.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result is a
-            `calib.api.parallel.ParallelMotionPlan`, with the same members but ``plot``.
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
+            the same members but ``plot``.
         waypoints: CSV of joint values, or of places of the tip (of the platform's coordinates).
         settings: payloads, straight lines, rate, shaping, approach.
         model: identified dynamics, in memory or in a folder, to plan with.
@@ -176,21 +168,16 @@ def plan_motion(
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
-    robot = recognised(robot)
+    stage = stage_of(robot, "plan", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
-        if isinstance(robot, FoundRobot):
-            from calib.api.parallel import ParallelMotionPlan
-            from calib.procedure.parallel_stage.plan import plan_parallel
-
-            refuse_links(base, tip)
-            made = plan_parallel(
-                robot, Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
+        if stage is not None:
+            return stage.run(
+                Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
                 progress=progress,
             )  # fmt: skip
-            return cast(Any, ParallelMotionPlan(made))
         planned = planning.plan(
-            robot, Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives), base=base,
-            tip=tip, progress=progress,
+            cast(Any, robot), Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
+            base=base, tip=tip, progress=progress,
         )  # fmt: skip
     return MotionPlan(planned)

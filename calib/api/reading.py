@@ -13,7 +13,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording as read_file
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
+from calib.procedure.robot_kinds import Mechanism, mechanism, stage_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.load import load_calibrated
 
@@ -26,7 +26,7 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
         robot: a ``.urdf``, an MDH table in TOML, a library name (``lwr4plus tx40 rv2sq ur5 ur10 ur10e panda iiwa14``),
             or the folder of an earlier fit, whose nominal robot, covariance and joint corrections come along. Of a
             parallel robot (``dualv fivebar stewart``, or a TOML of legs) the result is a
-            `calib.procedure.parallel_stage.robots.FoundRobot`, which the verbs take likewise.
+            `calib.procedure.robot_kinds.Mechanism`, which the verbs take likewise.
         base, tip: links of a URDF between which the arm runs; by default the longest chain without gripper.
 
     Returns:
@@ -35,10 +35,8 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
     Raises:
         RobotError: where nothing of this kind is found, or the file is wrong: with place and advice.
     """
-    found = recognised(robot)
-    if isinstance(found, FoundRobot):
-        refuse_links(base, tip)
-        return cast(Any, found)
+    if stage_of(robot, "identify", base, tip) is not None:
+        return cast(Any, mechanism(robot))
     return load_calibrated(robot, base, tip)
 
 
@@ -60,13 +58,13 @@ def read_poses(
         MeasurementError: naming file, row, column and the likely cause.
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
-    refuse_parallel(robot, "calib.read_poses", "calib.fit_geometry takes its files")
+    stage_of(robot, "calib.read_poses")
     return tuple(inputs.read_file(Path(path), _loaded(robot).complete, chosen))
 
 
 @checked
 def read_recording(
-    path: str | Path, robot: str | Path | CalibratedChain | FoundRobot, *, options: RecordingOptions | None = None
+    path: str | Path, robot: str | Path | CalibratedChain | Mechanism, *, options: RecordingOptions | None = None
 ) -> Recording:
     """Read a log of joint positions and torques (or currents) from npz, CSV, a ROS bag or MCAP.
 
@@ -80,12 +78,9 @@ def read_recording(
     """
     from calib.procedure.dynamic_stage.inputs import joints_of  # the dynamics' modules: none of the geometry's
 
-    robot = recognised(robot)
-    if isinstance(robot, FoundRobot):
-        from calib.procedure.parallel_stage.identify import joints_of as actuators_of
-
-        return read_file(path, actuators_of(robot.known.robot), options or RecordingOptions())
-    return read_file(path, joints_of(_loaded(robot).chain), options or RecordingOptions())
+    found = mechanism(robot)
+    joints = joints_of(_loaded(cast(Any, robot)).chain) if found is None else found.joints
+    return read_file(path, joints, options or RecordingOptions())
 
 
 def _loaded(robot: str | Path | CalibratedChain) -> CalibratedChain:

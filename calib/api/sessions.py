@@ -8,7 +8,7 @@ from typing import Any
 
 from calib.api.given import listed, optional
 from calib.arguments import checked
-from calib.procedure.parallel_stage.robots import refuse_parallel
+from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import commands, fleet
 
 
@@ -48,7 +48,7 @@ def new_session(
     Raises:
         UsageError: where the folder is in use, or a value is none of these.
     """
-    refuse_parallel(robot, "a guided session")
+    stage_of(robot, "a guided session")
     known = limits if isinstance(limits, Mapping) else optional(limits)
     wanted = commands.NewSession(
         str(robot), instrument, poses, validation, seed, base, tip, tool, known, dynamics, motion

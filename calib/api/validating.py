@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, overload
 
 from calib.api.dynamic import DynamicsModel, Recorded
 from calib.api.given import listed
 from calib.api.kinematic import GeometryFit, Measured, Several
-from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.arguments import checked
 from calib.errors import UsageError, require
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
+from calib.procedure.robot_kinds import MechanismResult
 
 
 @overload
@@ -23,12 +22,10 @@ def validate(result: GeometryFit, unseen: Several) -> GeometryFit: ...
 @overload
 def validate(result: DynamicsModel, unseen: Recorded | Sequence[Recorded]) -> DynamicsModel: ...
 @overload
-def validate(result: ParallelGeometry, unseen: Measured | Sequence[Measured]) -> ParallelGeometry: ...
-@overload
-def validate(result: ParallelDynamics, unseen: Recorded | Sequence[Recorded]) -> ParallelDynamics: ...
+def validate(result: MechanismResult, unseen: Any) -> Any: ...
 @checked
 def validate(
-    result: GeometryFit | DynamicsModel | ParallelGeometry | ParallelDynamics,
+    result: GeometryFit | DynamicsModel | MechanismResult,
     unseen: Measured | Recorded | Sequence[Measured | Recorded | Sequence[Measured]],
 ) -> Any:
     """Hold a result against poses or motion it has not seen, and judge it anew.
@@ -45,17 +42,10 @@ def validate(
     """
     given = listed(unseen)
     require(given, "validate: unseen: nothing is given to validate on", UsageError)
-    if isinstance(result, (ParallelGeometry, ParallelDynamics)):
-        return _of_parallel(result, given)
     if isinstance(result, GeometryFit):
         both = measured.with_unseen(result.outcome.inputs, given, result.options, result.settings)
         return replace(result, outcome=arm_fit.assessed(result.outcome, both, result.options, result.settings))
+    if not isinstance(result, DynamicsModel):
+        return result.with_unseen(given)
     more = result.outcome.inputs.with_unseen(given)
     return replace(result, outcome=arm_identify.assessed(result.outcome, more))
-
-
-def _of_parallel(result: ParallelGeometry | ParallelDynamics, unseen: Sequence[Any]) -> Any:
-
-    if isinstance(result, ParallelGeometry):
-        return ParallelGeometry(result.outcome.with_unseen([Path(one) for one in unseen]))
-    return ParallelDynamics(result.outcome.with_unseen(unseen))

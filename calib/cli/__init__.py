@@ -16,7 +16,8 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
-from calib.cli import camera, dynamics, geometry, motion, session, study
+from calib.cli import dynamics, geometry, motion, session
+from calib.extensions import offered
 from calib.workers.threads import limit_process
 
 # a command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
@@ -42,8 +43,8 @@ app = typer.Typer(
 _FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames", "--overwrite")
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
-for _group in (geometry, camera, dynamics, study, motion, session):
-    app.add_typer(_group.app)
+for _group in (geometry.app, dynamics.app, motion.app, session.app, *offered("commands")):
+    app.add_typer(_group)
 
 
 @app.callback()

@@ -40,7 +40,7 @@ def identify_dynamics(
         excitation: folder of calib excite: what it predicted is held against what is found
     """
     from calib.api.dynamic import identify_dynamics as identified
-    from calib.procedure.parallel_stage.destination import check_destination
+    from calib.cli.destination import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import dynamics_section
 

@@ -56,7 +56,7 @@ def fit(
         selection: CSV of calib select, or its folder: what it predicted is held against what is found
     """
     from calib.api.kinematic import fit_geometry
-    from calib.procedure.parallel_stage.destination import check_destination
+    from calib.cli.destination import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import geometry_section
 
@@ -108,10 +108,10 @@ def select(
     from calib.procedure.kinematic_stage import selection
     from calib.procedure.kinematic_stage.inputs import load_robot
     from calib.procedure.measuring.constraints_file import beside
-    from calib.procedure.parallel_stage.robots import refuse_parallel
+    from calib.procedure.robot_kinds import stage_of
 
     named = beside(constraints).values() if constraints else ()
-    refuse_parallel(robot, "choosing poses", "spread them over its workspace by hand")
+    stage_of(robot, "choosing poses")
     load_robot(robot, existing, FitOptions(), base, tip)
     written = [*selection.targets(out, plots), *([(run, (".csv",))] if run else [])]
     check_results(written, [robot, existing, constraints, *named], overwrite)
@@ -162,9 +162,9 @@ def export(
     from calib.errors import UsageError
     from calib.files import results
     from calib.procedure.export import delivery, geometry
-    from calib.procedure.parallel_stage.robots import refuse_parallel
+    from calib.procedure.robot_kinds import stage_of
 
-    refuse_parallel(folder, "export", "a URDF holds no closed loops: take its robot.toml and dynamics.json")
+    stage_of(folder, "export")
     if into:
         from calib.api.exporting import export as export_all
 

@@ -34,7 +34,7 @@ def excite(
         limits: TOML: speeds, torques, workspace, collision, friction
     """
     from calib.api.motions import design_excitation
-    from calib.procedure.parallel_stage.destination import check_destination
+    from calib.cli.destination import check_destination
     from calib.workers.interrupts import finishing
 
     check_destination("excite", robot, out, [robot, model, limits, *settings.existing])
@@ -90,7 +90,7 @@ def plan(
         drives: TOML: [drives] Ia, Fv, Fc, off, without --model
     """
     from calib.api.motions import plan_motion
-    from calib.procedure.parallel_stage.destination import check_destination
+    from calib.cli.destination import check_destination
 
     check_destination("plan", robot, out, [robot, waypoints, model, limits, drives])
     with progress() as say:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Base, Overwrite, Plots, Seed, Tip, Workers, exit_failed, make_console, reporting, say
+from calib.cli.shared import Base, Plots, Seed, Tip, Workers, exit_failed, make_console, reporting, say
 from calib.errors import CalibError, UsageError, command_line
 
 if TYPE_CHECKING:
@@ -76,10 +76,10 @@ def new(
         validation: poses to measure and never fit; 0 for none
     """
     from calib.api.sessions import new_session
-    from calib.procedure.parallel_stage.robots import refuse_parallel
+    from calib.procedure.robot_kinds import stage_of
     from calib.procedure.session.questions import Answers, checked
 
-    refuse_parallel(robot, "calib new")
+    stage_of(robot, "a guided session")
     told = tuple(obstacle) if obstacle else None
     if dynamics_only:
         if instrument not in (None, "none"):
@@ -175,47 +175,6 @@ def status(folder: Folder) -> None:
 
 
 @command(app)
-def demo(
-    out: Path = Path("calib-demo"),
-    robot: str = "lwr4plus",
-    geometry_only: Annotated[bool, typer.Option("--geometry-only")] = False,
-    instrument: str = "cmm",
-    guided: Annotated[bool, typer.Option("--guided")] = False,
-    bring: Path | None = None,
-    seed: Seed = 0,
-    plots: Plots = True,
-) -> None:
-    """Calibrate a simulated robot; compare with the hidden truth.
-
-    Args:
-        out: the session's folder
-        robot: a robot of the library
-        geometry_only: leave the dynamics out
-        instrument: cmm, or camera: rendered images of a board
-        guided: stop where an engineer would
-        bring: let the simulated cell bring what this session waits for
-    """
-    from calib.procedure.session import demo as demonstration
-
-    with reporting() as (say, progress):
-        if bring is not None:
-            demonstration.simulate_next(bring, say)
-            return
-        found = demonstration.run(
-            out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided, plots=plots,
-            instrument=instrument,
-        )  # fmt: skip
-    say("", *found.asks)
-    if found.results:
-        say(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at")
-    for words, name in found.results:
-        place, folder = found.session.folder / name, found.session.folder
-        how = f"  ({command_line(place, program='rerun')}, or {command_line('view', folder)})"
-        say(f"  {words:15} {place}{how if words == 'to play' else ''}")
-    exit_failed(found.verdict)
-
-
-@command(app)
 def run(sessions: list[Path], workers: Workers = "1", plots: Plots = True) -> None:
     """Run many SESSIONS, one folder per robot, as far as they go. A table at the end says how they stand.
 
@@ -253,40 +212,3 @@ def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> N
         stop = commands.go_on(folder, say, progress, typed, again, plots)
     say(*stop.lines)
     exit_failed(stop.verdict)
-
-
-@command(app)
-def view(
-    folder: Annotated[Path, typer.Argument(metavar="DIR")],
-    save: Path | None = None,
-    spawn: Annotated[bool | None, typer.Option("--spawn/--no-spawn")] = None,
-    robot: str | None = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Show robot, errors, poses, motions or torques in Rerun.
-
-    Args:
-        folder: of a fit, a session, an identification, a motion; or a CSV
-        save: write a Rerun recording (.rrd), and open no window
-        spawn: open Rerun's window; by default where nothing is saved
-        robot: the arm to draw, where the folder does not say
-    """
-    from calib.files import results
-    from calib.procedure.parallel_stage.robots import refuse_parallel
-    from calib.procedure.report import viewer
-
-    refuse_parallel(folder, "calib view")
-    if save is None and spawn is False:
-        raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
-    scene = None
-    if save:
-        inside = folder.iterdir() if folder.is_dir() else ()
-        read = [folder, robot, *(path for path in inside if path.suffix != ".rrd")]
-        with results([(save, (".rrd",))], read, overwrite):
-            scene = viewer.write(folder, save, robot)
-        size = f"{1e-6 * save.stat().st_size:.1f} MB"
-        say(f"{save}: {size}; {command_line(save, program='rerun')} shows it")
-    if spawn or (spawn is None and save is None):
-        scene = viewer.spawn(folder, robot)
-    for note in scene.notes if scene else ():
-        say(f"note: {note}")

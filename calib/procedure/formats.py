@@ -8,21 +8,12 @@ from importlib import import_module
 
 from calib.config import schema
 from calib.errors import UsageError
+from calib.extensions import merged
 
 TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "measurements": (
         "CSV files of measured poses, positions, distances",
         ("calib.data.poses.pose_files", "calib.data.poses.robodk"),
-    ),
-    "images": (
-        "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
-        (
-            "calib.data.poses.image_folders",
-            "calib.data.camera.board",
-            "calib.data.camera.camera_info",
-            "calib.data.camera.corner_file",
-            "calib.data.poses.image_bags",
-        ),
     ),
     "targets": (
         "targets of calib compensate, and the commands it writes",
@@ -47,14 +38,6 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.measuring.constraints_file",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
-    "parallel": (
-        "a parallel robot as legs and a platform, and what commands write of one",
-        (
-            "calib.mechanism.parallel_files",
-            "calib.procedure.parallel_stage.fit",
-            "calib.procedure.parallel_stage.folder",
-        ),
-    ),
     "robot": (
         "robot.toml as calib fit writes it",
         ("calib.robot.description", "calib.geometry.installation_file", "calib.robot.calibrated"),
@@ -69,7 +52,6 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "trajectory.toml of calib excite, and what calib recall writes",
         ("calib.procedure.excitation.coefficients", "calib.procedure.excitation.recall"),
     ),
-    "study": ("the TOML file of calib study", ("calib.studies.conditions",)),
     "recordings": (
         "recordings of motion, for calib identify",
         (
@@ -79,6 +61,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
             "calib.data.recordings.bags",
         ),
     ),
+    **merged("topics"),
 }
 
 SCHEMAS: Mapping[str, tuple[str, str]] = {
@@ -87,7 +70,7 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
-    "study": ("calib.studies.conditions", "StudyFile"),
+    **merged("schemas"),
 }
 """Topic → module and dataclass of the TOML files that people write."""
 

@@ -41,7 +41,7 @@ from calib.geometry.fit import GeometricFit, fit
 from calib.geometry.images.camera_guess import complete_camera, pnp_poses
 from calib.geometry.parameters import layout
 from calib.robot.chain import random_joints
-from calib.simulation.cells.camera_cell import (
+from calib.rooms.cells.camera_cell import (
     FIVE_MEGAPIXEL,
     CameraCell,
     Views,
@@ -50,9 +50,9 @@ from calib.simulation.cells.camera_cell import (
     take_pictures,
     views,
 )
-from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
-from calib.simulation.cells.truth import position_errors
-from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
+from calib.rooms.cells.truth import position_errors
+from calib.rooms.cells.virtual_cells import rigid, virtual_cell
 from calib.transforms import pose
 
 COUNTS = (20, 40, 80)

@@ -31,13 +31,13 @@ from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
-from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import closed
-from calib.mechanism.computed_torque import ComputedTorque, ParallelRun, simulate
-from calib.mechanism.distribution import distributed, overconstraint
-from calib.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.procedure.parallel_stage.design import ParallelDesign, design_parallel
+from calib.rooms.parallel.design import ParallelDesign, design_parallel
+from calib.rooms.parallel.mechanism import library, parallel_files
+from calib.rooms.parallel.mechanism.closure import closed
+from calib.rooms.parallel.mechanism.computed_torque import ComputedTorque, ParallelRun, simulate
+from calib.rooms.parallel.mechanism.distribution import distributed, overconstraint
+from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 
 RATE, SECONDS = 1000.0, 6.0  # of a recording: Hz, s
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}  # truth: mass as weighed, the others as the papers identify them

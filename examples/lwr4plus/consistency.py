@@ -42,9 +42,9 @@ from calib.identification.settings import IdentificationSettings, Payload, make_
 from calib.identification.uncertainty import geometry_uncertainty
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
-from calib.simulation.cells import known_robots
-from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
-from calib.simulation.cells.virtual_cells import lwr4plus_cell
+from calib.rooms.cells import known_robots
+from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
+from calib.rooms.cells.virtual_cells import lwr4plus_cell
 from calib.simulation.loop.references import Reference, random_fourier
 from calib.workers import workers
 

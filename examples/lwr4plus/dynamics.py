@@ -43,7 +43,7 @@ from calib.identification.cases import Case, make_case
 from calib.identification.rows import observe
 from calib.procedure.report.style import AFTER, INK, QUIET, WIDE, save, sheet, styled
 from calib.robot.chain import Chain
-from calib.simulation.cells import known_robots, lwr4plus
+from calib.rooms.cells import known_robots, lwr4plus
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference, random_fourier

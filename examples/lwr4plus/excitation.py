@@ -50,9 +50,9 @@ from calib.geometry.fit import fit
 from calib.procedure.excitation.limits import Points
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain, random_joints
-from calib.simulation.cells import lwr4plus
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_cells import lwr4plus_cell
+from calib.rooms.cells import lwr4plus
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_cells import lwr4plus_cell
 from calib.simulation.loop.references import Reference
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers

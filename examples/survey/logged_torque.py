@@ -18,10 +18,10 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.identification.cases import Case
 from calib.identification.methods.registry import method_named
 from calib.identification.rows import observe
-from calib.simulation.cells import known_robots
+from calib.rooms.cells import known_robots
+from calib.rooms.studies.conditions import Condition, read_study
+from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
 from calib.simulation.loop.closed_loop import Sensing, simulate
-from calib.studies.conditions import Condition, read_study
-from calib.studies.experiment import Experiment, make_experiment, set_up
 
 
 def with_case(data: Experiment, case: Case) -> Experiment:

@@ -16,10 +16,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from calib.identification.methods.registry import METHODS
-from calib.studies.conditions import read_study
-from calib.studies.store import read_rows
-from calib.studies.summary import ConditionSummary, MethodSummary, summarise
-from calib.studies.trial import TrialRow
+from calib.rooms.studies.conditions import read_study
+from calib.rooms.studies.store import read_rows
+from calib.rooms.studies.summary import ConditionSummary, MethodSummary, summarise
+from calib.rooms.studies.trial import TrialRow
 
 HERE = Path(__file__).parent
 STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs")

@@ -12,10 +12,10 @@ import sys
 
 import numpy as np
 
-from calib.simulation.cells import known_robots
+from calib.rooms.cells import known_robots
+from calib.rooms.studies.conditions import read_study
+from calib.rooms.studies.experiment import set_up
 from calib.simulation.loop.closed_loop import Sensing, simulate
-from calib.studies.conditions import read_study
-from calib.studies.experiment import set_up
 
 
 def main() -> None:

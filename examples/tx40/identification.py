@@ -46,7 +46,7 @@ from calib.identification.methods.instrumental import Instrumental, Round, ident
 from calib.identification.parameter_constraints import hold
 from calib.identification.parameter_constraints import signs as signed
 from calib.identification.rows import observe
-from calib.simulation.cells import known_robots
+from calib.rooms.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference, random_fourier, trapezoidal

@@ -10,10 +10,11 @@ import shutil
 import time
 from pathlib import Path
 
-from calib.procedure.session import demo, fleet, steps
+from calib.procedure.session import fleet, steps
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import locked
-from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.rooms.cells import demo
+from calib.rooms.cells.virtual_cells import virtual_cell
 from calib.workers import workers
 
 ROBOTS = ("ur5", "ur10e", "panda", "tx40")

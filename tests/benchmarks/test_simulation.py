@@ -21,7 +21,7 @@ from calib.identification.cases import Case, make_case
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.robot import description, library
-from calib.simulation.cells import known_robots
+from calib.rooms.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
 from calib.simulation.loop.references import Reference, random_fourier
 

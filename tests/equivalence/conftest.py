@@ -10,9 +10,9 @@ import pytest
 from both_ways import go_on, session_with
 
 from calib.robot import description
-from calib.simulation.cells import measured_files
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells import measured_files
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
 @pytest.fixture(scope="session")

@@ -17,9 +17,9 @@ from sessions import edit
 from calib.data.poses.plans import read_poses
 from calib.procedure.session.folder import open_session
 from calib.robot.load import load
-from calib.simulation.cells import measured_files
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells import measured_files
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
 def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> Judgement:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.simulation.cells import lwr4plus
+from calib.rooms.cells import lwr4plus
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]

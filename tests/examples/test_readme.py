@@ -14,10 +14,10 @@ from calib.robot import library
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf_write
 from calib.robot.load import load
-from calib.simulation.cells import measured_files
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_arm import moving_arm, record
-from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.rooms.cells import measured_files
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_arm import moving_arm, record
+from calib.rooms.cells.virtual_cells import virtual_cell
 from calib.simulation.loop.references import random_fourier
 
 ROOT = Path(__file__).parents[2]

@@ -16,7 +16,7 @@ from calib.geometry.parameters import layout
 from calib.robot import mdh
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf, urdf_write
-from calib.simulation.cells import lwr4plus
+from calib.rooms.cells import lwr4plus
 from calib.transforms import to_quaternion
 
 

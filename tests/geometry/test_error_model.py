@@ -15,8 +15,8 @@ from calib.geometry.model_choice.ladder import select_model
 from calib.geometry.uncertainty.error_model import END, ErrorModel, learn_errors
 from calib.geometry.uncertainty.left_out import LeftOut
 from calib.robot.load import load
-from calib.simulation.cells.cell import SimulatedInstrument, measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells.cell import SimulatedInstrument, measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
 def measured(seed: int, count: int, reach: float, outside: float) -> Positions:

@@ -27,10 +27,10 @@ from calib.geometry.parameters import layout, step
 from calib.geometry.weighing import Settings
 from calib.robot.deflection import Deflection
 from calib.robot.load import load
-from calib.simulation.cells import camera_cell as camera
-from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
-from calib.simulation.cells.truth import position_errors
-from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from calib.rooms.cells import camera_cell as camera
+from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
+from calib.rooms.cells.truth import position_errors
+from calib.rooms.cells.virtual_cells import rigid, virtual_cell
 from calib.transforms import pose
 
 FISHEYE = Lens("fisheye", np.array([900.0, 905.0, 1220.0, 1010.0, 0.05, -0.02, 0.01, 0.003]), (2448, 2048))

@@ -12,7 +12,7 @@ from calib.dynamics.gravity import gravity_torques
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
 from calib.robot.load import load
-from calib.simulation.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
+from calib.rooms.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
 
 ROBOTS = ("ur5", "lwr4plus", "tx40", "rv2sq", "panda")
 

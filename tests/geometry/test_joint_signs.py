@@ -10,8 +10,8 @@ from calib.geometry.checks import joint_signs
 from calib.geometry.first_guess import install
 from calib.robot.chain import random_joints
 from calib.robot.load import load
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
 @pytest.mark.parametrize(("turned", "most"), [((), 1), ((1,), 8), ((2, 5), 9)])

@@ -23,8 +23,8 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated
 from calib.robot.chain import random_joints
 from calib.robot.load import load_calibrated
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
 def geometry(model: str) -> kinematic.Outcome:

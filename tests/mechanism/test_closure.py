@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from calib.errors import RobotError
-from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import NoPosture, closed, coordinates_of
-from calib.mechanism.leg_links import leg_links
-from calib.mechanism.velocities import of_platform, of_readings
+from calib.rooms.parallel.mechanism import library, parallel_files
+from calib.rooms.parallel.mechanism.closure import NoPosture, closed, coordinates_of
+from calib.rooms.parallel.mechanism.leg_links import leg_links
+from calib.rooms.parallel.mechanism.velocities import of_platform, of_readings
 
 ROBOTS = ("dualv", "fivebar", "stewart")
 

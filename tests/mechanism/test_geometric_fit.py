@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calib.errors import Unidentifiable
-from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import closed, coordinates_of
-from calib.mechanism.geometric_fit import changed, fit_loops, loop_parameters, platform_errors
+from calib.rooms.parallel.mechanism import library, parallel_files
+from calib.rooms.parallel.mechanism.closure import closed, coordinates_of
+from calib.rooms.parallel.mechanism.geometric_fit import changed, fit_loops, loop_parameters, platform_errors
 
 NOISE = 1e-5  # of the encoders [rad or m]
 

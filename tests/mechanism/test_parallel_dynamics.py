@@ -8,10 +8,10 @@ from closed_tree import ClosedTree
 
 from calib.dynamics import base as bases
 from calib.errors import UsageError
-from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import ClosedRobot, closed
-from calib.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
-from calib.mechanism.velocities import of_platform
+from calib.rooms.parallel.mechanism import library, parallel_files
+from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
+from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
+from calib.rooms.parallel.mechanism.velocities import of_platform
 
 ROBOTS = ("dualv", "fivebar", "stewart")
 

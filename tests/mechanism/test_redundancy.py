@@ -11,12 +11,12 @@ from calib.errors import CannotSimulate
 from calib.identification.cases import make_case
 from calib.identification.identify import identify_model
 from calib.identification.settings import IdentificationSettings
-from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import closed
-from calib.mechanism.computed_torque import ComputedTorque, simulate
-from calib.mechanism.distribution import distributed, overconstraint
-from calib.mechanism.parallel_model import make_parallel_model, rows_named
-from calib.mechanism.platform_motion import PlatformRegressor, along
+from calib.rooms.parallel.mechanism import library, parallel_files
+from calib.rooms.parallel.mechanism.closure import closed
+from calib.rooms.parallel.mechanism.computed_torque import ComputedTorque, simulate
+from calib.rooms.parallel.mechanism.distribution import distributed, overconstraint
+from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
+from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
 
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}
 RATE = 1000.0

@@ -9,13 +9,13 @@ import pytest
 from without_figures import run
 
 import calib as api
-from calib.mechanism import library as parallel
-from calib.mechanism import parallel_files
-from calib.mechanism.closure import closed
-from calib.mechanism.geometric_fit import changed, loop_parameters
-from calib.mechanism.parallel_model import make_parallel_model
-from calib.mechanism.platform_motion import PlatformRegressor, along
 from calib.robot import library
+from calib.rooms.parallel.mechanism import library as parallel
+from calib.rooms.parallel.mechanism import parallel_files
+from calib.rooms.parallel.mechanism.closure import closed
+from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
+from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model
+from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
 
 HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
 
@@ -197,7 +197,7 @@ def test_a_fit_worse_than_the_nominal_fails(folder, tmp_path, capsys):
         (("fit", "dualv", "readings.csv", "--tolerance", 0.1), "a tolerance is of the platform's position"),
         (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
         (("select", "dualv"), "choosing poses is for serial arms"),
-        (("new", "--robot", "dualv", "--instrument", "cmm"), "calib new is for serial arms"),
+        (("new", "--robot", "dualv", "--instrument", "cmm"), "a guided session is for serial arms"),
     ],
 )
 def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, said):

@@ -16,10 +16,10 @@ from study_rows import ROW
 
 from calib.errors import UsageError
 from calib.identification.methods.registry import VERSIONS
-from calib.procedure.study.outcome import run_study
-from calib.studies.conditions import read_study
-from calib.studies.store import JOURNAL, opened, read_rows
-from calib.studies.trial import TrialRow
+from calib.rooms.studies.conditions import read_study
+from calib.rooms.studies.reports.outcome import run_study
+from calib.rooms.studies.store import JOURNAL, opened, read_rows
+from calib.rooms.studies.trial import TrialRow
 
 FILE = """
 name = "small"

@@ -12,7 +12,7 @@ import study_rows
 from study_rows import rows
 
 from calib.errors import CalibError, UsageError
-from calib.studies.store import JOURNAL, WHOLE, opened, read_rows
+from calib.rooms.studies.store import JOURNAL, WHOLE, opened, read_rows
 
 
 def test_rows_come_back_as_they_were(tmp_path: Path):
@@ -115,7 +115,7 @@ import resource, sys
 sys.path.insert(0, {str(Path(study_rows.__file__).parent)!r})
 from pathlib import Path
 from calib.errors import CalibError
-from calib.studies.store import JOURNAL, opened
+from calib.rooms.studies.store import JOURNAL, opened
 from study_rows import rows
 with opened(Path({str(tmp_path)!r})) as store:
     store.append(rows(3))

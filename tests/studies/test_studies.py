@@ -14,11 +14,11 @@ from study_rows import ROW
 from calib.errors import UsageError
 from calib.identification.methods.registry import VERSIONS
 from calib.procedure.report.console import rendered
-from calib.procedure.study.report import console_table
-from calib.studies.conditions import Condition, read_study, shipped
-from calib.studies.experiment import make_experiment
-from calib.studies.summary import LEAST, sign_test, summarise
-from calib.studies.trial import FOUND, NOT_RECORDED, run_trial
+from calib.rooms.studies.conditions import Condition, read_study, shipped
+from calib.rooms.studies.experiment import make_experiment
+from calib.rooms.studies.reports.report import console_table
+from calib.rooms.studies.summary import LEAST, sign_test, summarise
+from calib.rooms.studies.trial import FOUND, NOT_RECORDED, run_trial
 
 FILE = """
 name = "small"
@@ -105,7 +105,7 @@ def test_a_trial_is_pure():
 
 def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch):
     """An unstable controller is counted, and ends nothing."""
-    from calib.simulation.cells import known_robots
+    from calib.rooms.cells import known_robots
 
     stiff = known_robots.controller("rv2sq").scaled(100.0)
     monkeypatch.setattr(known_robots, "controller", lambda name: replace(stiff, limit=np.full(6, np.inf)))

@@ -7,8 +7,8 @@ import pinocchio as pin
 
 from calib.dynamics.bodies import PRISMATIC, bodies_of
 from calib.dynamics.model import PINOCCHIO_ORDER, to_inertia
-from calib.mechanism.closure import ClosedRobot
-from calib.mechanism.leg_links import Posture
+from calib.rooms.parallel.mechanism.closure import ClosedRobot
+from calib.rooms.parallel.mechanism.leg_links import Posture
 
 SMALL = np.array([1e-2, 0, 0, 1e-2, 0, 1e-2, 0, 0, 0, 0.1])
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from calib.robot.chain import random_joints
 from calib.robot.load import load
-from calib.simulation.cells import measured_files
-from calib.simulation.cells.cell import measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells import measured_files
+from calib.rooms.cells.cell import measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 CODE = """
 import json, sys

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,7 +27,7 @@ import numpy as np
 from calib.data.camera import board as boards
 from calib.data.camera import camera_info, corner_file
 from calib.data.camera.board import Board
-from calib.data.camera.corner_file import Detection, Found
+from calib.data.camera.corner_file import Found
 from calib.data.camera.lens import Lens
 from calib.data.csv_table import Table, read_table
 from calib.data.poses import plausible
@@ -36,10 +36,10 @@ from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plausible import Limits
 from calib.errors import CalibError, MeasurementError
+from calib.extensions import needed
 from calib.words import counted, listing
 
 JOINTS = "joints.csv"
-LOOKED_INTO = 3  # useless images that are looked into for the reason, unless it is found
 LEAST = 3  # usable images below which a folder is refused
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
@@ -139,44 +139,10 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     if not images:
         missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
         raise MeasurementError(f"none of the images that {JOINTS} names is there ({missing})", path)
-    found = detected(((each.name, each) for each in images), board, len(images), progress)
+    found = needed("detect_boards")(((each.name, each) for each in images), board, len(images), progress)
     with suppress(CalibError):  # a folder that cannot be written into is read all the same
         corner_file.write_corners(stored, found)
     return found
-
-
-def detected(
-    images: Iterable[tuple[str, Path | np.ndarray]], board: Board, count: int = 0, progress: Progress | None = None
-) -> Found:
-    """Look for a board in images, files or arrays, by name.
-
-    Images of another size than most are of no use: a camera's lens is that of one size.
-    """
-    from calib.data.camera.detection import detect
-    from calib.data.camera.images import read_image
-
-    result, sizes, useless = dict[str, Detection](), dict[str, tuple[int, int]](), 0
-    blank = np.full((len(boards.corners(board)), 2), np.nan)
-    for number, (name, each) in enumerate(images):
-        if progress:
-            progress(number, count, name)
-        try:
-            image = read_image(each) if isinstance(each, Path) else each
-        except MeasurementError as error:
-            result[name] = Detection(blank, blank[:, 0], str(error).removeprefix(f"{each}: "))
-            continue
-        sizes[name] = image.shape[1], image.shape[0]
-        result[name] = detect(image, board, thorough=useless < LOOKED_INTO)
-        useless += result[name].problem.startswith("no board found")
-    if not sizes:
-        return Found(result)
-    usual = Counter(sizes.values()).most_common(1)[0][0]
-    for name, size in sizes.items():
-        if size != usual:
-            turned = "; was it turned by a program?" if size == usual[::-1] else ""
-            words = f"{size[0]} x {size[1]} pixels, where most are {usual[0]} x {usual[1]}{turned}"
-            result[name] = Detection(blank, blank[:, 0], words)
-    return Found(result, usual)
 
 
 def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray, list[str]]:

@@ -18,6 +18,7 @@ from calib.data.camera.lens import Lens
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
+from calib.extensions import needed
 from calib.geometry.images.hand_eye import Placement, misfit, place_robustly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -73,11 +74,9 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
         if block.lens is None and isinstance(other, Pixels) and other.size == block.size and other.lens is not None:
             block = replace(block, lens=other.lens, mounting=block.mounting or other.mounting, free=())
     if block.lens is None:
-        from calib.data.camera.intrinsics import estimate_lens
-
         if not block.size[0]:
             raise MeasurementError("neither the images' size nor a lens (camera.yaml) is known", block.file)
-        guess = estimate_lens(block.board, block.pixel, block.size, block.model, block.file)
+        guess = needed("estimate_lens")(block.board, block.pixel, block.size, block.model, block.file)
         block = replace(block, lens=guess.lens)
     arm = forward(chain, block.q)
     found = place_camera(block, arm)

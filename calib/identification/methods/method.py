@@ -246,3 +246,38 @@ def attempted(
             method, status, None, problem.pooled, nothing, nothing, failure=error, loops=loops
         )  # fmt: skip
     return replace(found, seconds=time.perf_counter() - began)
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """A method as a list shows it.
+
+    Attributes:
+        method: itself.
+        description: one line.
+        source: whose it is.
+        tunes: what of it is chosen beforehand and not told by the data; () for nothing.
+        version: raised whenever it gives another estimate, or another count of rounds, of the same data: what studies
+            have kept of it from before then does not count, and is run again.
+    """
+
+    method: Method
+    description: str
+    source: str
+    tunes: tuple[str, ...] = ()
+    version: int = 1
+
+    @property
+    def name(self) -> str:
+        """What options and files call it."""
+        return self.method.name
+
+    @property
+    def needs_controller(self) -> bool:
+        """Whether it simulates the closed loop, and so asks for the controller and its reference."""
+        return self.method.needs_controller
+
+    @property
+    def needs_simulation(self) -> bool:
+        """Whether it asks for a model whose motion can be computed from torques."""
+        return self.method.needs_simulation

@@ -15,8 +15,8 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
 from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.result import GeometricFit
-from calib.procedure.measuring.boards import coverage, coverage_words
 
+GRID = (12, 9)  # cells of the image that coverage counts (our choice)
 LOOSE = 4.0  # times their stated sigmas that corners lie off within an image, from which on it is worth a word
 
 
@@ -27,7 +27,7 @@ class ImageCoverage:
     Attributes:
         file: the images' folder.
         size: width and height of the images [px].
-        count: corners per cell of the image, row by row (`calib.procedure.measuring.boards.GRID`).
+        count: corners per cell of the image, row by row (`GRID`).
         rms: distance of corners seen from corners predicted [px], per cell; 0 where none was seen.
     """
 
@@ -103,3 +103,17 @@ def image_notes(found: GeometricFit) -> list[str]:
                 + (", against which the other instruments' measurements stand" if others else "")
             )
     return lines
+
+
+def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
+    """Return how many corners (N, 2) [px] lie in each cell of an image, (rows, columns) of `GRID`; or their weight."""
+    bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
+    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)[0].T
+
+
+def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
+    """Return how much of the image the corners cover, with a word where that is little."""
+    share = float(np.mean(coverage(pixels, size) > 0))
+    words = f"corners lie in {share:.0%} of the image"
+    few = ": bring the board (or the camera) nearer, and into the image's corners, or the lens is not told there"
+    return words + (few if share < 0.6 else "")

@@ -10,11 +10,12 @@ from calib import files
 from calib.data.camera.corner_file import FILE as CORNERS
 from calib.data.poses.image_folders import JOINTS
 from calib.errors import command_line
+from calib.extensions import offered
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.coefficients import SAMPLES
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
-from calib.procedure.report import certificate, fit_report, viewer
+from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.certificate import FileRow
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
@@ -66,8 +67,8 @@ def certify(session: Session, say: Say) -> list[str]:
         listed(session),
     )
     files.write(session.path(CERTIFICATE), certificate.render(page))
-    recording = [viewer.write_beside(session.folder)] if session.plots else []
-    return [*notes, CERTIFICATE, *recording]
+    recordings = [write(session.folder) for write in offered("recordings") if session.plots]
+    return [*notes, CERTIFICATE, *recordings]
 
 
 def _whole_report(session: Session) -> fit_report.Report:

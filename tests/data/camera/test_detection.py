@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.camera.board import Board, corners
 from calib.data.camera.corner_file import Detection
-from calib.data.camera.detection import detect
-from calib.data.camera.images import decode, read_image
 from calib.data.camera.lens import Lens
 from calib.errors import MeasurementError
-from calib.simulation.cells.rendered_camera import Imaging, render
+from calib.rooms.camera.detection import detect
+from calib.rooms.camera.images import decode, read_image
+from calib.rooms.cells.rendered_camera import Imaging, render
 from calib.transforms import pose
 
 LENS = Lens("pinhole", np.array([620.0, 622.0, 320.0, 238.0, -0.2, 0.08, 5e-4, -3e-4, 0.0]), (640, 480))

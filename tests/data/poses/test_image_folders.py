@@ -12,12 +12,12 @@ from calib.data.camera.board import read_board
 from calib.data.camera.camera_info import write_lens
 from calib.data.camera.lens import Lens
 from calib.data.poses.fit_options import parse_options
-from calib.data.poses.image_bags import read_image_bag, write_image_folder
 from calib.data.poses.image_folders import is_image_folder, problem_words, read_images
 from calib.errors import MeasurementError
-from calib.simulation.cells import camera_cell as camera
-from calib.simulation.cells.cell import SimulatedInstrument
-from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from calib.rooms.camera.image_bags import read_image_bag, write_image_folder
+from calib.rooms.cells import camera_cell as camera
+from calib.rooms.cells.cell import SimulatedInstrument
+from calib.rooms.cells.virtual_cells import rigid, virtual_cell
 
 LENS = Lens("pinhole", np.array([470.0, 471.0, 240.0, 178.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (480, 360))
 

@@ -11,7 +11,9 @@ import small_arm
 
 from calib.dynamics.torque_rows import POWER
 from calib.errors import Diverged, UsageError
-from calib.estimation.sequential.kalman import (
+from calib.identification.methods.method import EstimateStatus
+from calib.identification.methods.registry import METHODS
+from calib.rooms.studies.methods.kalman import (
     RULES,
     Belief,
     Filter,
@@ -21,8 +23,6 @@ from calib.estimation.sequential.kalman import (
     points,
     predicted,
 )
-from calib.identification.methods.method import EstimateStatus
-from calib.identification.methods.registry import METHODS
 
 KINDS = [Filter(rule, root) for rule, root in product(RULES, (False, True))]
 NAMES = [("sr" if one.root else "") + one.rule for one in KINDS]

@@ -13,15 +13,15 @@ from calib.data.signals.decimation import decimate
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.torque_rows import POWER
 from calib.errors import NotConverged, UsageError
-from calib.estimation.sequential.networks import hopfield
 from calib.estimation.triangles import collect
 from calib.identification.cases import make_case
 from calib.identification.identify import chain_states, common_decimator, find_base
-from calib.identification.methods.maximum_likelihood import noise_of_states
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem
 from calib.identification.methods.registry import METHODS
 from calib.identification.rows import observe
 from calib.identification.settings import IdentificationSettings, make_model
+from calib.rooms.studies.methods.maximum_likelihood import noise_of_states
+from calib.rooms.studies.methods.networks import hopfield
 
 
 def noisy(seed: int, noise: float) -> IdentificationProblem:
@@ -89,7 +89,7 @@ def test_a_saturated_neuron_is_no_estimate():
 
 
 def test_networks_say_when_they_fail(problem, monkeypatch):
-    monkeypatch.setattr("calib.estimation.sequential.networks.EPOCHS", 1)
+    monkeypatch.setattr("calib.rooms.studies.methods.networks.EPOCHS", 1)
     found = METHODS["adaline"].estimate(problem)
     assert found.status is EstimateStatus.NOT_CONVERGED and "from rest after 1 epochs" in str(found.failure)
 

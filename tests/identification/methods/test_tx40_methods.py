@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.identification.methods.registry import METHODS
-from calib.studies.conditions import Condition
-from calib.studies.experiment import make_experiment
+from calib.rooms.studies.conditions import Condition
+from calib.rooms.studies.experiment import make_experiment
 
 # torque error [%] on unseen motion, and size of the errors in stated standard deviations (None: biased by more than
 # their sigma, since filtered positions round off friction's reversals)

@@ -25,7 +25,7 @@ from calib.procedure.excitation.waypoints import read_waypoints
 from calib.robot import description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
-from calib.simulation.cells.known_robots import truth
+from calib.rooms.cells.known_robots import truth
 from calib.transforms import to_quaternion
 
 

@@ -14,8 +14,8 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, assess
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.load import load
-from calib.simulation.cells.cell import SimulatedInstrument, measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells.cell import SimulatedInstrument, measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
 def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,14 +13,12 @@ import pytest
 from calib.cli import run
 from calib.data.camera.board import read_board
 from calib.data.camera.corner_file import Detection, Found
-from calib.data.poses.image_bags import ImageBag, write_image_folder
 from calib.data.poses.measurements import Distances
 from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
-from calib.procedure.measuring.boards import make
 from calib.procedure.measuring.camera_view import image_observation
 from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.pose_limits import read_limits
@@ -28,10 +26,12 @@ from calib.procedure.session.commands import NewSession, begin, go_on
 from calib.procedure.session.folder import open_session
 from calib.robot.deflection import Deflection
 from calib.robot.load import load
-from calib.simulation.cells import camera_cell as camera
-from calib.simulation.cells import camera_files
-from calib.simulation.cells.cell import SimulatedInstrument
-from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from calib.rooms.camera.boards import make
+from calib.rooms.camera.image_bags import ImageBag, write_image_folder
+from calib.rooms.cells import camera_cell as camera
+from calib.rooms.cells import camera_files
+from calib.rooms.cells.cell import SimulatedInstrument
+from calib.rooms.cells.virtual_cells import rigid, virtual_cell
 from calib.transforms import from_xyz_rpy, pose
 from poses.space import is_feasible
 
@@ -212,7 +212,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.report import figures, fit_report
     from calib.robot.chain import random_joints
-    from calib.simulation.cells.cell import measure, true_poses
+    from calib.rooms.cells.cell import measure, true_poses
 
     arm, reflector = cell.cell.nominal, pose(None, [0.1, 0.0, 0.1])
     images = replace(camera.photograph(cell, camera.views(cell, 30, 5), 0.05, 5), tool_names=("tool",))

@@ -14,14 +14,14 @@ import pytest
 from calib import cli
 from calib.errors import UsageError
 from calib.geometry import installation_file
-from calib.procedure.report import scene as viewing
-from calib.procedure.report import viewer
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.robot.visuals import visuals
-from calib.simulation.cells.cell import SimulatedInstrument, measure
-from calib.simulation.cells.virtual_cells import perturbed_cell
+from calib.rooms.cells.cell import SimulatedInstrument, measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.rooms.viewer import scene as viewing
+from calib.rooms.viewer import viewer
 
 
 @pytest.fixture(scope="module")

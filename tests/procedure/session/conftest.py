@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from sessions import edit, go_on
 
-from calib.procedure.session import demo
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import Session, open_session
-from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.rooms.cells import demo
+from calib.rooms.cells.virtual_cells import virtual_cell
 
 
 @pytest.fixture(scope="session")

@@ -15,11 +15,12 @@ from sessions import edit, go_on
 from calib import cli
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
-from calib.procedure.session import commands, demo, instructions, steps
+from calib.procedure.session import commands, instructions, steps
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import Session, open_session
-from calib.simulation.cells.truth import torque_errors
-from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.rooms.cells import demo
+from calib.rooms.cells.truth import torque_errors
+from calib.rooms.cells.virtual_cells import virtual_cell
 
 QUICK = {"period": 6.0, "harmonics": 5, "starts": 1, "evaluations": 100, "repeats": 2, "rate": 250.0}
 

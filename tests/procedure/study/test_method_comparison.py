@@ -13,7 +13,7 @@ from calib.cli import run
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.dynamic_stage.validation import overlaps
-from calib.procedure.study.method_comparison import QUICK, caveats, compare_methods
+from calib.rooms.studies.reports.method_comparison import QUICK, caveats, compare_methods
 
 
 def recorded(folder: Path) -> tuple[Path, Path]:
@@ -74,7 +74,7 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
 
 
 def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from calib.procedure.study import method_comparison
+    from calib.rooms.studies.reports import method_comparison
 
     def broken(robot, cases, settings, say):
         if settings.method == "tls":

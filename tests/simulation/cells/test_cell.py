@@ -15,9 +15,9 @@ from calib.geometry.weighing import Settings
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.simulation.cells import lwr4plus
-from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure, true_poses
-from calib.simulation.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell
+from calib.rooms.cells import lwr4plus
+from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
+from calib.rooms.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell
 from calib.transforms import invert, rotation_vector
 
 

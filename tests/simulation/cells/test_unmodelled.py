@@ -11,9 +11,9 @@ from calib.dynamics.gravity import gravity_torques
 from calib.geometry.model_choice.effects import EFFECTS
 from calib.robot.chain import random_joints
 from calib.robot.deflection import Deflection, evaluate
-from calib.simulation.cells.cell import true_poses
-from calib.simulation.cells.unmodelled import PositionErrors, TorqueErrors, displacements, gear_torques, memory
-from calib.simulation.cells.virtual_cells import lwr4plus_cell, virtual_cell
+from calib.rooms.cells.cell import true_poses
+from calib.rooms.cells.unmodelled import PositionErrors, TorqueErrors, displacements, gear_torques, memory
+from calib.rooms.cells.virtual_cells import lwr4plus_cell, virtual_cell
 
 CELL = virtual_cell("lwr4plus", 0)
 ARM = CELL.truth.chain

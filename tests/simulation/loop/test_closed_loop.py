@@ -14,7 +14,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.errors import CalibError, CannotSimulate, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain
-from calib.simulation.cells import known_robots
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, forward_dynamics, simulate, simulate_many
 from calib.simulation.loop.references import Reference

@@ -11,7 +11,7 @@ from arms import motley_with_follower
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.errors import CalibError, NotConverged
-from calib.simulation.cells import known_robots
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate, simulate_tangents
 

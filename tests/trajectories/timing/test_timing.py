@@ -9,7 +9,7 @@ from planned import CHAIN, WAYPOINTS, Cart, cart_limits, limits, lwr
 
 from calib.dynamics.model import model as pinocchio_model
 from calib.robot.chain import random_joints
-from calib.simulation.cells.known_robots import truth
+from calib.rooms.cells.known_robots import truth
 from trajectories.errors import BadInput, NothingFeasible
 from trajectories.timing.path import spline
 from trajectories.timing.profile import track

@@ -1,0 +1,63 @@
+"""What the rooms of `calib.rooms` add to the core, which imports none of them: found by folder, loaded at first use.
+
+A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and where, as ``module:name`` below the room
+(``:name`` for the package itself). The core asks for
+
+    commands               typer apps of `calib`
+    topics, schemas        of `calib formats`: see `calib.procedure.formats`
+    methods                of identification: tuples of `calib.identification.methods.method.MethodEntry`
+    robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
+    stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
+    detect_boards, estimate_lens   of images: see `calib.rooms.camera`
+    recordings             functions: a session's folder → the name of the recording written there
+
+A room that is deleted takes its commands, methods and robots along; the rest works without.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+from calib.errors import UsageError
+
+ROOMS = "calib.rooms"
+
+
+def offered(what: str) -> list[Any]:
+    """Return what all rooms offer under a name, in the order of the rooms' names."""
+    return [_loaded(room, places[what]) for room, places in _offers().items() if what in places]
+
+
+def merged(what: str) -> dict[str, Any]:
+    """Return the tables that rooms offer under a name, as one."""
+    return {key: value for table in offered(what) for key, value in table.items()}
+
+
+def needed(what: str) -> Any:
+    """Return what one room offers under a name.
+
+    Raises:
+        UsageError: where no room offers it.
+    """
+    for each in offered(what):
+        return each
+    raise UsageError(f"{what.replace('_', ' ')}: no package of {ROOMS} offers it; is the installation complete?")
+
+
+@cache
+def _offers() -> dict[str, dict[str, str]]:
+    """Return the table of each room, by the room's full name."""
+    try:
+        package = import_module(ROOMS)
+    except ImportError:
+        return {}
+    names = sorted(f"{ROOMS}.{each.name}" for each in pkgutil.iter_modules(package.__path__))
+    return {name: import_module(name).OFFERS for name in names}
+
+
+def _loaded(room: str, place: str) -> Any:
+    module, _, name = place.rpartition(":")
+    return getattr(import_module(f"{room}.{module}" if module else room), name)

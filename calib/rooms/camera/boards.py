@@ -1,0 +1,142 @@
+"""Boards to print, and a first look at images of them, for people: what `calib board` and `calib images` say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.camera import board as boards
+from calib.data.camera.board import KINDS, Board
+from calib.data.camera.corner_file import Found
+from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
+from calib.errors import CalibError, MeasurementError, UsageError
+from calib.procedure.measuring.image_findings import coverage_words
+
+Show = Callable[[str], None]
+USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
+SMALLEST = 1.0  # side of a square [mm]
+
+
+def make(
+    out: Path, kind: str, columns: int | None, rows: int, square: float, marker: float | None, words: str | None,
+    paper: str | None, overwrite: bool = False,
+) -> list[str]:  # fmt: skip
+    """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return what to do with them.
+
+    Args:
+        out: folder.
+        kind, columns, rows, words, paper: see `calib.data.camera.board`; a dictionary, and the paper's name. None: the
+            usual ones.
+        square, marker: [mm].
+        overwrite: replace another board that is there, whose squares somebody may have measured.
+
+    Raises:
+        UsageError: for a board that cannot be, or does not fit onto its paper, and for another that is there already.
+    """
+    from calib.rooms.camera import board_print
+    from calib.rooms.camera.detection import FEWEST
+
+    if kind not in KINDS:
+        raise UsageError(f"--kind {kind}: expected one of {', '.join(KINDS)}")
+    if paper is not None and paper.lower() not in board_print.PAPERS:
+        raise UsageError(f"--paper {paper}: expected one of {', '.join(board_print.PAPERS)}")
+    if square < SMALLEST:
+        raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
+    usual, share, across = USUAL[kind]
+    try:
+        side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
+        made = Board(kind, columns or across, rows, side, between, words or usual).checked()
+        if (count := len(boards.corners(made))) < FEWEST:
+            raise UsageError(f"a {made.words} has {count} corners; an image counts from {FEWEST} on: more squares")
+        size = board_print.page_size(made, (paper or "").lower())
+    except ValueError as error:
+        raise UsageError(f"this board cannot be: {error}") from None
+    there = out / boards.FILE
+    if not overwrite and there.exists() and not _as_printed(out):
+        raise UsageError(
+            f"{there} is not as it was printed: somebody measured its squares, or it is another's; nothing changed. "
+            "Take another folder (--out), or say --overwrite"
+        )
+    files.write(out / "board.pdf", board_print.pdf(made, size))
+    files.write(out / "board.svg", board_print.svg(made, size))
+    boards.write_board(made, out / boards.FILE)
+    wide, high = (round(1e3 * length) for length in size)
+    return [
+        f"{made.words}, {len(boards.corners(made))} corners, on a page of {wide} x {high} mm: {out / 'board.pdf'}",
+        "print it at 100 % (not fitted to the page), check the ruler, glue it onto glass or aluminium; then measure "
+        f"several squares together and put the size of one into {out / boards.FILE}: the robot's lengths get their "
+        "scale from it",
+    ]
+
+
+def _as_printed(out: Path) -> bool:
+    """Tell whether a folder's ``board.toml`` is that of its ``board.svg``, as `make` left both."""
+    from calib.rooms.camera import board_print
+
+    try:
+        found, drawn = boards.read_board(out), (out / "board.svg").read_bytes()
+        sizes = []
+        for paper in ("", *board_print.PAPERS):
+            with suppress(ValueError):  # a paper that it does not fit onto
+                sizes.append(board_print.page_size(found, paper))
+        drawings = (board_print.svg(found, size) for size in dict.fromkeys(sizes))
+        return any((one.encode() if isinstance(one, str) else one) == drawn for one in drawings)
+    except (OSError, ValueError, CalibError):
+        return False
+
+
+def look(folder: Path, show: Show) -> list[str]:
+    """Look at the images of a folder; return what was found, in sentences."""
+    board = read_own_board(folder)
+    names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
+    found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
+    return _summary(found, board, names)
+
+
+def _images(folder: Path) -> list[str]:
+    from calib.rooms.camera.images import SUFFIXES
+
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not names:
+        raise UsageError(f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})")
+    return names
+
+
+def _summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
+    """Return what was found in images, in sentences: how many are of use, why others are not, what they cover.
+
+    Raises:
+        MeasurementError: where none is of use, with the reasons.
+    """
+    kept = [one for one in found.images.values() if not one.problem]
+    total = len(boards.corners(board))
+    problems = problem_words({name: one.problem for name, one in found.images.items()})
+    if not kept:
+        raise MeasurementError("; ".join([f"none of {len(list(names))} images is of use ({board.words})", *problems]))
+    seen = np.array([one.seen.sum() for one in kept])
+    sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
+    edge = float(np.nanmedian([one.edge for one in kept]))
+    lines = [
+        f"{len(kept)} of {len(list(names))} images are of use ({board.words})",
+        f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide",
+    ]
+    if found.size[0]:
+        lines.append(coverage_words(np.concatenate([one.pixel[one.seen] for one in kept]), found.size))
+    return [*lines, *problems]
+
+
+def from_bag(
+    bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Show
+) -> list[str]:
+    """Make a folder of images' corners and joint values from a bag; return what was found, in sentences."""
+    from calib.rooms.camera.image_bags import read_image_bag, write_image_folder
+
+    made = boards.read_board(board)
+    found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
+    write_image_folder(found, made, out)
+    lines = _summary(found.corners, made, found.names)
+    return [*lines, *found.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

@@ -1,0 +1,83 @@
+"""A camera as the instrument: board, images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.options import command
+from calib.cli.shared import Out, Overwrite, progress, say
+
+app = typer.Typer()
+Millimetres = typer.Option(metavar="MM")
+
+
+@command(app)
+def board(
+    out: Out,
+    kind: str = "charuco",
+    columns: int | None = None,
+    rows: int = 7,
+    square: Annotated[float, Millimetres] = 30.0,
+    marker: Annotated[float | None, Millimetres] = None,
+    dictionary: str | None = None,
+    paper: str | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a board to print at true scale; a ruler checks the print.
+
+    ChArUco is the one to take: seen in part it still counts, and its corners are found to hundredths of a pixel; the
+    corners of tags ten times worse. Print at 100 %, glue it onto something flat, measure a square, correct board.toml.
+
+    Args:
+        out: folder for board.toml, board.pdf and board.svg
+        kind: charuco, chessboard or apriltag (a grid)
+        columns: squares (tags) across; by default 9, of a chessboard 10
+        rows: squares (tags) down
+        square: side of a square (tag), in mm
+        marker: side of a marker; of apriltag the gap between tags
+        dictionary: of the markers: 4x4_50 to 7x7_1000, apriltag_36h11
+        paper: a4, a3, a2, a1 or a0; by default the smallest that fits
+    """
+    from calib.rooms.camera import boards
+
+    for line in boards.make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
+        say(line)
+
+
+@command(app)
+def images(
+    source: Path,
+    board: Path | None = None,
+    out: Path | None = None,
+    image_topic: str | None = None,
+    joint_topic: str | None = None,
+) -> None:
+    """Find the board in images or a bag; say which are useless. A bag's images become a folder.
+
+    A folder that was looked at holds corners.csv, and goes where a CSV file of measured poses goes: calib fit ROBOT
+    FOLDER. See calib formats images.
+
+    Args:
+        source: a folder of images with board.toml, or a ROS bag / MCAP file
+        board: board.toml, of a bag
+        out: folder to write images' corners and joints into, of a bag
+        image_topic: of a bag with several cameras
+        joint_topic: of a bag with several robots
+    """
+    from calib.errors import UsageError
+    from calib.rooms.camera import boards
+
+    with progress() as show:
+        if source.is_dir() and (source / "board.toml").exists():
+            lines = boards.look(source, show)
+        elif not source.exists():
+            raise UsageError(f"{source}: no such file or folder")
+        elif board is None or out is None:
+            raise UsageError(f"{source} has no board.toml; of a bag --board and --out are needed")
+        else:
+            lines = boards.from_bag(source, board, out, image_topic, joint_topic, show)
+    for line in lines:
+        say(line)

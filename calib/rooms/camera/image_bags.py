@@ -1,0 +1,194 @@
+"""Images of a board from ROS 1 and 2 bags and MCAP: sensor_msgs/Image and CompressedImage beside JointState.
+
+Every image takes the joint values at its own stamp, between the joint states before and after it. An image during which
+a joint moved faster than `STILL` is left out: its joint values are not those of its exposure. Of images taken at one
+stop of the arm the first `SAME` are kept. What is kept is written as a folder (``calib images BAG --board board.toml
+--out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.data.camera import board as boards
+from calib.data.camera import corner_file
+from calib.data.camera.board import Board
+from calib.data.camera.corner_file import Found
+from calib.data.poses.image_folders import JOINTS
+from calib.errors import MeasurementError, require, suggestion
+from calib.rooms.camera.detection import detected
+
+IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
+JOINT = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
+STILL = 2e-3  # of a joint about an image [rad/s or m/s]; this and the next two: our choice
+Say = Callable[[int, str], None]
+APART = 1e-3  # joints of one stop differ by less [rad or m]
+SAME = 3  # images of one stop that are kept
+LATE = 0.1  # an image further from the nearest joint state has none [s]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBag:
+    """What a bag's images come to.
+
+    Attributes:
+        names: of the images kept.
+        joint_names: as in the bag.
+        q: (m, n) joint values of the images kept [rad or m].
+        corners: what was found in them.
+        notes: what was left out.
+    """
+
+    names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    q: np.ndarray
+    corners: Found
+    notes: tuple[str, ...]
+
+
+def read_image_bag(
+    path: Path,
+    board: Board,
+    image_topic: str = "",
+    joint_topic: str = "",
+    say: Callable[[int, str], None] | None = None,
+) -> ImageBag:
+    """Read images and joint states of a bag, and look for the board.
+
+    Args:
+        path: of the bag (a file, or the folder of a ROS 2 bag).
+        board: to look for.
+        image_topic, joint_topic: where there are several.
+        say: called with the number and the name of each image.
+
+    Raises:
+        MeasurementError: where it cannot be read, a topic is missing, or no image was taken at rest.
+    """
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            names, stamps, q = _joints(reader, _topic(reader, JOINT, joint_topic, "joint states", path), path)
+            connections = _topic(reader, IMAGE, image_topic, "images", path)
+            chosen, own, notes = _at_rest(_image_stamps(reader, connections), stamps, q)
+            require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
+            images = _images(reader, connections, set(chosen.tolist()))
+            labels = [f"image {k + 1}" for k in chosen]
+            found = detected(
+                zip(labels, images), board, len(labels), None if say is None else lambda k, _, name: say(k, name)
+            )
+    except MeasurementError:
+        raise
+    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
+        raise MeasurementError(f"cannot be read as a ROS bag ({error}): was it closed properly?", path) from error
+    return ImageBag(tuple(labels), names, own, found, tuple(notes))
+
+
+def _topic(reader: Any, kinds: tuple[str, ...], wanted: str, what: str, path: Path) -> list[Any]:
+    """Return the connections of the one topic of some kinds, or of the one wanted."""
+    known = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
+    if not known:
+        raise MeasurementError(f"has no topic of {what} ({' or '.join(kinds[:2])})", path)
+    if wanted and wanted not in known:
+        raise MeasurementError(f"has no {what} on '{wanted}'{suggestion(wanted, known)}; on {', '.join(known)}", path)
+    if not wanted and len(known) > 1:
+        raise MeasurementError(f"has {what} on {', '.join(known)}: say on which (--image-topic, --joint-topic)", path)
+    return [c for c in reader.connections if c.topic == (wanted or known[0]) and c.msgtype in kinds]
+
+
+def _stamp(message: Any, logged: int) -> int:
+    own = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+    return own or logged
+
+
+def _joints(reader: Any, connections: list[Any], path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    names, stamps, rows = (), [], []
+    for connection, logged, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        names = names or tuple(message.name)
+        if set(names) <= set(message.name):
+            order = [list(message.name).index(name) for name in names]
+            stamps.append(_stamp(message, logged))
+            rows.append(np.asarray(message.position)[order])
+    require(len(rows) >= 2, f"{len(rows)} joint states are too few to pair images with", MeasurementError, path)
+    place = np.argsort(stamps, kind="stable")
+    return names, np.array(stamps)[place], np.array(rows)[place]
+
+
+def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
+    return np.array(
+        [
+            _stamp(reader.deserialize(raw, c.msgtype), logged)
+            for c, logged, raw in reader.messages(connections=connections)
+        ]
+    )
+
+
+def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
+    """Yield the wanted images as grey levels, one by one, in their order."""
+    for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
+        if number in wanted:
+            yield _grey(reader.deserialize(raw, connection.msgtype))
+
+
+def _grey(message: Any) -> np.ndarray:
+    from calib.rooms.camera.images import decode, to_grey
+
+    if hasattr(message, "format"):
+        return decode(bytes(message.data))
+    kinds = {"mono8": (np.uint8, 1), "8UC1": (np.uint8, 1), "mono16": (np.uint16, 1), "16UC1": (np.uint16, 1)}
+    kinds |= {name: (np.uint8, 3) for name in ("bgr8", "rgb8", "8UC3")} | {
+        "bgra8": (np.uint8, 4),
+        "rgba8": (np.uint8, 4),
+    }
+    if message.encoding not in kinds:
+        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(kinds)}")
+    kind, depth = kinds[message.encoding]
+    order = ">" if message.is_bigendian else "<"
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    flat = np.ascontiguousarray(rows[:, : message.width * depth * np.dtype(kind).itemsize])
+    values = flat.view(np.dtype(kind).newbyteorder(order)).astype(kind).reshape(message.height, message.width, depth)
+    if message.encoding.startswith("rgb"):
+        values = values[:, :, 2::-1]
+    return to_grey(values[:, :, 0] if depth == 1 else values)
+
+
+def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the numbers of images taken at rest, their joint values, and what is to be said of the others."""
+    notes = []
+    after = np.clip(np.searchsorted(stamps, images), 1, len(stamps) - 1)
+    before = after - 1
+    gap = np.maximum(stamps[after] - stamps[before], 1)
+    share = np.clip((images - stamps[before]) / gap, 0.0, 1.0)[:, None]
+    own = q[before] * (1.0 - share) + q[after] * share
+    near = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < LATE * 1e9
+    speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
+    still = speed < STILL
+    if not near.all():
+        notes.append(f"{int((~near).sum())} images have no joint state within {LATE:g} s (do the clocks agree?)")
+    if moving := int((near & ~still).sum()):
+        notes.append(f"{moving} images were taken while the arm moved (faster than {1e3 * STILL:g} mrad/s): left out")
+    kept, stop = [], 0
+    for k in np.flatnonzero(near & still):
+        stop = stop + 1 if kept and np.abs(own[k] - own[kept[-1]]).max() < APART else 1
+        if stop <= SAME:
+            kept.append(int(k))
+    if more := int((near & still).sum()) - len(kept):
+        notes.append(f"{more} more images of the same stops were left out ({SAME} of each are kept)")
+    return np.array(kept, dtype=int), own[kept], notes
+
+
+def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
+    """Write what a bag came to as a folder that `calib.data.poses.image_folders` reads."""
+    boards.write_board(board, folder / boards.FILE)
+    rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
+    files.write_table(folder / JOINTS, ["image", *found.joint_names], rows)
+    corner_file.write_corners(folder / corner_file.FILE, found.corners)
+    return folder

@@ -1,0 +1,259 @@
+"""A virtual cell with a camera: the arm as it really is, camera and board where they really are, and images of them.
+
+Corners are either projected, with white noise (`photograph`), or found in rendered images (`take_pictures`), which have
+everything that real images have: see `calib.rooms.cells.rendered_camera`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib import files
+from calib.data.camera import board as boards
+from calib.data.camera.board import Board, corners
+from calib.data.camera.lens import Lens
+from calib.data.poses.image_folders import JOINTS
+from calib.data.poses.pixels import IN_HAND, Pixels
+from calib.errors import CannotSimulate
+from calib.geometry.images.optics import BoardShape, Optics, shaped_points
+from calib.geometry.installation import Installation
+from calib.geometry.inverse import Goal, reach, seen_at
+from calib.robot.chain import Chain, random_joints
+from calib.robot.deflection import Deflection
+from calib.robot.kinematics import forward
+from calib.rooms.cells.cell import Cell, true_poses
+from calib.transforms import invert, pose
+from calib.units import JOINT
+
+if TYPE_CHECKING:
+    from calib.rooms.cells.rendered_camera import Imaging
+
+BOARD = Board("charuco", 9, 7, 0.03, 0.021)
+FIVE_MEGAPIXEL = Lens(
+    "pinhole", np.array([2400.0, 2405.0, 1220.0, 1010.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (2448, 2048)
+)  # an 8 mm lens before 3.45 µm pixels, about
+RANGE, TILT = (0.35, 0.8), 0.7  # distance [m] and largest tilt [rad] of what is looked at; our choice
+TRIES = 40
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCell:
+    """A cell with one camera and one board.
+
+    Attributes:
+        cell: the arm, and where camera and board are; its truth has `Installation.optics`.
+        board: as its file says.
+        mounting: ``in hand`` or ``to hand``.
+    """
+
+    cell: Cell
+    board: Board
+    mounting: str
+
+    @property
+    def lens(self) -> Lens:
+        """The true lens."""
+        return self.cell.truth.optics.lenses[0]
+
+    @property
+    def shape(self) -> BoardShape:
+        """The board as it was printed."""
+        return self.cell.truth.optics.boards[0]
+
+
+@dataclass(frozen=True)
+class Views:
+    """Which views of the board are sought: its distance [m], tilt [rad] at most, and whether all of it is in view."""
+
+    distance: tuple[float, float] = RANGE
+    tilt: float = TILT
+    whole: bool = True
+
+
+def camera_cell(
+    cell: Cell,
+    mounting: str = IN_HAND,
+    *,
+    board: Board = BOARD,
+    lens: Lens = FIVE_MEGAPIXEL,
+    shape: BoardShape | None = None,
+    reach_of_arm: float | None = None,
+) -> CameraCell:
+    """Return a virtual cell whose instrument is a camera.
+
+    Args:
+        cell: whose arm it is; its instrument is left out but for the noise of the encoders.
+        mounting: what the arm carries: the camera (``in hand``) or the board (``to hand``).
+        board, lens, shape: the board, the camera, and how the print differs.
+        reach_of_arm: how far the arm's workspace reaches [m]; None to find out.
+    """
+    arm = cell.truth.chain
+    far = reach_of_arm or _reach(arm)
+    middle = 0.5 * np.array([*board.extent, 0.0])
+    optics = Optics((lens,), ("camera",), (shape or BoardShape(),), ("board",))
+    if mounting == IN_HAND:  # the board lies on a table beside the base, facing up
+        place = pose(Rotation.from_euler("x", np.pi), np.array([0.55 * far, 0.0, 0.0])) @ pose(None, -middle)
+        station, names = invert(place), ("board", "camera")
+        tool = pose(Rotation.from_euler("xyz", [0.05, -0.1, 0.6]), [0.04, 0.02, 0.06])
+    else:  # the camera stands beyond the workspace and looks at the base's axis
+        eye = np.array([1.2 * far, -0.15 * far, 0.65 * far])
+        station, names = invert(_looking(eye, np.array([0.35 * far, 0.0, 0.35 * far]))), ("camera", "board")
+        tool = pose(Rotation.from_euler("xyz", [0.1, 0.15, 0.3]), [0.02, 0.03, 0.05]) @ pose(None, -middle)
+    truth = Installation(
+        arm, station[None], tool[None], names[:1], names[1:], deflection=cell.truth.deflection, optics=optics
+    )
+    note = f"{cell.note}; a camera {mounting} sees a {board.words}"
+    return CameraCell(replace(cell, truth=truth, note=note), board, mounting)
+
+
+def _reach(chain: Chain) -> float:
+    return float(np.quantile(np.linalg.norm(forward(chain, random_joints(chain, 500, 0))[:, :3, 3], axis=1), 0.9))
+
+
+def _looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return the pose of a camera at `eye` (3,) [m] that looks at a point, its x level."""
+    ahead = (at - eye) / np.linalg.norm(at - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return pose(np.column_stack([right, np.cross(ahead, right), ahead]), eye)
+
+
+def board_poses(found: CameraCell, q: np.ndarray) -> np.ndarray:
+    """Return the board's true poses (m, 4, 4) in the camera's frame."""
+    poses = true_poses(found.cell, q)
+    return invert(poses) if found.mounting == IN_HAND else poses
+
+
+def views(
+    found: CameraCell,
+    count: int,
+    seed: int | np.random.Generator = 0,
+    sought: Views | None = None,
+    free: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> np.ndarray:
+    """Return joint values (count, n) within the limits at which the camera sees the board, at random.
+
+    Args:
+        found: the cell.
+        count: how many.
+        seed: of the draw.
+        sought: which views.
+        free: q (m, n) -> (m,) bool, where the arm may be; None for anywhere.
+
+    Raises:
+        CannotSimulate: where hardly any are found.
+    """
+    sought, rng, arm = sought or Views(), np.random.default_rng(seed), found.cell.nominal
+    lower, upper = arm.sampling_limits()
+    goal = Goal(replace(found.cell.truth, chain=arm, deflection=Deflection()), 6, lower, upper)
+    result = np.zeros((0, arm.n))
+    for _ in range(TRIES):
+        wanted = _random_views(found, 4 * count, rng, sought)
+        targets = invert(wanted) if found.mounting == IN_HAND else wanted
+        q = reach(goal, targets, rng.uniform(lower, upper, (len(targets), arm.n)), 40)
+        there = np.linalg.norm(seen_at(goal, q).poses() - targets, axis=(1, 2)) < 1e-3
+        q = q[there]
+        seen = visible(found, q)
+        q = q[seen.all(axis=1) if sought.whole else seen.sum(axis=1) >= 12]
+        result = np.concatenate([result, q if free is None else q[free(q)]])
+        if len(result) >= count:
+            return result[:count]
+    raise CannotSimulate(f"the camera sees the board at hardly any posture of the arm ({len(result)} of {count} found)")
+
+
+def _random_views(found: CameraCell, count: int, rng: np.random.Generator, sought: Views) -> np.ndarray:
+    """Return random poses (count, 4, 4) of the board before the camera, its middle well in the image."""
+    lens, middle = found.lens, 0.5 * np.array([*found.board.extent, 0.0])
+    if found.mounting != IN_HAND:
+        sought = replace(sought, distance=(2.0 * sought.distance[0], 3.0 * sought.distance[1]))
+    turn = Rotation.from_rotvec(np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0]))
+    about = rng.uniform(-np.pi, np.pi, count)
+    lean = sought.tilt * np.sqrt(rng.uniform(0.0, 1.0, count))
+    tilt = Rotation.from_rotvec(lean[:, None] * np.column_stack([np.cos(about), np.sin(about), np.zeros(count)]))
+    rotation = (tilt * turn).as_matrix()
+    depth = rng.uniform(*sought.distance, count)
+    share = rng.uniform(-0.7, 0.7, (count, 2)) * 0.5 * np.array(lens.size) / lens.values[:2]
+    place = np.column_stack([share * depth[:, None], depth])
+    return pose(rotation, place - rotation @ middle)
+
+
+def visible(found: CameraCell, q: np.ndarray) -> np.ndarray:
+    """Say which corners (m, K) fall into the image and face the camera at joint values q (m, n)."""
+    poses = board_poses(found, q)
+    flat = _points(found, poses).reshape(-1, 3)
+    facing = np.einsum("mi,mi->m", poses[:, :3, 2], poses[:, :3, 3]) > 0.0
+    return found.lens.in_sight(flat, 6.0).reshape(len(q), len(corners(found.board))) & facing[:, None]
+
+
+def _points(found: CameraCell, poses: np.ndarray) -> np.ndarray:
+    table = shaped_points(found.board, found.shape, corners(found.board))
+    return np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
+
+
+def photograph(
+    found: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
+) -> Pixels:
+    """Return the corners seen at q (m, n), each with white noise [px]; the lens is left to be found.
+
+    The recorded joints carry the encoders' noise.
+    """
+    rng, names = np.random.default_rng(seed), found.cell.truth
+    seen, points = visible(found, q), _points(found, board_poses(found, q))
+    flat = np.where(seen.reshape(-1, 1), points.reshape(-1, 3), [0.0, 0.0, 1.0])
+    pixel = found.lens.project(flat).reshape(*seen.shape, 2)
+    pixel = np.where(seen[:, :, None], pixel + rng.normal(0.0, noise, pixel.shape), np.nan)
+    own = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
+    free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    return Pixels(
+        own, found.cell.nominal.joint_names, pixel, found.board, None, sigma=np.full(seen.shape, max(noise, 1e-3)),
+        station=names.station_names[0], tool_names=names.tool_names, size=found.lens.size, file=file, free=free,
+        names=tuple(f"{k + 1:04}.png" for k in range(len(q))),
+    )  # fmt: skip
+
+
+def take_pictures(
+    found: CameraCell,
+    q: np.ndarray,
+    folder: Path,
+    imaging: Imaging | None = None,
+    seed: int = 0,
+    moving: np.ndarray | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Path:
+    """Render what the camera sees at q (m, n) into a folder of images with ``joints.csv`` and ``board.toml``.
+
+    Args:
+        found: the cell.
+        q: joint values [rad or m]; recorded with the encoders' noise.
+        folder: to write into.
+        imaging: light, focus and noise.
+        seed: of all noise.
+        moving: (m, n) how far the joints move during the exposure [rad or m]; None: the arm stands still.
+        say: called with each image's name.
+    """
+    from calib.rooms.camera.images import write_image
+    from calib.rooms.cells.rendered_camera import render
+
+    boards.write_board(found.board, folder / boards.FILE)
+    rng = np.random.default_rng([seed, 11])
+    recorded = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
+    names = [f"{k + 1:04}.png" for k in range(len(q))]
+    for k, name in enumerate(names):
+        if say:
+            say(name)
+        way = q[k : k + 1]
+        if moving is not None and moving[k].any():
+            way = q[k] + np.linspace(-0.5, 0.5, 7)[:, None] * moving[k]
+        poses, noise = board_poses(found, way), np.random.default_rng([seed, k])
+        write_image(folder / name, render(found.board, found.lens, poses, imaging, noise, found.shape))
+    units = [JOINT[joint.kind] for joint in found.cell.nominal.joints]
+    heads = [f"{each} [{unit}]" for each, (_, unit) in zip(found.cell.nominal.joint_names, units)]
+    rows = [[name, *map(float, row * [factor for factor, _ in units])] for name, row in zip(names, recorded)]
+    files.write_table(folder / JOINTS, ["image", *heads], rows)
+    return folder

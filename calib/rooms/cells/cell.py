@@ -1,0 +1,161 @@
+"""A robot cell with known truth: the arm as it really is, and the instrument that looks at it.
+
+    y_i = S_true · arm_true(q_i + δ(q_i)) · X_true · noise,     q_recorded = q_i + encoder noise,
+
+δ being what no rigid geometry holds: compliance under gravity and gear harmonics, which a richer model can, and what
+none can (`unmodelled`). With LEDs on the base the instrument
+sees the base, too, and reports the tool in the base LEDs' frame: B_i⁻¹ y_i, so that both frames' noises count and the
+base's orientation noise acts with the lever between the two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.arrays import shaped
+from calib.data.poses.measurements import Poses, Positions
+from calib.dynamics.gravity import gravity_torques
+from calib.geometry.installation import Installation, see
+from calib.robot.chain import Chain
+from calib.robot.deflection import evaluate
+from calib.rooms.cells.unmodelled import PositionErrors, displacements, drooping
+from calib.transforms import invert, pose
+
+
+@dataclass(frozen=True)
+class SimulatedInstrument:
+    """An instrument that sees frames (or points), with white noise.
+
+    Attributes:
+        name: for messages and certificates.
+        position_sigma: per axis [m].
+        orientation_sigma: about each axis [rad]; None where it sees points only.
+        drift: how far the instrument wanders over one series [m], evenly with the row number.
+        outlier_share: share of rows with a gross error.
+        outlier_size: length of a gross error [m].
+        encoder_sigma: of the recorded joint values [rad or m].
+        base_frame: pose (4, 4) of the base LEDs in the arm's base; None where there are none.
+    """
+
+    name: str = "optical CMM"
+    position_sigma: float = 60e-6
+    orientation_sigma: float | None = 0.2e-3
+    drift: float = 0.0
+    outlier_share: float = 0.0
+    outlier_size: float = 5e-3
+    encoder_sigma: float = 1e-5
+    base_frame: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A cell with one station and one tool.
+
+    Attributes:
+        nominal: what the engineer is told the arm is.
+        truth: what it is, where it stands, what the tool is, and how its joints deflect; hidden from a calibration.
+        instrument: what measures.
+        note: what the truth is made of, in a sentence.
+        unmodelled: errors that no parameter of a calibration holds.
+    """
+
+    nominal: Chain
+    truth: Installation
+    instrument: SimulatedInstrument = field(default_factory=SimulatedInstrument)
+    note: str = ""
+    unmodelled: PositionErrors = field(default_factory=PositionErrors)
+
+
+def true_poses(cell: Cell, q: np.ndarray, hidden: bool = True, warm: float = np.inf) -> np.ndarray:
+    """Return the tool's poses (m, 4, 4) in the station's frame, without noise.
+
+    Args:
+        cell: the cell.
+        q: (m, n) joint values in the order in which the arm takes them [rad or m].
+        hidden: with deflections and unmodelled errors; without, the rigid truth.
+        warm: how many poses the arm has moved to before; infinite for a warm arm.
+    """
+    q = shaped(q, (None, cell.truth.chain.n), "joint values")
+    arm = cell.truth.chain
+    torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
+    bases = evaluate(cell.truth.deflection, q, torque)
+    if not hidden:
+        return see(cell.truth, q, bases=np.zeros_like(bases)).poses()
+    beyond = displacements(cell.unmodelled, arm, q, torque, warm)
+    seen = see(cell.truth, q, bases=bases, given=beyond).poses()
+    return drooping(cell.unmodelled, arm, seen, cell.truth.stations[0])
+
+
+def measure(
+    cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated", warm: float = np.inf
+) -> Positions:
+    """Measure the poses q (m, n) [rad or m] once each, in their order.
+
+    Args:
+        cell: the cell.
+        q: where the robot is sent; the encoders' reading of it is what is recorded.
+        seed: of the noise.
+        file: the name the measurement carries.
+        warm: how many poses the arm has moved to before; infinite for a warm arm.
+
+    Returns:
+        Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
+    """
+    rng, instrument = np.random.default_rng(seed), cell.instrument
+    seen = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
+    sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
+    if instrument.base_frame is not None:
+        base = cell.truth.stations[0] @ instrument.base_frame
+        seen = invert(_noisy(np.broadcast_to(base, seen.shape), instrument, rng)) @ seen
+        sigma, sigma_rotation = _stated(instrument, seen[:, :3, 3], frames=2)
+    seen[:, :3, 3] += _gross_errors(instrument, len(q), rng)
+    common: dict[str, Any] = {
+        "sigma": sigma, "station": cell.truth.station_names[0], "tool_names": cell.truth.tool_names, "file": file,
+    }  # fmt: skip
+    q, names = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)), cell.nominal.joint_names
+    if instrument.orientation_sigma is None:
+        return Positions(q, names, seen[:, :3, 3], **common)
+    turns = Rotation.from_matrix(seen[:, :3, :3]).as_quat(canonical=True)
+    return Poses(q, names, seen[:, :3, 3], turns, sigma_rotation=sigma_rotation, **common)
+
+
+def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
+    """Return positions as an instrument sees them that wanders by `drift` [m] from `begin` (0 to 1) to the series' end.
+
+    The direction is the seed's, so that several series can share it.
+    """
+    direction = np.random.default_rng([seed, 5]).standard_normal(3)
+    way = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
+    return replace(measured, position=measured.position + drift * way)
+
+
+def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:
+    """Return poses (m, 4, 4) as seen: noise along and about the instrument's axes."""
+    m = len(poses)
+    turn = Rotation.from_rotvec(rng.normal(0.0, instrument.orientation_sigma or 0.0, (m, 3))).as_matrix()
+    shift = rng.normal(0.0, instrument.position_sigma, (m, 3))
+    return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + shift)
+
+
+def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return sigmas of position [m] and orientation [rad], each (m, 3).
+
+    Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
+    """
+    turning = instrument.orientation_sigma or 0.0
+    across = (lever**2).sum(axis=1, keepdims=True) - lever**2
+    sigma = np.sqrt(frames * instrument.position_sigma**2 + turning**2 * across)
+    return sigma, np.full(lever.shape, turning * np.sqrt(frames))
+
+
+def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Generator) -> np.ndarray:
+    """Return drift and outliers of m rows (m, 3) [m]."""
+    directions = rng.normal(size=(m + 1, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    wandering = instrument.drift * np.linspace(0.0, 1.0, m)[:, None] * directions[-1]
+    hit = rng.uniform(size=m) < instrument.outlier_share
+    return wandering + instrument.outlier_size * hit[:, None] * directions[:-1]

@@ -1,0 +1,55 @@
+"""A calibration of a simulated robot: demo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.options import command
+from calib.cli.shared import Plots, Seed, exit_failed, reporting
+from calib.errors import command_line
+
+app = typer.Typer()
+
+
+@command(app)
+def demo(
+    out: Path = Path("calib-demo"),
+    robot: str = "lwr4plus",
+    geometry_only: Annotated[bool, typer.Option("--geometry-only")] = False,
+    instrument: str = "cmm",
+    guided: Annotated[bool, typer.Option("--guided")] = False,
+    bring: Path | None = None,
+    seed: Seed = 0,
+    plots: Plots = True,
+) -> None:
+    """Calibrate a simulated robot; compare with the hidden truth.
+
+    Args:
+        out: the session's folder
+        robot: a robot of the library
+        geometry_only: leave the dynamics out
+        instrument: cmm, or camera: rendered images of a board
+        guided: stop where an engineer would
+        bring: let the simulated cell bring what this session waits for
+    """
+    from calib.rooms.cells import demo as demonstration
+
+    with reporting() as (say, progress):
+        if bring is not None:
+            demonstration.simulate_next(bring, say)
+            return
+        found = demonstration.run(
+            out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided, plots=plots,
+            instrument=instrument,
+        )  # fmt: skip
+    say("", *found.asks)
+    if found.results:
+        say(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at")
+    for words, name in found.results:
+        place, folder = found.session.folder / name, found.session.folder
+        how = f"  ({command_line(place, program='rerun')}, or {command_line('view', folder)})"
+        say(f"  {words:15} {place}{how if words == 'to play' else ''}")
+    exit_failed(found.verdict)

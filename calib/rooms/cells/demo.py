@@ -1,0 +1,265 @@
+"""The demonstration: a session on a simulated cell, ended by a comparison with the truth it did not know."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.poses.pixels import Pixels
+from calib.data.poses.plans import read_poses
+from calib.errors import SessionError, UsageError, command_line
+from calib.estimate_files import read_estimate
+from calib.folders import CERTIFICATE
+from calib.geometry import installation_file
+from calib.identification.model_file import read_dynamics
+from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.session import dynamics_steps, steps
+from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
+from calib.records import read_lines
+from calib.robot import calibrated, library
+from calib.robot.load import load
+from calib.rooms.cells import camera_files, measured_files
+from calib.rooms.cells.cell import Cell, measure, wandering
+from calib.rooms.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
+from calib.rooms.cells.virtual_arm import REST, MovingArm, moving_arm, play, record
+from calib.rooms.cells.virtual_cells import virtual_cell
+from calib.rooms.viewer import viewer
+
+Say = Callable[[str], None]
+FIT, VALIDATION, AGAIN = 40, 20, 3
+DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
+MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
+SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
+LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demonstration came to: the session, its verdict ("" where it stopped), what to look at, and how long.
+
+    Attributes:
+        asks: what to do now, where it stopped for an engineer.
+        nominal, calibrated: errors against the hidden truth, rms [mm]; NaN where it stopped.
+        memory: largest resident set [MB].
+    """
+
+    session: Session
+    verdict: str
+    results: tuple[tuple[str, str], ...]
+    seconds: float
+    asks: tuple[str, ...] = ()
+    nominal: float = float("nan")
+    calibrated: float = float("nan")
+    memory: float = 0.0
+
+
+def run(
+    folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False,
+    plots: bool = True, instrument: str = "cmm",
+) -> DemoResult:  # fmt: skip
+    """Calibrate a simulated robot in a session, and compare with its hidden truth.
+
+    Args:
+        folder: new; the session.
+        robot: of the library.
+        seed: of the robot's errors, the noise, the pose selection and the motions.
+        say, progress: lines that stay, and words that pass.
+        dynamics: identify them, too, where the library knows the robot's masses.
+        guided: stop where an engineer would; `simulate_next` then plays his part.
+        plots: whether figures are drawn.
+        instrument: ``cmm``, or ``camera``, which takes rendered images.
+    """
+    if instrument not in ("cmm", "camera"):
+        raise UsageError(f"--instrument {instrument}: the demonstration has cmm and camera")
+    started = time.perf_counter()
+    cell = virtual_cell(robot, seed)
+    if dynamics and cell.nominal.inertias is None:
+        known = ", ".join(name for name in library.names() if load(name).inertias is not None)
+        say(
+            f"geometry only: the library holds no masses for {robot}, so its motion cannot be simulated (of {known} "
+            "it can)"
+        )
+        dynamics = False
+    motion = MOTION if dynamics else {}
+    wanted = NewSession(robot, instrument, FIT, VALIDATION, seed, dynamics=dynamics, motion=motion)
+    if instrument == "camera":
+        seen = camera_files.seen_by_camera(cell)
+        cell = seen.cell
+        with camera_files.limits_of(seen) as limits:
+            session = begin(folder, replace(wanted, limits=limits))
+    else:
+        session = begin(folder, wanted)
+    session = replace(session, plots=plots)
+    say(f"the cell: {cell.note}")
+    with locked(session):
+        waiting = steps.run_next(session, say, progress, "calib demo")
+        while waiting is not None and waiting.kind == steps.WAITING and not guided:
+            _bring_for(session, waiting.step.name, say, progress)
+            waiting = steps.run_next(session, say, progress, "calib demo")
+    if waiting is not None:
+        if not guided:
+            raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
+        return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
+    before, after = _compare_with_truth(session, cell, say)
+    seconds = time.perf_counter() - started
+    return DemoResult(
+        session, session.verdicts().level, _results(session), seconds, (), before, after, _largest_memory()
+    )
+
+
+def _largest_memory() -> float:
+    """Return the largest resident set of this process so far [MB]; Linux counts it in kB, macOS in bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
+
+
+def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
+    """Return what an engineer would be asked, and how to let the simulated cell do it."""
+    from calib.procedure.session.instructions import asks
+
+    folder = session.folder
+    return (
+        *asks(session, waiting),
+        f"(or let the simulated cell do it: {command_line('demo', '--bring', folder)}; "
+        f"then: {command_line('next', folder)})",
+    )
+
+
+def _results(session: Session) -> tuple[tuple[str, str], ...]:
+    """Return what to look at."""
+    found = [
+        ("certificate", CERTIFICATE),
+        ("plots" if session.plots else "fit", "4-fit"),
+        ("calibrated URDF", f"{session.export}/{URDF}"),
+    ]
+    if session.dynamic:
+        found += [("motions", "6-excitation"), ("dynamics", "8-dynamics")]
+    if session.path(viewer.FILE).exists():
+        found.append(("to play", viewer.FILE))
+    return (*found, ("the session", SETTINGS))
+
+
+def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
+    """Compare a session's result with the cell's truth, print and write the errors; return those of the tool [mm]."""
+    found = installation_file.read(session.fit.path)
+    before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
+    lines = [
+        f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
+        f"nominal arm, {after:.3f} mm with the calibrated one"
+    ]
+    truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
+    if bare > after:
+        lines[0] += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
+    notes = [cell.note]
+    if session.dynamic:
+        arm = arm_of(session, cell)
+        chain, dynamics = read_dynamics(session.identification.path)
+        torques = torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
+        motion = dynamics_steps.designed_motions(session)[LOGS[0][0]]
+        middle = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
+        true = true_base(dynamics.model, cell, arm, session.settings.seed, middle)
+        within, count = share_within(true, read_estimate(session.identification.path))
+        notes.append(arm.note)
+        truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
+        lines.append(
+            "hidden truth, on a motion nobody has seen: noise-free torques are predicted to "
+            f"{torques.identified:.2f} % ({torques.nominal:.1f} % behind the gears by the nominal masses, with the "
+            f"true friction); of {count} base parameters {within:.0%} are within two sigmas of the truth"
+        )
+    files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
+    files.write_json(session.path("truth.json"), truth)
+    for line in lines:
+        say(line)
+    return before, after
+
+
+def simulate_next(folder: Path, say: Say) -> None:
+    """Let the simulated cell bring what the session in `folder` waits for; compare a finished one with the truth.
+
+    Raises:
+        UsageError: where nothing is waited for, or the session's robot is none of the library.
+    """
+    session = open_session(folder)
+    if session.settings.robot.given not in library.names():
+        raise UsageError(
+            f"{folder} is about {session.settings.robot.given}; the simulated cells are of {', '.join(library.names())}"
+        )
+    with locked(session, say):
+        waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
+        if waiting is None:
+            _compare_with_truth(session, _cell_of(session), say)
+            return
+        if waiting.kind != steps.WAITING:
+            raise UsageError(f"{folder} waits for nothing; next: {command_line('next', folder)}")
+        _bring_for(session, waiting.step.name, say)
+    say(f"next: {command_line('next', folder)}")
+
+
+def _cell_of(session: Session) -> Cell:
+    """Return the virtual cell of a session of the demonstration."""
+    cell = virtual_cell(session.settings.robot.given, session.settings.seed)
+    return camera_files.seen_by_camera(cell).cell if session.settings.instrument.measures == Pixels.kind else cell
+
+
+def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
+    """Let the simulated cell do what a step waits for."""
+    seed = session.settings.seed
+    cell = virtual_cell(session.settings.robot.given, seed)
+    if step in ("measure", "validate") and session.settings.instrument.measures == Pixels.kind:
+        found = camera_files.seen_by_camera(cell)
+        _mark(session, found.cell.note)
+        camera_files.bring_images(session.folder, found, seed, progress)
+        say("    (the simulated camera takes an image at every pose of both lists)")
+    elif step in ("measure", "validate"):
+        simulate_measurements(session, cell, seed)
+        say("    (the simulated cell measures both lists of poses)")
+    elif step in ("record", "predict"):
+        simulate_recordings(session, arm_of(session, cell), seed)
+        say("    (the simulated arm plays both motions)")
+    else:
+        raise SessionError(f"the demonstration cannot bring what {step} needs")
+
+
+def arm_of(session: Session, cell: Cell) -> MovingArm:
+    """Return the arm of a session's simulated cell as it moves."""
+    return moving_arm(cell, session.settings.robot.given, session.settings.seed)
+
+
+def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
+    """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
+    _mark(session, cell.note)
+    kinds = [joint.kind for joint in cell.nominal.joints]
+    for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
+        q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
+        seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
+        measured_files.write(seen, session.path(f"3-measured/{name}.csv"))
+        if plan == "poses":
+            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
+            measured_files.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+
+
+def _mark(session: Session, note: str) -> None:
+    """Write down in the session that its files are a simulated cell's; the certificate says so."""
+    path, line = session.path(MARK), SIMULATED.format(note=note)
+    known = read_lines(path)
+    files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
+
+
+def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
+    """Let the simulated arm play the designed motions, and log them."""
+    _mark(session, arm.note)
+    motions = dynamics_steps.designed_motions(session)
+    for name, number, running in LOGS:
+        if name not in motions:
+            continue
+        t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
+        reference = play(t, *motions[name].orders(t), motions[name].repeat)
+        recorded = record(arm, reference, np.random.default_rng([seed, number]), running)
+        measured_files.write_log(recorded, session.path(f"7-recorded/{name}.csv"))

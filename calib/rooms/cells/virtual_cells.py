@@ -1,0 +1,125 @@
+"""Cells to practise on: the LWR4+ of the study, and any robot of the library made wrong on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.geometry.installation import Installation
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward
+from calib.robot.load import load
+from calib.rooms.cells import lwr4plus
+from calib.rooms.cells.cell import Cell, SimulatedInstrument
+from calib.rooms.cells.deflections import deflection
+from calib.rooms.cells.unmodelled import PositionErrors
+from calib.transforms import pose
+
+LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3  # how far a made-up arm is from its nominal (1 sigma) [m], [rad], [rad]
+COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2  # hidden part of the LWR4+ [rad/(N m)], [rad]
+MODELLED = 0.7  # share of it where `UNMODELLED` comes on top
+UNMODELLED = PositionErrors(gear=4e-4, backlash=5e-5, growth=5e-5, droop=5e-5, seed=2)  # our choice
+
+
+def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedInstrument | None = None) -> Cell:
+    """Return the simulated cell of a robot: the study's for the LWR4+, otherwise a perturbed one by seed.
+
+    A third of what is hidden, in squares at the tool (LWR4+: 0.34 of 0.65 mm rms, UR5: 0.08 of 0.13 mm), is of kinds
+    that no model of this toolkit holds (`UNMODELLED`).
+    """
+    instrument = instrument or SimulatedInstrument()
+    if robot == "lwr4plus":
+        return lwr4plus_cell(instrument, MODELLED, UNMODELLED)
+    return perturbed_cell(load(robot), seed, instrument, unmodelled=replace(UNMODELLED, gear=0.2 * UNMODELLED.gear))
+
+
+def lwr4plus_cell(
+    instrument: SimulatedInstrument | None = None, hidden: float = 1.0, unmodelled: PositionErrors | None = None
+) -> Cell:
+    """Return the paper's cell: truth is the calibrated column of Table 2, instrument its optical CMM.
+
+    The hidden part, 20 µrad/(N m) and two harmonics of 0.6 mrad per joint, is chosen so that 17 poses chosen under
+    Table 1 leave about the paper's 0.80 mm and 0.10 deg (Table 3) on poses they have not seen.
+
+    Args:
+        instrument: another one than the paper's.
+        hidden: scale of the hidden part; 0 for a rigid arm.
+        unmodelled: what no model holds; None for nothing.
+    """
+    unmodelled = unmodelled or PositionErrors()
+    _, calibrated = lwr4plus.table_2()
+    true = lwr4plus.arm(calibrated)
+    stiff = np.full(true.n, hidden * COMPLIANCE), np.full(true.n, hidden * AMPLITUDE)
+    truth = Installation(
+        true,
+        lwr4plus.station(calibrated)[None],
+        lwr4plus.tool(calibrated)[None],
+        deflection=deflection(true, *stiff, HIDDEN_SEED),
+    )
+    note = (
+        "simulated LWR4+: truth = calibrated column of Table 2 of Kolyubin et al. (2019), plus joint deflections of "
+        f"{hidden * COMPLIANCE * 1e6:g} µrad/(N m) and two harmonics of {hidden * AMPLITUDE * 1e3:g} mrad per joint"
+        f"{unmodelled.note}"
+    )
+    return Cell(lwr4plus.nominal_chain(), truth, instrument or SimulatedInstrument(), note, unmodelled)
+
+
+def perturbed_cell(
+    nominal: Chain,
+    seed: int = 0,
+    instrument: SimulatedInstrument | None = None,
+    *,
+    size: float = 1.0,
+    hidden: float = 0.2,
+    unmodelled: PositionErrors | None = None,
+) -> Cell:
+    """Return a cell whose arm is its nominal plus normal deviations of every element.
+
+    Args:
+        nominal: the arm as it is described.
+        seed: of the deviations, the placements and the hidden part.
+        instrument: what measures.
+        size: scale of the deviations (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets).
+        hidden: scale of the hidden deflections, in those of the LWR4+.
+        unmodelled: what no model holds; None for nothing.
+    """
+    unmodelled = unmodelled or PositionErrors()
+    rng = np.random.default_rng(seed)
+    true = _perturbed(nominal, rng, size)
+    span = float(np.linalg.norm(forward(nominal, np.zeros((1, nominal.n)))[0, :3, 3])) + 0.5
+    amplitude = np.array([AMPLITUDE if joint.kind == "revolute" else 0.3 * AMPLITUDE for joint in true.joints])
+    truth = Installation(
+        true,
+        _random_pose(rng, 3.0 * span)[None],
+        _random_pose(rng, 0.12)[None],
+        deflection=deflection(true, np.full(true.n, hidden * COMPLIANCE), hidden * amplitude, seed),
+    )
+    note = (
+        f"simulated {nominal.name}: every element off its nominal by {size * LENGTH * 1e3:g} mm or "
+        f"{size * ANGLE * 1e3:g} mrad, joint offsets by {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
+        f"{unmodelled.note}"
+    )
+    return Cell(nominal, truth, instrument or SimulatedInstrument(), note, unmodelled)
+
+
+def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
+    """Return a chain whose elements deviate by normal errors: `LENGTH`, `ANGLE`, and `OFFSET` for joint offsets."""
+    rng = np.random.default_rng(seed)
+    spread = [
+        LENGTH if element.unit == "m" else OFFSET if element.joint is not None else ANGLE for element in chain.elements
+    ]
+    return chain.with_values(chain.values + size * np.array(spread) * rng.standard_normal(len(spread)))
+
+
+def rigid(cell: Cell) -> Cell:
+    """Return the cell without its hidden deflections and unmodelled errors."""
+    still = cell.truth.deflection.with_coefficients(np.zeros(len(cell.truth.deflection.terms)))
+    return replace(cell, truth=replace(cell.truth, deflection=still), unmodelled=PositionErrors())
+
+
+def _random_pose(rng: np.random.Generator, distance: float) -> np.ndarray:
+    direction = rng.standard_normal(3)
+    turn = Rotation.random(rng=rng).as_matrix()
+    return pose(turn, distance * direction / np.linalg.norm(direction))

@@ -1,0 +1,13 @@
+"""Parallel robots: the verbs for serial arms, on closed loops (`calib.rooms.parallel.mechanism`)."""
+
+OFFERS = {"topics": ":TOPICS", "robots": "robots:find", "stages": "verbs:STAGES"}
+TOPICS = {
+    "parallel": (
+        "a parallel robot as legs and a platform, and what commands write of one",
+        (
+            "calib.rooms.parallel.mechanism.parallel_files",
+            "calib.rooms.parallel.loop_fit",
+            "calib.rooms.parallel.results",
+        ),
+    )
+}

@@ -1,0 +1,186 @@
+"""The file of a parallel robot, in TOML: legs as MDH tables, a platform, where each leg is attached.
+
+kind = "parallel"                # required: tells it from a serial arm
+name = "dualv"
+gravity = [0, 0, -9.81]          # in the base frame [m/s²]
+source = "where the numbers come from"
+
+[platform]
+freedom = ["x", "y", "rz"]       # its independent coordinates: of x y z (position) rx ry rz (about the base's axes)
+lower = [-0.1, -0.1, "-30 deg"]  # box of them around home in which states are drawn and motions designed
+upper = [0.1, 0.1, "30 deg"]
+home = {xyz = [0, 0, 0], rpy = [0, 0, 0]}   # in the base; default the identity
+inertia = [XX, XY, XZ, YY, YZ, ZZ, MX, MY, MZ, M]   # about its frame, optional
+
+[[leg]]                          # one table per leg
+name = "leg1"                    # default leg1 leg2 ...
+base = {xyz = [0.4, 0.1, 0], rpy = [0, 0, 0]}       # where its first row stands in the base; default the identity
+attachment = {xyz = [0, 0.11, 0]}                   # where the platform holds its end, in the platform's frame
+end = "rigid"                    # the last row's link is the platform; or "spherical": a ball joint behind it
+actuated = ["motor1"]            # names of its joints with a motor and an encoder
+home = ["130 deg", "-90 deg", 0] # joint values that close its loop at home; Newton's start, so a degree is enough
+tail = {xyz = [0, 0, 0.1]}       # what follows its last row, optional
+
+[[leg.joint]]                    # its rows: keys of an MDH table (calib.robot.mdh), limits and inertia included
+name = "motor1"
+d = 0.28
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.config_types import shown
+from calib.errors import RobotError, suggestion
+from calib.robot import mdh
+from calib.robot.chain import GRAVITY, Chain
+from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, spelled, vector, word
+from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
+
+KIND = "parallel"
+TOP = ("kind", "name", "gravity", "source", "platform", "leg", "provenance")
+_PLATFORM = ("freedom", "lower", "upper", "home", "inertia")
+_LEG = ("name", "base", "attachment", "end", "actuated", "home", "tail", "joint")
+
+
+def is_parallel(path: str | Path) -> bool:
+    """Tell whether a TOML file says of itself that it holds a parallel robot, or has the tables of one."""
+    table = load(path)
+    return table.get("kind") == KIND or "leg" in table
+
+
+def read(path: str | Path) -> ParallelRobot:
+    """Read a parallel robot from a TOML file (schema above); its loops are not solved here (`closure.closed`).
+
+    Raises:
+        RobotError: naming the table, the key and what is wrong with it.
+    """
+    return _from_table(load(path), str(path))
+
+
+def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
+    """Return the robot of a parsed table; `where` names it in messages."""
+    check_keys(table, TOP, where)
+    if table.get("kind") != KIND:
+        raise RobotError(
+            f'{where}: kind is {shown(table.get("kind"))}; a robot of legs and a platform says kind = "parallel"'
+        )
+    gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
+    own, place = table.get("platform"), f"{where}, [platform]"
+    if not isinstance(own, Mapping):
+        raise RobotError(f"{where}: no [platform] table found")
+    check_keys(own, _PLATFORM, place)
+    freedom = _words(own.get("freedom"), f"{place}, freedom")
+    legs = table.get("leg")
+    if not isinstance(legs, list) or not legs or not all(isinstance(leg, Mapping) for leg in legs):
+        raise RobotError(f"{where}: no [[leg]] tables found; a parallel robot needs one per leg")
+    return ParallelRobot(
+        name=word(table, "name", where),
+        legs=tuple(_leg(leg, k, gravity, where) for k, leg in enumerate(legs)),
+        freedom=freedom,
+        home=placement(own.get("home", {}), f"{place}, home"),
+        lower=_box(own, "lower", freedom, place),
+        upper=_box(own, "upper", freedom, place),
+        platform=vector(own["inertia"], 10, f"{place}, inertia") if "inertia" in own else None,
+        gravity=gravity,
+    )
+
+
+def write(
+    path: str | Path, robot: ParallelRobot, source: str = "", provenance: Mapping[str, Any] | None = None
+) -> Path:
+    """Write a parallel robot, so that `read` returns the same one to the last bit."""
+    return files.write(path, dumps(to_table(robot, source) | ({"provenance": provenance} if provenance else {})))
+
+
+def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
+    """Return the table (schema above) that `_from_table` reads back exactly."""
+    table: dict[str, Any] = {"kind": KIND, "name": robot.name, "gravity": robot.gravity.tolist()}
+    if source:
+        table["source"] = source
+    table["platform"] = {
+        "freedom": list(robot.freedom),
+        "lower": robot.lower.tolist(),
+        "upper": robot.upper.tolist(),
+        "home": placement_table(robot.home),
+    }
+    if robot.platform is not None:
+        table["platform"]["inertia"] = robot.platform.tolist()
+    table["leg"] = [_leg_table(leg) for leg in robot.legs]
+    return table
+
+
+def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str) -> Leg:
+    place = f"{where}, [[leg]] number {number_ + 1}"
+    check_keys(entry, _LEG, place)
+    name = word(entry, "name", place, f"leg{number_ + 1}")
+    place = f"{place} ('{name}')"
+    rows = {"name": name, "joint": entry.get("joint"), "gravity": gravity.tolist(), "propose_beta": False}
+    if "tail" in entry:
+        rows["tail"] = entry["tail"]
+    chain = _based(mdh.from_table(rows, place), placement(entry.get("base", {}), f"{place}, base"))
+    home = entry.get("home", [0.0] * chain.n)
+    if not isinstance(home, list) or len(home) != chain.n:
+        raise RobotError(f"{place}: home needs one value per joint, {chain.n}; found {shown(home)}")
+    kinds = ["angle" if joint.kind == "revolute" else "length" for joint in chain.joints]
+    return Leg(
+        name,
+        chain,
+        _actuated(entry, chain, place),
+        np.array([number(value, f"{place}, home", kind) for value, kind in zip(home, kinds)]),
+        placement(entry.get("attachment", {}), f"{place}, attachment"),
+        word(entry, "end", place, "rigid"),
+    )
+
+
+def _based(chain: Chain, base: np.ndarray) -> Chain:
+    """Return the chain with a placement before its first element."""
+    first = replace(chain.elements[0], placement=None if np.array_equal(base, np.eye(4)) else base)
+    return replace(chain, elements=(first, *chain.elements[1:]))
+
+
+def _actuated(entry: Mapping[str, Any], chain: Chain, place: str) -> tuple[int, ...]:
+    named = _words(entry.get("actuated", []), f"{place}, actuated")
+    for one in named:
+        if one not in chain.joint_names:
+            near = suggestion(one, chain.joint_names)
+            raise RobotError(f"{place}: actuated '{one}' is none of its joints{near}: {', '.join(chain.joint_names)}")
+    return tuple(sorted(chain.joint_names.index(one) for one in dict.fromkeys(named)))
+
+
+def _words(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        raise RobotError(f"{where}: expected a list of names, found {shown(value)}")
+    return tuple(value)
+
+
+def _box(table: Mapping[str, Any], key: str, freedom: tuple[str, ...], place: str) -> np.ndarray:
+    """Return one bound per coordinate of the platform."""
+    values = table.get(key)
+    if not isinstance(values, list) or len(values) != len(freedom):
+        raise RobotError(
+            f"{place}: {key} needs a value per coordinate of freedom, {len(freedom)}; found {shown(values)}"
+        )
+    kinds = ["angle" if name in COORDINATES[3:] else "length" for name in freedom]
+    return np.array([number(value, f"{place}, {key}", kind) for value, kind in zip(values, kinds)])
+
+
+def _leg_table(leg: Leg) -> dict[str, Any]:
+    base = leg.chain.elements[0].placement
+    own = mdh.to_table(_based(leg.chain, np.eye(4)))
+    table: dict[str, Any] = {"name": leg.name}
+    if base is not None:
+        table["base"] = placement_table(base)
+    table |= {"attachment": placement_table(leg.attachment), "end": leg.end}
+    table["actuated"] = [leg.chain.joint_names[j] for j in leg.actuated]
+    table["home"] = [spelled(float(value)) for value in leg.home]
+    if "tail" in own:
+        table["tail"] = own["tail"]
+    table["joint"] = own["joint"]
+    return table

@@ -1,0 +1,324 @@
+"""The identification model of a parallel robot: rows on the platform's coordinates, on its actuators, or their power.
+
+    platform   J_p^invᵀ τ = W χ      one row per freedom; unique, also with redundant actuators (eqs 24-28)
+    motor      τ = W χ               one row per actuator, where there are as many as freedoms (eq. 14)
+    power      q̇ᵀ τ = vᵀ W χ         one row
+
+    W = [J_tᵀ W_legs, Dᵀ W_platform, J_tᵀ W_drives]
+
+(Briot, Gautier & Krut 2013.) Bodies are numbered as there: joint j of leg k is jk, the platform comes after the legs'
+last joints, payloads on it after that. χ holds ten standard parameters of each, then the drives' terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from calib.dynamics import drives, rigid_body
+from calib.dynamics.bodies import PRISMATIC, STANDARD, UNITS, Bodies, bodies_of
+from calib.dynamics.drives import DriveTerm
+from calib.dynamics.idim import KEPT_LAST
+from calib.dynamics.regressor_model import Loads, States
+from calib.dynamics.shapes import V0
+from calib.dynamics.torque_rows import MOTOR, POWER, Projection, TorqueRows, projected
+from calib.errors import CalibError, UsageError, require
+from calib.rooms.parallel.mechanism.closure import ClosedRobot
+from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, FORCES
+from calib.rooms.parallel.mechanism.platform_body import energy_columns, wrench_regressor
+from calib.rooms.parallel.mechanism.velocities import LoopMotion, loop_jacobians, of_platform, of_readings
+
+RATE = 3.0  # of random states: m/s or rad/s, and per s (as `IdentificationModel.sample`)
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelModel:
+    """Legs, platform, payloads and drives as one regressor; a `calib.dynamics.regressor_model.RegressorModel`.
+
+    Attributes:
+        known: the robot, its loops closed.
+        terms: the drives' terms; their joints are those of the tree.
+        torque_rows: ``platform``, ``motor`` or ``power`` rows (`rows_named`).
+        payloads: labels of bodies that the platform may carry.
+    """
+
+    known: ClosedRobot
+    terms: tuple[DriveTerm, ...]
+    torque_rows: TorqueRows
+    payloads: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
+            raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")
+
+    @property
+    def n(self) -> int:
+        """Actuated joints: what is recorded."""
+        return self.known.robot.n
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """Of the bodies: the legs', the platform's, the payloads'."""
+        robot = self.known.robot
+        legs = [robot.labels[a + j] for leg, a in zip(robot.legs, robot.starts) for j in range(leg.bodies)]
+        return (*legs, robot.platform_label, *self.payloads)
+
+    @property
+    def inertial(self) -> int:
+        return 10 * len(self.labels)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self._names
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
+        bodies = (name + label for label in self.labels for name in STANDARD)
+        return (*bodies, *(one.name for one in self.terms))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return (*UNITS * len(self.labels), *(one.unit for one in self.terms))
+
+    @property
+    def p(self) -> int:
+        return len(self.names)
+
+    @property
+    def columns(self) -> tuple[DriveTerm, ...]:
+        return self.terms
+
+    @property
+    def rows(self) -> int:
+        return self.torque_rows.count(self.n)
+
+    @cached_property
+    def leg_bodies(self) -> tuple[Bodies, ...]:
+        """The legs as trees of their own."""
+        return tuple(bodies_of(leg.chain) for leg in self.known.robot.legs)
+
+    def regressor(
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, load: np.ndarray | None = None,
+        carried: Collection[str] | None = None, states: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Return W (N, rows, p) at the encoders' q, v, a (N, n); other arguments as `IdentificationModel.regressor`."""
+        motion = self.moved(q, v, a)
+        return self._on_rows(self.platform_regressor(motion, carried), motion)
+
+    def torque(
+        self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None,
+        states: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Return the rows' torques, forces or power (N, rows) of parameters (p,), without the regressor."""
+        motion = self.moved(q, v, a)
+        return self._on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
+
+    def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+        """Return the whole robot's motion from the encoders' q, v, a (N, n)."""
+        return of_readings(self.known, self.known.locate(q), np.asarray(v, dtype=float), np.asarray(a, dtype=float))
+
+    def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return W (N, r, p) on the platform's coordinates; its memory is ordered (p, r, N)."""
+        robot, J = self.known.robot, motion.jacobians
+        out = np.zeros((self.p, robot.r, len(motion.v)))
+        first = 0
+        for leg, bodies, a, b in zip(robot.legs, self.leg_bodies, robot.starts, robot.starts[1:]):
+            W = rigid_body.regressor(bodies, motion.posture.q[:, a:b], motion.v[:, a:b], motion.a[:, a:b])
+            count = 10 * leg.bodies
+            out[first : first + count] = np.einsum("njr,njc->crn", J.joints[:, a:b], W[:, :, :count], optimize=True)
+            first += count
+        own = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
+        self._fill_platform(out, first, (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0), carried)
+        motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
+        for k, one in enumerate(self.terms):
+            for joint, column in one.acting(motions, np.zeros((0, len(motion.v)))):
+                out[self.inertial + k] += J.joints[:, joint].T * column
+        return out.transpose(2, 1, 0)
+
+    def platform_force(
+        self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
+    ) -> np.ndarray:
+        """Return the forces and moments (N, r) on the platform's coordinates that parameters (p,) need."""
+        robot, J = self.known.robot, motion.jacobians
+        values = np.asarray(values, dtype=float)
+        tree = self.tree_torque(values, motion)
+        fixed = self.platform_parameters(values, carried)
+        wrench = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity) @ fixed
+        return np.einsum("ntr,nt->nr", J.joints, tree) + np.einsum("nkr,nk->nr", J.platform, wrench)
+
+    def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
+        """Return the torques (N, n_t) of the opened legs with their drives, the platform taken off."""
+        robot, parts = self.known.robot, []
+        own = [motion.posture.q, motion.v, motion.a]
+        for bodies, parameters, a, b in zip(
+            self.leg_bodies, self.leg_parameters(values), robot.starts, robot.starts[1:]
+        ):
+            parts.append(rigid_body.inverse_dynamics(bodies, parameters, *(x[:, a:b] for x in own)))
+        result = np.concatenate(parts, axis=1)
+        for one, value in zip(self.terms, values[self.inertial :]):
+            for joint, column in one.acting([*(x.T for x in own), None], np.zeros((0, len(result)))):
+                result[:, joint] += value * column
+        return result
+
+    def leg_parameters(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the parameters of each leg's bodies, zero for a last link that is the platform."""
+        result, first = [], 0
+        for leg in self.known.robot.legs:
+            own = np.zeros(10 * leg.chain.n)
+            own[: 10 * leg.bodies] = values[first : first + 10 * leg.bodies]
+            result.append(own)
+            first += 10 * leg.bodies
+        return result
+
+    def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return the ten parameters of the platform with what it carries."""
+        first = 10 * (len(self.labels) - len(self.payloads) - 1)
+        own = values[first : self.inertial].reshape(-1, 10)
+        present = [True, *(self._carries(label, carried) for label in self.payloads)]
+        return own[present].sum(axis=0)
+
+    def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return the energies h (N, p) at the encoders' q, v (N, n), as `IdentificationModel.energy_columns`."""
+        return self.energies(self.moved(q, v, np.zeros_like(v)), carried)
+
+    def energies(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return the columns h (N, p) of kinetic and potential energy; zero for friction (eq. 3 of the power paper)."""
+        robot = self.known.robot
+        out, first = np.zeros((self.p, len(motion.v))), 0
+        for leg, bodies, a, b in zip(robot.legs, self.leg_bodies, robot.starts, robot.starts[1:]):
+            own = rigid_body.energies(bodies, motion.posture.q[:, a:b], motion.v[:, a:b])
+            out[first : first + 10 * leg.bodies] = own[:, : 10 * leg.bodies].T
+            first += 10 * leg.bodies
+        self._fill_platform(out, first, energy_columns(motion.posture.pose, motion.twist, robot.gravity).T, carried)
+        drives.fill_energies(self.terms, out[self.inertial :], motion.v.T)
+        return out.T
+
+    def _fill_platform(self, out: np.ndarray, first: int, own: np.ndarray, carried: Collection[str] | None) -> None:
+        """Write the platform's ten columns, and the same for each payload on board."""
+        for k, label in enumerate(("", *self.payloads)):
+            if not label or self._carries(label, carried):
+                out[first + 10 * k : first + 10 * k + 10] = own
+
+    def acting(self) -> np.ndarray:
+        states = self.sample(4, np.random.default_rng(0))
+        return np.asarray((np.abs(self.regressor(states.q, states.v, states.a)) > 1e-12).any(axis=0)).T
+
+    def preference(self) -> np.ndarray:
+        """Return the columns in the order they are tried: platform, first moments, inertias, drives, masses, payloads.
+
+        Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
+        """
+        order = np.concatenate([bodies.order[: leg.bodies] for leg, bodies in self._pairs()])
+        kinds = np.concatenate([bodies.kinds[: leg.bodies] for leg, bodies in self._pairs()])
+        ranks: dict[str, list[int]] = {"moments": [], "inertias": [], "late": []}
+        for i, (own, kind) in enumerate(zip(order, kinds)):
+            last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
+            for c in range(10):
+                rank = "late" if c in last or c == 9 else "moments" if c > 5 else "inertias"
+                ranks[rank].append(10 * i + int(own[c]))
+        platform = 10 * len(order)
+        drive = range(self.inertial, self.p)
+        first = range(platform, platform + 10)
+        payloads = range(platform + 10, self.inertial)
+        return np.array([*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads], dtype=int)
+
+    def load_cases(self) -> Loads:
+        return (None, ()) if self.payloads else (None,)
+
+    def sample(
+        self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
+    ) -> States:
+        """Draw states: the platform uniform in its box, its twist and the derivative within ±3."""
+        robot = self.known.robot
+        posture = self.known.place(rng.uniform(robot.lower, robot.upper, (count, robot.r)))
+        motion = of_platform(self.known, posture, *rng.uniform(-RATE, RATE, (2, count, robot.r)))
+        own = robot.actuated
+        return States(posture.q[:, own], motion.v[:, own], motion.a[:, own])
+
+    def known_parameters(self) -> np.ndarray | None:
+        """Return the bodies' parameters of the robot's file (inertial,), payloads zero; None where it holds none."""
+        robot = self.known.robot
+        parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
+        if len(parts) < len(robot.legs) or robot.platform is None:
+            return None
+        return np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
+
+    def _pairs(self) -> list:
+        return list(zip(self.known.robot.legs, self.leg_bodies))
+
+    def _carries(self, label: str, carried: Collection[str] | None) -> bool:
+        return carried is None or label in carried
+
+    def _on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
+        """Return rows (N, rows, p) of those on the platform's coordinates."""
+        if self.torque_rows.name == PLATFORM:
+            return W
+        if self.torque_rows.name == POWER.name:
+            return np.einsum("nr,nrp->pn", motion.rate, W).T[:, None, :]
+        return np.linalg.solve(motion.jacobians.readings.transpose(0, 2, 1), W)
+
+
+PLATFORM = "platform"
+
+
+def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
+    """Return the rows that options call ``platform``, ``motor`` or ``power``; by default those a robot allows.
+
+    Raises:
+        UsageError: for motor rows of redundant actuators, whose torques no model determines; for other names.
+    """
+    robot = known.robot
+    name = name or (PLATFORM if robot.redundant else MOTOR.name)
+    if name == PLATFORM:
+        units = tuple(FORCES[COORDINATES.index(one)] for one in robot.freedom)
+        return projected(PLATFORM, Projection(robot.freedom, units, partial(_to_platform, known)))
+    if name == POWER.name:
+        return POWER
+    require(name == MOTOR.name, f"rows = '{name}': a parallel robot's are platform, motor or power", UsageError)
+    if robot.redundant:
+        raise UsageError(
+            f"rows = 'motor': '{robot.name}' has {robot.n} actuators for {robot.r} freedoms, so that the share of each "
+            "depends on the overconstraint; use rows = 'platform', or 'power'"
+        )
+    return MOTOR
+
+
+def make_parallel_model(
+    known: ClosedRobot, sets: Sequence[str] = (), v0: float = V0, rows: TorqueRows | None = None,
+    payloads: Sequence[str] = (), passive: str = "",
+) -> ParallelModel:  # fmt: skip
+    """Return the model of a robot with drive terms on its actuated joints, and friction of the passive ones.
+
+    Args:
+        sets: names out of `calib.dynamics.drives.standard`, one text per actuated joint or one for all; none: Ia Fv Fc
+            off.
+        v0: smoothing of the Coulomb sign [rad/s or m/s].
+        passive: names for all passive joints, e.g. ``Fv Fc``.
+    """
+    robot = known.robot
+    each = list(sets) or ["Ia Fv Fc off"]
+    each = each * robot.n if len(each) == 1 else each
+    if len(each) != robot.n:
+        raise UsageError(f"drives: {len(each)} texts for the {robot.n} actuated joints; give one, or one per joint")
+    joints = [joint for leg in robot.legs for joint in leg.chain.joints]
+    texts = [passive] * len(joints)
+    for j, text in zip(robot.actuated, each):
+        texts[j] = text
+    linear = [joint.kind == "prismatic" for joint in joints]
+    plain = drives.standard(texts, v0, linear)
+    terms = tuple(replace(one, name=_renamed(one, robot.labels)) for one in plain)
+    return ParallelModel(known, terms, rows or rows_named(known), tuple(payloads))
+
+
+def _renamed(one: DriveTerm, labels: Sequence[str]) -> str:
+    """Return the name of a term with the label of its joint in place of its number."""
+    joint = one.acts[0][0]
+    return one.name.removesuffix(str(joint + 1)) + labels[joint]
+
+
+def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return J_p^invᵀ (N, r, n), which takes the actuators' torques to the platform's coordinates."""
+    return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)

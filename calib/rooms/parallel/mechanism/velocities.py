@@ -1,0 +1,137 @@
+"""Velocities and accelerations of closed loops by rigid-body relations (eqs 4-10 and 15-18 of Briot, Gautier & Krut).
+
+q̇_k = J_k⁺ G_k D v              joints of leg k from the independent parts v of the platform's twist t = D v
+q̈_k = J_k⁺ (G_k ṫ + g_k)        g_k: acceleration of the attachment at ṫ = 0 less that of the leg's end at q̈_k = 0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rooms.parallel.mechanism.closure import ClosedRobot, twists
+from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links
+
+
+@dataclass(frozen=True, eq=False)
+class LoopJacobians:
+    """Jacobians at N postures, by the independent parts v (r,) of the platform's twist.
+
+    Attributes:
+        joints: (N, n_t, r) J_t: rates of all joints of the tree.
+        readings: (N, n, r) J_p^inv: those of the actuated ones.
+        platform: (N, 6, r) D: the whole twist, in the base's axes.
+        links: the legs.
+    """
+
+    joints: np.ndarray
+    readings: np.ndarray
+    platform: np.ndarray
+    links: Sequence[LegLinks]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopMotion:
+    """How N postures move.
+
+    Attributes:
+        posture: of joints and platform.
+        jacobians: there.
+        v, a: (N, n_t) of all joints of the tree [per s, per s²].
+        twist, change: (N, 6) of the platform: velocity of its origin, angular velocity, and their derivatives.
+        rate: (N, r) the independent parts of the twist.
+    """
+
+    posture: Posture
+    jacobians: LoopJacobians
+    v: np.ndarray
+    a: np.ndarray
+    twist: np.ndarray
+    change: np.ndarray
+    rate: np.ndarray
+
+
+def loop_jacobians(known: ClosedRobot, posture: Posture) -> LoopJacobians:
+    """Return the Jacobians of postures."""
+    links = leg_links(known.robot, posture)
+    D, _ = twists(known, links)
+    joints = np.concatenate([one.inverse @ (one.carried @ D) for one in links], axis=1)
+    return LoopJacobians(joints, joints[:, known.robot.actuated], D, links)
+
+
+def of_platform(
+    known: ClosedRobot, posture: Posture, rate: np.ndarray, change: np.ndarray, jacobians: LoopJacobians | None = None
+) -> LoopMotion:
+    """Return the motion of postures from the platform's.
+
+    Args:
+        rate, change: (N, r) independent parts of its twist, and their derivatives.
+        jacobians: of the postures, where they are known already.
+    """
+    return _moving(known, posture, loop_jacobians(known, posture) if jacobians is None else jacobians, rate, change)
+
+
+def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+    """Return the motion of postures from the encoders', redundant ones by least squares (eqs 16, 18).
+
+    Args:
+        v, a: (N, n) of the actuated joints.
+    """
+    found = loop_jacobians(known, posture)
+    back = np.linalg.pinv(found.readings) if known.robot.redundant else np.linalg.inv(found.readings)
+    rate = (back @ v[:, :, None])[:, :, 0]
+    still = _moving(known, posture, found, rate, np.zeros_like(rate))
+    change = (back @ (a - still.a[:, known.robot.actuated])[:, :, None])[:, :, 0]
+    return LoopMotion(
+        posture, found, still.v, still.a + np.einsum("ntr,nr->nt", found.joints, change), still.twist,
+        still.change + np.einsum("nkr,nr->nk", found.platform, change), rate,
+    )  # fmt: skip
+
+
+def _moving(
+    known: ClosedRobot, posture: Posture, found: LoopJacobians, rate: np.ndarray, change: np.ndarray
+) -> LoopMotion:
+    v = np.einsum("ntr,nr->nt", found.joints, rate)
+    twist = np.einsum("nkr,nr->nk", found.platform, rate)
+    shifts, starts = [], known.robot.starts
+    for one, a, b in zip(found.links, starts, starts[1:]):
+        shifts.append(_end_bias(one, v[:, a:b]) - _attachment_bias(one, twist))
+    _, still = twists(known, found.links, shifts)
+    turning = still + np.einsum("nkr,nr->nk", found.platform, change)
+    accelerations = [
+        (one.inverse @ (one.carried @ turning[:, :, None] - shift[:, :, None]))[:, :, 0]
+        for one, shift in zip(found.links, shifts)
+    ]
+    return LoopMotion(posture, found, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
+
+
+def _attachment_bias(one: LegLinks, twist: np.ndarray) -> np.ndarray:
+    """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); no angular part."""
+    result = np.zeros(one.gap.shape)
+    turn = twist[:, 3:]
+    result[:, :3] = (
+        turn * np.einsum("ni,ni->n", turn, one.lever)[:, None] - one.lever * np.sum(turn**2, axis=1)[:, None]
+    )
+    return result
+
+
+def _end_bias(one: LegLinks, v: np.ndarray) -> np.ndarray:
+    """Return J̇ q̇ (N, c) of a leg's end: Σ_j [(2 w_j + ω_j q̇_j) × v_j q̇_j; w_j × ω_j q̇_j], w_j = Σ_{i<j} ω_i q̇_i.
+
+    The columns [v_j; ω_j] of the Jacobian are those of axes fixed in link j - 1, see
+    `calib.robot.kinematics.twist_product`.
+    """
+    w, result = np.zeros((len(v), 3)), np.zeros(one.full.shape[:2])
+    for j in range(v.shape[1]):
+        moved, turned = one.full[:, :3, j] * v[:, j : j + 1], one.full[:, 3:, j] * v[:, j : j + 1]
+        result[:, :3] += _cross(2.0 * w + turned, moved)
+        result[:, 3:] += _cross(w, turned)
+        w = w + turned
+    return result[:, : one.gap.shape[1]]
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a × b (N, 3); numpy's takes ten times as long for few samples."""
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]

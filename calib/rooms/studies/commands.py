@@ -1,0 +1,134 @@
+"""Comparing methods of identification: study (simulated, truth known), compare (recordings)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.options import command
+from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, Workers, exit_failed, reporting, say
+from calib.errors import UsageError
+
+app = typer.Typer()
+SHOWN = 3  # conditions whose tables are printed in full
+LOGGED = 30.0  # [s] between two lines on progress where the output is no terminal
+
+
+@command(app)
+def study(
+    studies: Annotated[list[str] | None, typer.Argument(metavar="STUDY...")] = None,
+    out: Path | None = None,
+    methods: str | None = None,
+    runs: Annotated[int | None, typer.Option(min=0)] = None,
+    workers: Workers = "1",
+    report_only: Annotated[bool, typer.Option("--report-only")] = False,
+    list_methods: Annotated[bool, typer.Option("--list-methods")] = False,
+    list_studies: Annotated[bool, typer.Option("--list")] = False,
+    plots: Plots = True,
+) -> None:
+    """Compare identification methods where the truth is known. Runs STUDY, or what of it is missing (Monte Carlo).
+
+    Rows go to the disk as they come: a study that was stopped, or lost workers, goes on from there when the same
+    command is given again; asked for more runs, it adds them. What a study file holds: calib formats study.
+
+    Args:
+        studies: study files, or shipped ones: MCS-TX40-1-1, 'MCS-*'
+        out: folder of its rows and report; default: the study's name
+        methods: in place of the file's: wls,iv,didim
+        runs: data sets per condition, in place of the file's
+        report_only: run nothing: report what is there
+        list_methods: all methods, and what each needs
+        list_studies: the studies that come with the toolkit
+    """
+    from calib.procedure.report import console
+    from calib.rooms.studies.reports import outcome, report
+
+    if list_methods or list_studies:
+        say(*(outcome.method_lines() if list_methods else ()), *(outcome.study_lines() if list_studies else ()))
+        return
+    if not studies:
+        raise UsageError("no study named: give a file, or a name out of calib study --list")
+    if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
+        raise UsageError("several studies together need a folder: --out DIR")
+    folder = out or Path(f"{Path(studies[0]).stem}-study")
+    with reporting(LOGGED) as (_, progress):
+        found = outcome.run_study(
+            studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
+            say=progress,
+        )  # fmt: skip
+    seen = [one for one in found.conditions if one.methods]
+    if len(seen) > SHOWN:
+        blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
+    else:
+        blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]
+    say(*console.rendered(blocks))
+    say(*found.described(), f"written to {folder}: {outcome.REPORT} shows it")
+
+
+@command(app)
+def compare(
+    robot: Robot,
+    recordings: list[str],
+    validate: list[str] | None = None,
+    methods: str | None = None,
+    friction: str = "standard",
+    options: Path | None = None,
+    out: Path | None = None,
+    overwrite: Overwrite = False,
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Rank identification methods on recordings of your robot. What counts is how well they predict other motion.
+
+    The one to take is judged as calib identify judges it; where its verdict is fail, none is to take: exit code 1.
+
+    Args:
+        recordings: recordings to learn from; log.npz@0:9.4 cuts
+        validate: recording of other motion; may be repeated
+        methods: wls,iv,didim; default: all that the options allow
+        friction: as of calib identify; loops are simulated with standard friction
+        options: TOML, as of calib identify; with [loop], all methods run
+        out: CSV to write the table to
+    """
+    from calib import files
+    from calib.identification.identify_options import read_options
+    from calib.procedure.dynamic_stage import inputs
+    from calib.procedure.report import console
+    from calib.rooms.studies.reports import method_table
+    from calib.rooms.studies.reports.method_comparison import caveats, compare_methods, write_table
+
+    table = [] if out is None else [(out, (".csv",))]
+    files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)
+    chosen = _names(methods)
+    with reporting() as (say_now, progress):
+        given = inputs.gather(
+            robot, recordings, validate or (), options=read_options(options), base=base, tip=tip, seed=seed,
+            friction=friction, progress=progress,
+        )  # fmt: skip
+        found = compare_methods(
+            given, chosen, friction, progress, lambda one: say_now(method_table.line(one))
+        )  # fmt: skip
+    say(*console.section(method_table.section(found, caveats(given, found))))
+    if out is not None:
+        with files.results(table, overwrite=overwrite):
+            say(f"written to {write_table(found, out)}")
+    if all(one.failure for one in found):
+        raise typer.Exit(3)
+    exit_failed(next(one.verdict.level for one in found if one.verdict is not None))
+
+
+def _names(text: str | None) -> list[str] | None:
+    """Return the methods of a list with commas, held against those there are; None for all."""
+    from calib.identification.methods.registry import method_named
+
+    if text is None:
+        return None
+    found = [name.strip() for name in text.split(",") if name.strip()]
+    for name in found:
+        method_named(name)
+    if not found:
+        raise UsageError("--methods names none; calib study --list-methods")
+    return found

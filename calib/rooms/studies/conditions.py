@@ -1,0 +1,284 @@
+"""The study file: which methods are compared, on which simulated experiments, how often.
+
+TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismatch is a condition::
+
+    name = "small"
+    about = "what it is for"
+    robot = ["tx40", "rv2sq"]        # those two: their true inertias, friction and controller are known
+    decimation = [1, 4]              # one sample in so many is kept, behind the parallel low-pass
+    cutoff = 50.0                    # of the positions' zero-phase Butterworth filter [Hz], or a list; 0: none to speak
+                                     # of (0.8 of the Nyquist frequency)
+    mismatch = "none"                # or a list: geometry (the robot is off its drawing, 0.9 mm, 1.5 mrad and
+                                     # 9 mrad of joint offset rms), calibrated (the same, its geometry fitted first to
+                                     # 40 measured poses), controller (gains believed 30 % off), friction (a Stribeck
+                                     # peak of half Fc that the model lacks), payload (1 kg nobody was told of), clock
+                                     # (torques logged 2 ms late)
+    methods = ["wls", "iv"]          # or "all": calib study --list-methods
+    runs = 20                        # data sets per condition, each with noise of its own
+    runs_loop = 10                   # of methods that simulate the closed loop; default: runs
+    runs_filter = 5                  # of methods that simulate the robot alone (Kalman filters); default: runs
+    runs_of = { iv = 10 }            # for single methods
+    seed = 0                         # number of the first data set
+    duration = 10.0                  # of the motion [s]
+    guess = 0.15                     # relative error of what cloe, clie and the Kalman filters start from
+    resimulated = 3                  # data sets whose estimate is simulated once more, for the survey's position error
+    [[noise]]                        # at least one
+    name = "1"
+    sigma_q = "1e-4 deg"             # of every encoder, in the loop
+    sigma_tau = 0.05                 # of the logged torque [N m]
+
+In its folder summary.csv holds, of every figure of a method on a condition, the median over runs and, as ``_lower`` and
+``_upper``, the quartiles: each the nearest of the runs' own values, not interpolated between two.
+
+The same data set serves all methods. The 15 conditions of Leboutet et al. (2021), MCS-TX40-1-1 to MCS-RV2SQ-1-5, and
+others come with the toolkit: ``calib study --list``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatchcase
+from importlib import resources
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+from calib.config import parse, read_toml, strict
+from calib.config_types import Filled, Name, OneOf, Real, Spread, Text, Whole
+from calib.errors import UsageError, require, suggestion
+from calib.identification.methods.registry import METHODS, method_named
+
+ROBOTS = ("tx40", "rv2sq")
+MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
+TRIAL = 1
+"""Raised whenever the trials of all methods come out otherwise: no row from before then counts.
+
+Where one method changes, its `calib.identification.methods.registry.MethodEntry.version` is raised."""
+
+_Few = Spread(words="a value, or a list of them")
+Robots = Annotated[
+    tuple[Annotated[str, OneOf(ROBOTS, "a study needs the truth; methods on recordings: calib compare")], ...], _Few
+]
+Wholes = Annotated[tuple[Annotated[int, Whole(1, 100)], ...], _Few]
+Cutoffs = Annotated[tuple[Annotated[float, Real(least=0, words="0 or more, Hz without a unit")], ...], _Few]
+Mismatches = Annotated[tuple[Annotated[str, OneOf(MISMATCHES)], ...], _Few]
+Methods = Annotated[tuple[Name, ...], _Few]
+Count = Annotated[int, Whole(0, 1_000_000)]
+
+
+@strict
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the encoders [rad] and of the logged torques [N m]; its name goes into those of conditions."""
+
+    name: Name
+    sigma_q: Annotated[float, Real(least=0, most=0.1, unit="rad", quantity="angle")]
+    sigma_tau: Annotated[float, Real(least=0, quantity="torque")]
+
+
+@strict
+@dataclass(frozen=True)
+class StudyFile:
+    """A study; the module says what each key means."""
+
+    name: Name
+    noise: Annotated[tuple[Noise, ...], Filled()]
+    robot: Robots
+    about: Text = ""
+    decimation: Wholes = (1,)
+    cutoff: Cutoffs = (50.0,)
+    mismatch: Mismatches = ("none",)
+    methods: Methods = ("all",)
+    runs: Count = 20
+    runs_loop: Count | None = None
+    runs_filter: Count | None = None
+    runs_of: Mapping[str, Count] = field(default_factory=dict)
+    seed: Count = 0
+    duration: Annotated[float, Real(least=2.0, most=600.0, unit="s")] = 10.0
+    guess: Annotated[float, Real(least=0, most=10.0)] = 0.15
+    resimulated: Count = 3
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One experiment, up to the seed of its noise.
+
+    Attributes:
+        name: what people call it; no part of what it is.
+        robot: one of `ROBOTS`.
+        sigma_q, sigma_tau: [rad] in the loop, [N m] of the log.
+        decimation: factor of the parallel decimation.
+        cutoff: of the positions' filter [Hz]; 0 for none.
+        mismatch: what is believed wrongly, one of `MISMATCHES`.
+        duration: [s].
+        guess: relative error of the parameters that methods start from which ask for some.
+        resimulated: seeds below it get the survey's position error.
+    """
+
+    name: str
+    robot: str
+    sigma_q: float
+    sigma_tau: float
+    decimation: int = 1
+    cutoff: float = 50.0
+    mismatch: str = "none"
+    duration: float = 10.0
+    guess: float = 0.15
+    resimulated: int = 3
+
+    @property
+    def digest(self) -> str:
+        """What its rows are kept under: the same for conditions that differ in name alone."""
+        content = {key: value for key, value in asdict(self).items() if key not in ("name", "resimulated")}
+        return hashlib.sha256(json.dumps([TRIAL, content], sort_keys=True).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Conditions, and how often each method runs on them.
+
+    Attributes:
+        name, about: of the study.
+        conditions: all with names of their own.
+        runs: name of a method → number of data sets, for each condition (in their order).
+        seeds: number of the first data set, by condition.
+    """
+
+    name: str
+    about: str
+    conditions: tuple[Condition, ...]
+    runs: tuple[Mapping[str, int], ...]
+    seeds: tuple[int, ...]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """All methods of it, in the registry's order."""
+        asked = {name for own in self.runs for name in own}
+        return tuple(name for name in METHODS if name in asked)
+
+
+def shipped() -> dict[str, Path]:
+    """Return the study files that come with the toolkit, by name."""
+    folder = Path(str(resources.files("calib.rooms.studies").joinpath("library")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def read_study(
+    files: Sequence[str | Path], methods: Sequence[str] | None = None, runs: int | None = None
+) -> Study:  # fmt: skip
+    """Return the study of one file, or of several together.
+
+    Args:
+        files: paths, names of shipped ones, or patterns of these (``MCS-*``).
+        methods, runs: in place of the files'.
+
+    Raises:
+        UsageError: for a file that cannot be one, a method's name misspelt, two conditions of one name.
+    """
+    for name in methods or ():
+        method_named(name)
+    read = [_parse(path) for path in _paths(files)]
+    found = [(one, condition) for one in read for condition in _expanded(one)]
+    conditions = [condition for _, condition in found]
+    names = [condition.name for condition in conditions]
+    if twice := next((name for name in names if names.count(name) > 1), ""):
+        raise UsageError(
+            f"there are two conditions '{twice}': name a value once in its list, and give noises (and studies of "
+            "several files) names of their own"
+        )
+    _check_cutoffs(conditions)
+    counts = tuple(_counts(one, methods, runs) for one, _ in found)
+    name = read[0].name if len(read) == 1 else f"{len(read)} studies"
+    about = read[0].about if len(read) == 1 else ", ".join(one.name for one in read)
+    return Study(name, about, tuple(conditions), counts, tuple(one.seed for one, _ in found))
+
+
+def _check_cutoffs(conditions: Sequence[Condition]) -> None:
+    """Refuse what no data set could be filtered with.
+
+    Raises:
+        UsageError: for a cut-off that the robot's log is sampled too slowly for.
+    """
+    from calib.rooms.cells import known_robots  # slow to load
+
+    for one in conditions:
+        most = 0.5 * float(known_robots.truth(one.robot)["control"]["sampling"])
+        if one.cutoff >= most:
+            raise UsageError(
+                f"{one.name}: cutoff: expected less than {most:g} Hz, half the rate of the {one.robot}'s log, found "
+                f"{one.cutoff:g}; 0 is unfiltered"
+            )
+
+
+def _paths(files: Sequence[str | Path]) -> list[Path]:
+    own, result = shipped(), []
+    for one in map(str, files):
+        found = [path for name, path in own.items() if fnmatchcase(name.lower(), one.lower())]
+        if not Path(one).exists() and not one.endswith(".toml"):
+            if not found:
+                raise UsageError(
+                    f"no study '{one}'{suggestion(one, own)}: neither a file nor one of calib study --list"
+                )
+            result += found
+        else:
+            result.append(Path(one))
+    require(result, "no study named: give a file, or a name out of calib study --list", UsageError)
+    return list(dict.fromkeys(result))
+
+
+def _parse(path: Path) -> StudyFile:
+    """Return the study of a file.
+
+    Raises:
+        UsageError: see `calib.config.parse`; methods that there are none of.
+    """
+    found = parse(StudyFile, read_toml(path), str(path))
+    for key, names in (("methods", found.methods), ("runs_of", found.runs_of)):
+        for name in names:
+            if name not in METHODS and (key, name) != ("methods", "all"):
+                raise UsageError(
+                    f"{path}: {key}: there is no method '{name}'{suggestion(name, METHODS)}; calib study --list-methods"
+                )
+    return found
+
+
+def _expanded(study: StudyFile) -> list[Condition]:
+    """Return all combinations, named by the study and by what varies in it."""
+    axes: dict[str, tuple[Any, ...]] = {
+        "robot": study.robot, "noise": study.noise, "decimation": study.decimation, "cutoff": study.cutoff,
+        "mismatch": study.mismatch,
+    }  # fmt: skip
+    result = []
+    for values in product(*axes.values()):
+        chosen = dict(zip(axes, values))
+        parts = [_word(axis, chosen[axis]) for axis, several in axes.items() if len(several) > 1]
+        noise = chosen.pop("noise")
+        result.append(
+            Condition(
+                "-".join([study.name, *parts]), sigma_q=noise.sigma_q, sigma_tau=noise.sigma_tau,
+                duration=study.duration, guess=study.guess, resimulated=study.resimulated, **chosen,
+            )
+        )  # fmt: skip
+    return result
+
+
+def _word(axis: str, value: Any) -> str:
+    if axis == "cutoff":
+        return f"{value:g}Hz" if value else "unfiltered"
+    return value.name if isinstance(value, Noise) else f"r{value}" if axis == "decimation" else str(value)
+
+
+def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
+    names = list(METHODS) if "all" in study.methods else list(study.methods)
+    chosen = names if methods is None else list(methods)
+    return {name: _stated(study, name) if runs is None else runs for name in dict.fromkeys(chosen)}
+
+
+def _stated(study: StudyFile, name: str) -> int:
+    """Return the runs that a file states for a method: its own, else those of its kind."""
+    method = METHODS[name]
+    kind = study.runs_loop if method.needs_controller else study.runs_filter if method.needs_simulation else None
+    return study.runs_of.get(name, study.runs if kind is None else kind)

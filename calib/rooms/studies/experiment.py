@@ -1,0 +1,237 @@
+"""One data set of a condition: a robot with known parameters in its closed loop, and the problem a method is given.
+
+The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40) or 140 Hz (RV-2SQ); the encoders'
+noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows decimated, as
+`calib identify` does it. What is believed of the robot may differ from what it is (`Condition.mismatch`). All data sets
+of a condition share the motion: the best by condition number of `DRAWN` random Fourier series within the limits
+(self-collisions are not looked at).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from calib.data.recordings.recording import Recording
+from calib.data.signals.bandwidth import USABLE
+from calib.data.signals.decimation import design_decimator
+from calib.data.signals.motion import FilterOptions, make_motion
+from calib.dynamics import base as bases
+from calib.dynamics import drives
+from calib.dynamics.base import Base
+from calib.dynamics.bodies import bodies_of, with_payload
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.pseudo_inertia import ball, margin
+from calib.geometry import fit as geometry
+from calib.geometry.first_guess import install
+from calib.identification.cases import Case, make_case
+from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.methods.method import IdentificationProblem
+from calib.identification.parameter_constraints import ConstraintSettings
+from calib.identification.rows import observe
+from calib.robot.chain import Chain, random_joints
+from calib.robot.load import load
+from calib.rooms.cells import known_robots
+from calib.rooms.cells.cell import SimulatedInstrument, measure
+from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
+from calib.rooms.studies.conditions import Condition
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
+from calib.simulation.loop.controllers import Controller
+from calib.simulation.loop.references import Reference, random_fourier
+from calib.simulation.loop.tracking import feed_forward
+
+# our choices
+DRAWN, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
+REACH, SPEED, ACCELERATION = 0.9, 0.8, 40.0  # shares of the limits; largest in any joint [rad/s²]
+THIN = 50  # of the control rate: instants at which a motion's condition and the validation torques are taken
+GEOMETRY = 3.0  # times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated
+POSES = 40  # measured for the geometric fit, by a tracker of frames (60 µm, 0.2 mrad)
+BELIEVED = 1.3, 0.7  # factors of kp, kd
+STRIBECK, SLIP = 0.5, 0.1  # peak of friction at rest beyond Fc, as its share; the speed it falls with [rad/s]
+PAYLOAD, AWAY = 1.0, 0.05  # [kg] a ball, [m] in front of the flange
+LATE = 2e-3  # [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What the data sets of a condition share.
+
+    Attributes:
+        chain: the arm as it is believed to be.
+        plant: the robot as its maker describes it.
+        reference: the motion, at the control rate.
+        other: the motion that validates.
+        every: control periods per sample, whole or not.
+    """
+
+    chain: Chain
+    plant: Plant
+    reference: Reference
+    other: Reference
+    every: float
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One data set.
+
+    Attributes:
+        problem: what a method is given; model: of it.
+        truth: (b,) true values of the model's base parameters.
+        matrix: (K, n, b) base regressor of the believed robot along the validation motion.
+        torque: (K, n) noise-free torques that the true robot needs along it, without what it carried unknown [N m].
+    """
+
+    problem: IdentificationProblem
+    model: IdentificationModel
+    truth: np.ndarray
+    matrix: np.ndarray
+    torque: np.ndarray
+
+
+@lru_cache(maxsize=4)
+def set_up(robot: str, duration: float) -> Setup:
+    """Return what the data sets of a robot share."""
+    chain = load(robot)
+    plant = known_robots.plant(robot)
+    known = known_robots.truth(robot)["control"]
+    rate, every = float(known["rate"]), float(known["rate"]) / float(known["sampling"])
+    model = known_robots.model(plant)
+    kept = _nominal_base(robot).kept
+
+    def draw(number: int) -> Reference:
+        lower, upper = chain.sampling_limits()
+        middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
+        speed = SPEED * np.array([joint.velocity for joint in chain.joints])
+        return random_fourier(
+            middle - half, middle + half, speed, duration, rate, HARMONICS, acceleration=ACCELERATION,
+            seed=np.random.default_rng([number, HARMONICS]),
+        )  # fmt: skip
+
+    def condition(reference: Reference) -> float:
+        part = slice(None, None, 2 * THIN)
+        matrix = model.regressor(reference.q[part], reference.v[part], reference.a[part])[:, :, kept]
+        matrix = matrix.reshape(-1, len(kept))
+        return float(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)))
+
+    training = min((draw(number) for number in range(DRAWN)), key=condition)
+    return Setup(chain, plant, training, draw(10_000), every)
+
+
+@lru_cache(maxsize=4)
+def _nominal_base(robot: str) -> Base:
+    return bases.find(known_robots.model(known_robots.plant(robot)))
+
+
+@lru_cache(maxsize=2)
+def make_experiment(condition: Condition, seed: int) -> Experiment:
+    """Return the data set of a condition with this number: the same at any place and time.
+
+    Raises:
+        CalibError: where the true robot cannot be recorded.
+    """
+    setup = set_up(condition.robot, condition.duration)
+    controller = known_robots.controller(condition.robot)
+    true, model, base, truth = _robots(condition, setup, seed)
+    case = _recorded(condition, setup, true, controller, seed)
+    decimator = case.motion.decimator
+    rows = observe(model, base.kept, case, decimator)
+    terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
+    problem = IdentificationProblem(
+        model, base, (case,), decimator, (rows,), terms, np.full(base.b, -1),
+        loop=_loop(condition, controller), start=base.transform @ _guess(setup.plant, condition.guess, seed),
+        constraints=ConstraintSettings(bodies=True),
+    )  # fmt: skip
+    matrix, torque = _validation(setup, model, base, truth if condition.mismatch == "payload" else true)
+    return Experiment(
+        problem, model, base.transform @ truth.parameters, matrix, torque
+    )  # fmt: skip
+
+
+def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, IdentificationModel, Base, Plant]:
+    """Return the robot that moves, the model and its base as believed, and the robot with the model's parameters."""
+    plant, chain = setup.plant, setup.chain
+    model, base = known_robots.model(plant), _nominal_base(condition.robot)
+    if condition.mismatch in ("geometry", "calibrated"):
+        cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=GEOMETRY))
+        true = replace(plant, bodies=bodies_of(replace(cell.truth.chain, inertias=chain.inertias)))
+        if condition.mismatch == "geometry":
+            return true, model, base, plant
+        measured = [measure(cell, random_joints(chain, POSES, seed), seed=seed)]
+        found = geometry.fit(install(chain, measured), measured).calibrated.chain
+        fitted = replace(model, bodies=bodies_of(found))
+        return true, fitted, bases.regroup(base, fitted), plant
+    if condition.mismatch == "friction":
+        v0 = float(known_robots.truth(condition.robot)["drives"]["v0"])
+        peaks = tuple(drives.stribeck(joint, SLIP, v0=v0)[-1] for joint in range(chain.n))
+        coulomb = np.array(known_robots.truth(condition.robot)["drives"]["Fc"])
+        values = np.concatenate([plant.parameters, STRIBECK * coulomb])
+        return Plant(plant.bodies, (*plant.terms, *peaks), values), model, base, plant
+    if condition.mismatch == "payload":
+        size = plant.inertial
+        body = ball(PAYLOAD, AWAY, np.array([0.0, 0.0, AWAY]))
+        bodies = with_payload(plant.bodies, np.asarray(chain.tail), on=chain.n - 1)
+        values = np.concatenate([plant.parameters[:size], body, plant.parameters[size:]])
+        return Plant(bodies, plant.terms, values), model, base, plant
+    return plant, model, base, plant
+
+
+def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Controller, seed: int) -> Case:
+    """Return the case of one noisy run of the true robot."""
+    sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
+
+    def run(every: float) -> SimulatedRun:
+        own = replace(sensing, every=every)
+        return simulate(true, controller, setup.reference, own, np.random.default_rng([seed, 20_211]))
+
+    log, period = run(setup.every), setup.reference.period
+    rate, torque = 1.0 / (period * setup.every), log.tau
+    if condition.mismatch == "clock":
+        torque = run(1).tau[np.maximum(np.rint((log.t - log.t[0] - LATE) / period).astype(int), 0)]
+    asked = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
+    recording = Recording(
+        log.t, log.measured, torque, "torque", setup.chain.joint_names, q_ref=asked, file=condition.name
+    )  # fmt: skip
+    cutoff = condition.cutoff or USABLE * rate / 2
+    decimator = design_decimator(rate, condition.decimation, "chebyshev")
+    motion = make_motion(recording, FilterOptions(cutoff=cutoff, band=0.999 * decimator.band, clock="stamps"))
+    return make_case(condition.name, replace(motion, decimator=decimator, band=decimator.band))
+
+
+def _loop(condition: Condition, controller: Controller) -> LoopSettings:
+    """Return the loop as it is believed to be."""
+    kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
+    known = known_robots.truth(condition.robot)
+    return LoopSettings(
+        "pd", kp=tuple(kp * controller.kp), kd=tuple(kd * controller.kd), limit=tuple(controller.limit),
+        rate=float(known["control"]["rate"]), inertia=tuple(known["drives"]["Ia"]),
+    )  # fmt: skip
+
+
+def _validation(setup: Setup, model: IdentificationModel, base: Base, true: Plant) -> tuple[np.ndarray, np.ndarray]:
+    other, part = setup.other, slice(None, None, THIN)
+    thin = Reference(other.t[part], other.q[part], other.v[part], other.a[part])
+    return model.regressor(thin.q, thin.v, thin.a)[:, :, base.kept], feed_forward(true, thin)
+
+
+def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
+    """Return the robot's parameters, each off by a normal relative error, of bodies that can be and drives that brake.
+
+    A body is drawn until it can be (the survey's way, but body by body); where that takes long, from a smaller spread.
+    """
+    rng = np.random.default_rng([seed, 15])
+    values = np.array(plant.parameters)
+    for first in range(0, plant.inertial, 10):
+        body, own = plant.parameters[first : first + 10], spread
+        for attempt in range(1000):
+            values[first : first + 10] = body * (1.0 + own * rng.standard_normal(10))
+            if margin(values[first : first + 10]) > 0.0:
+                break
+            own *= 0.5 if attempt % 100 == 99 else 1.0
+    drives_ = plant.parameters[plant.inertial :]
+    off = 1.0 + spread * rng.standard_normal(len(drives_))
+    values[plant.inertial :] = drives_ * np.maximum(off, 0.01)
+    return values

@@ -1,0 +1,201 @@
+"""Output and input error of the simulated closed loop: the survey's CLOE and CLIE, with exact sensitivities.
+
+    CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the robot that moves as the real one does
+    CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the robot whose controller asks for the same torques
+
+q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
+Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
+∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`calib.simulation.loop.tangent_kernels`)
+where differences take one simulation per parameter. What is left is what noise did in the loop, correlated over time;
+the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`calib.estimation.correlated`).
+
+What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.linalg
+
+from calib.data.signals.decimation import decimate
+from calib.errors import CalibError, NotConverged, UsageError
+from calib.estimation import nonlinear
+from calib.estimation.correlated import scatter
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import condition_numbers, require_rank
+from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
+from calib.identification.loop.simulated_motion import low_passed, simulated_samples
+from calib.identification.methods.least_squares import WLS
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.rows import thinned
+from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, serial_arm, start_of
+from calib.simulation.loop.closed_loop import Sensing, simulate, simulate_tangents
+
+ROUNDS = 3  # of weighing joints by what the last estimate leaves
+LIMIT = 25  # simulations with tangents per round
+TOLERANCE = 0.05  # standard deviations of the estimate
+DAMPING = 1e-3  # at first
+IMPOSSIBLE = 1e60  # residual of parameters that cannot be simulated: any step that can is better
+
+
+@dataclass(frozen=True)
+class _OutputError(Method):
+    """A method that fits the simulated closed loop to the recorded one; see the module.
+
+    Attributes:
+        torques: whether torques are compared, and not positions.
+    """
+
+    needs_controller: bool = field(default=True, kw_only=True)
+    needs_simulation: bool = field(default=True, kw_only=True)
+    torques: bool
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the problem's columns; one simulation gives motion and tangents.
+
+        Raises:
+            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+        """
+        if problem.loop is None:
+            raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return replace(plain, method=self.name)
+        bodies = serial_arm(problem, self.name).bodies
+        loops = close_loops(bodies, problem.cases, problem.decimator, problem.loop, problem.cad)
+        return attempted(self.name, problem, lambda: self._estimate(problem, plain, loops), loops)
+
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, loops: ClosedLoops) -> MethodEstimate:
+        task = _Comparison(problem, believed_robot(problem, self.name), loops, self.torques)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
+        inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
+        values = start_of(problem, self.name, plain.estimate.values, inertia, task.simulated)
+        first, _ = task.linearised(values)
+        std, count = task.spread(first, 0), 1
+        for _ in range(ROUNDS):
+            found = task.solved(values, std)
+            values, count = found.state, count + found.iterations
+            residual, slopes = task.linearised(values)
+            before, std = std, task.spread(residual, len(values))
+            if np.all(np.abs(std / before - 1.0) < 0.1):
+                break
+        fit = _packed(task, plain, values, residual, slopes, std)
+        step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
+        if not found.status.good and step > 0.5:
+            raise NotConverged(f"{self.name}: {found.status.value} ({step:.2g} standard deviations from rest)", fit)
+        return replace(
+            plain, method=self.name, status=EstimateStatus.FOUND, solution=fit, std=std if self.torques else plain.std,
+            iterations=count, simulations=task.count[0], beforehand=None, loops=loops, alone=True,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """What is compared: recordings in their loops, positions or torques; `count` of simulations."""
+
+    problem: IdentificationProblem
+    robot: BelievedRobot
+    loops: ClosedLoops
+    torques: bool
+    count: list[int] = field(default_factory=lambda: [0])
+
+    def simulated(self, values: np.ndarray) -> None:
+        """Simulate the loops, or raise what stands against it."""
+        for case, loop in self.loops.pairs:
+            plant, controller = self.robot.at(values, case), loop.controller
+            if loop.design is not None:
+                controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+            self.count[0] += 1
+            simulate(plant, controller, loop.reference, Sensing(every=loop.every))
+
+    def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (M, n), zero where nothing is compared, and slopes (M, n, p) of what is simulated."""
+        residuals, slopes = [], []
+        for case, loop in self.loops.pairs:
+            plant, controller, relative = self.robot.at(values, case), loop.controller, None
+            if loop.design is not None:
+                diagonal = plant.inertia_diagonal(loop.reference.q[::200])
+                controller = controller.scaled(diagonal / loop.design)
+                relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
+            self.count[0] += 1
+            run = simulate_tangents(plant, controller, loop.reference, self.robot.columns, loop.every, relative)
+            index, motion = simulated_samples(case, run.t, loop), case.motion
+            if self.torques:
+                rest, slope = case.target - run.torque[index], run.by_torque[index]
+            else:
+                moved, slope = (low_passed(x, motion)[index] for x in (run.q, run.by_q))
+                rest = motion.q - moved
+            there = self.robot.carried(case)[self.robot.columns]
+            used = thinned(case.present, motion.segment, self.problem.decimator)
+            rest, slope = (decimate(x, self.problem.decimator, motion.segment) for x in (rest, slope))
+            residuals.append(np.where(used, rest, 0.0))
+            slopes.append(np.where(used[:, :, None], slope * there, 0.0))
+        return np.concatenate(residuals), np.concatenate(slopes)
+
+    def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
+        """Return the slopes (n, p) of the mean diagonal of the inertia, which is linear in the parameters."""
+        p = len(self.robot.columns)
+        return np.array([self.robot.at(np.eye(p)[k]).inertia_diagonal(q) for k in range(p)]).T
+
+    def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (M n,) and slopes (M n, p) over (n,) std; of what cannot be simulated huge ones."""
+        p = len(values)
+        try:
+            residual, slopes = self.linearised(values)
+        except CalibError:
+            return np.full(p + 1, IMPOSSIBLE), np.zeros((p + 1, p))
+        return (residual / std).ravel(), np.asfortranarray((slopes / std[:, None]).reshape(-1, p))
+
+    def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
+        """Return the parameters that minimise the residuals over (n,) std."""
+        return nonlinear.solve(
+            lambda x: self.whitened(x, std), lambda x, step: x + step, values, damping=DAMPING, tolerance=TOLERANCE,
+            limit=LIMIT,
+        )  # fmt: skip
+
+    def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
+        """Return the standard deviation (n,) of each joint's residuals."""
+        count = np.maximum(np.sum(residual != 0.0, axis=0), 1)
+        share = max(1.0 - p / count.sum(), 0.1)
+        std = np.sqrt(np.sum(residual**2, axis=0) / count / share)
+        return np.maximum(std, 1e-6 * max(float(std.max()), 1e-300))
+
+
+def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Return the next Gauss-Newton step in standard deviations, were residuals white: Qᵀ r."""
+    p = slopes.shape[2]
+    return np.linalg.qr(slopes.reshape(-1, p))[0].T @ residual.ravel()
+
+
+def _packed(
+    task: _Comparison,
+    plain: MethodEstimate,
+    values: np.ndarray,
+    residual: np.ndarray,
+    slopes: np.ndarray,
+    std: np.ndarray,
+) -> LinearFit:
+    """Return the fit with the covariance H⁻¹ S H⁻¹.
+
+    Raises:
+        Unidentifiable: where the simulated motion does not tell parameters apart.
+    """
+    white, left = slopes / std[:, None], residual / std
+    p, rows = len(values), int(np.sum(residual != 0.0))
+    flat = white.reshape(-1, p)
+    size = np.linalg.norm(flat, axis=0)
+    factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
+    require_rank(factor, plain.pooled.names, "the simulated motion does not tell them apart")
+    inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
+    bread = inverse @ inverse.T
+    covariance = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread
+    estimate = replace(plain.estimate, values=values, covariance=covariance, residual_std=1.0)
+    return LinearFit(estimate, std, *condition_numbers(flat))
+
+
+_LOOP = "controller and reference are those of the loop, the model's friction that of the robot; "
+CLOE = _OutputError("cloe", _LOOP + "no measured torque takes part", False)
+CLIE = _OutputError("clie", _LOOP + "no measured position takes part", True)

@@ -1,0 +1,224 @@
+"""The report of a study: tables, box plots, and the decision rule, as one HTML file; the same tables for a console."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from importlib import metadata, resources
+
+from calib.procedure.report.page import Pictures, Section, Table, Text
+from calib.rooms.studies.conditions import Condition, Study
+from calib.rooms.studies.reports import figures
+from calib.rooms.studies.summary import (
+    ALIKE,
+    FIGURES,
+    LEAST,
+    LEVEL,
+    RELIABLE,
+    SLACK,
+    ConditionSummary,
+    MethodSummary,
+    Quartiles,
+)
+from calib.rooms.studies.trial import TrialRow
+
+RULE = (
+    f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
+    "whose torque error on unseen motion, noise-free, is not told from the best one's on the same data sets (sign "
+    f"test, {LEVEL:.0%}), or, in the median data set, larger by at most {SLACK:.0%}.",
+    f"Of these one is taken that is cheap, at most {ALIKE:g} times the processor time of the cheapest: the best such.",
+    "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
+    f"A method with fewer than {LEAST} runs is listed, and neither the best nor as good: so few tell nothing apart.",
+)
+MEANING = (
+    "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
+    "β: 100 ‖β̂ - β‖ / ‖β‖ of the base parameters; in σ: rms of their errors in stated standard deviations (1 where "
+    "these tell the error); covered: share within 1.96 σ (95 % where they do).",
+    "d_τ, d_q: the survey's figures, on the data set itself. d_τ compares with noisy torque, and has a floor that no "
+    "method goes below: it cannot rank.",
+    "All are medians over trials; CPU is processor time of the method alone; p is the sign test's against the best.",
+)
+BESIDE = (  # figures in the order of the columns behind the quartiles
+    "torque_worst", "beta_error", "beta_sigma", "coverage", "survey_tau", "survey_q", "iterations", "simulations",
+    "cpu",
+)  # fmt: skip
+HEADER = (
+    "method", "trials", "failed", "torque [%]", "quartiles", "worst joint [%]", "β [%]", "in σ", "covered [%]",
+    "d_τ [%]", "d_q [%]", "rounds", "simulations", "CPU [s]", "p", "",
+)  # fmt: skip
+ON_CONSOLE = tuple(
+    HEADER.index(name)
+    for name in ("method", "trials", "failed", "torque [%]", "quartiles", "covered [%]", "CPU [s]", "")
+)
+
+
+def overview(conditions: Sequence[ConditionSummary]) -> Table:
+    """Return what to take on each condition."""
+    lines = []
+    for one in conditions:
+        if not one.methods:
+            lines.append((one.condition.name, _described(one.condition), "no rows yet", "", "", "", ""))
+            continue
+        best, chosen = one.best, one.chosen
+        failed = ", ".join(f"{m.method} {sum(m.failures.values())}/{m.trials}" for m in one.methods if m.failures)
+        lines.append(
+            (
+                one.condition.name, _described(one.condition), chosen.method if chosen else "none",
+                _short(chosen.figures["torque_error"].median) if chosen else "",
+                f"{best.method} {_short(best.figures['torque_error'].median)}" if best else "",
+                ", ".join(m.method for m in one.methods if m.as_good and m is not chosen), failed,
+            )
+        )  # fmt: skip
+    header = ("condition", "", "take", "torque [%]", "best [%]", "as good", "without an estimate")
+    return Table("What to take", header, lines, numbers=(3,))
+
+
+def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
+    """Return the median torque error of every method on every condition."""
+    names = list(dict.fromkeys(method.method for one in conditions for method in one.methods))
+    lines = []
+    for one in conditions:
+        own = {method.method: method for method in one.methods}
+        lines.append((one.condition.name, *(_median_cell(own.get(name)) for name in names)))
+    note = (
+        f"Median over trials [%]; a trial without an estimate counts as ∞. * the one to take; (n) of fewer than "
+        f"{LEAST} runs."
+    )
+    return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=range(1, len(names) + 1))
+
+
+def _median_cell(one: MethodSummary | None) -> str:
+    if one is None:
+        return ""
+    return _short(one.figures["torque_error"].median) + (
+        "*" if one.chosen else "" if one.enough else f" ({one.trials})"
+    )
+
+
+def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
+    """Return why there is no method to take, and on which conditions."""
+    found: dict[str, list[str]] = {}
+    for one in conditions:
+        if why := one.why_none:
+            found.setdefault(why, []).append(one.condition.name)
+    return [
+        f"none to take on {'all' if 1 < len(names) == len(conditions) else ', '.join(names)}: {why}"
+        for why, names in found.items()
+    ]
+
+
+def _described(one: Condition) -> str:
+    """Return a condition in a line."""
+    filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
+    wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
+    degrees = math.degrees(one.sigma_q)
+    return f"{one.robot}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
+
+
+def _condition_table(one: ConditionSummary) -> Table:
+    """Return all methods of a condition, best first."""
+    rows = [_line(method) for method in one.methods]
+    strong = frozenset(k for k, method in enumerate(one.methods) if method.chosen)
+    return Table(
+        f"Methods on {one.condition.name}", HEADER, rows, _described(one.condition), strong, range(1, len(HEADER) - 1)
+    )
+
+
+def console_table(one: ConditionSummary) -> Table:
+    """Return the columns of a condition's table that a terminal has room for."""
+    whole = _condition_table(one)
+    rows = [tuple(row[k] for k in ON_CONSOLE) for row in whole.rows]
+    header = tuple(HEADER[k] for k in ON_CONSOLE)
+    return replace(whole, header=header, rows=rows, numbers=range(1, len(header) - 1))
+
+
+def failures(one: ConditionSummary) -> list[Text]:
+    """Return each way in which a method failed on a condition, how often, and the first one's message; or nothing."""
+    said = [
+        f"{method.method}: {count} {status}, e.g. {method.examples[status]}"
+        for method in sorted(one.methods, key=lambda method: method.method)
+        for status, count in method.failures.items()
+    ]
+    return [Text("Without an estimate", said)] if said else []
+
+
+def _line(one: MethodSummary) -> tuple[str, ...]:
+    def median(name: str) -> str:
+        return _short(one.figures[name].median)
+
+    failed = ", ".join(f"{count} {status}" for status, count in one.failures.items())
+    mark = "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
+    return (
+        one.method, str(one.trials), failed or "0", median("torque_error"), _quartiles(one.figures["torque_error"]),
+        *map(median, BESIDE), _short(one.p), mark,
+    )  # fmt: skip
+
+
+def _short(value: float) -> str:
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞"
+    return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.1e}"
+
+
+def _quartiles(found: Quartiles) -> str:
+    return f"{_short(found.lower)}–{_short(found.upper)}"
+
+
+def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], list[list[object]]]:
+    """Return header and rows of ``summary.csv``."""
+    header = ["condition", "method", "trials", "failed", "rank", "as_good", "take", "p"]
+    header += [f"{name}_{part}" for name in FIGURES for part in ("median", "lower", "upper")]
+    lines: list[list[object]] = []
+    for one in conditions:
+        for method in one.methods:
+            spreads = [value for name in FIGURES for value in _parts(method.figures[name])]
+            flags = ["yes" if flag else "no" for flag in (method.as_good, method.chosen)]
+            head = [one.condition.name, method.method, method.trials, sum(method.failures.values()), method.rank]
+            lines.append([*head, *flags, "" if math.isnan(method.p) else method.p, *spreads])
+    return header, lines
+
+
+def _parts(found: Quartiles) -> list[object]:
+    return ["" if math.isnan(value) else value for value in (found.median, found.lower, found.upper)]
+
+
+def make_page(
+    study: Study,
+    conditions: Sequence[ConditionSummary],
+    rows: Sequence[TrialRow],
+    notes: Sequence[str],
+    plots: bool = True,
+) -> str:
+    """Return the report as HTML.
+
+    Args:
+        rows: of these conditions.
+        plots: with box plots.
+    """
+    import jinja2  # slow to load
+
+    head = [overview(conditions), *([torque_table(conditions)] if len(conditions) > 1 else [])]
+    sections = [Section("", [*head, Text("How that was decided", RULE), Text("Figures", MEANING)])]
+    for one in conditions:
+        if not one.methods:
+            continue
+        own = [row for row in rows if row.digest == one.condition.digest]
+        blocks = [_condition_table(one)]
+        drawn = [Pictures("", [figures.boxes(one, own)])] if plots else []
+        blocks = [*blocks, *drawn, *failures(one)]
+        sections.append(Section(one.condition.name, blocks))
+    here, style = resources.files("calib.rooms.studies.reports"), resources.files("calib.procedure.report")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    source = here.joinpath("study.html").read_text(encoding="utf-8")
+    when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z").strip()
+    return environment.from_string(source).render(
+        title=study.name, about=study.about, sections=sections, notes=notes,
+        issued=f"{when}, armature-calib {metadata.version('armature-calib')}, {len(rows)} trials",
+        style=style.joinpath("certificate.css").read_text(encoding="utf-8"),
+    )  # fmt: skip

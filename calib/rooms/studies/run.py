@@ -1,0 +1,108 @@
+"""Running what a study lacks: tasks to workers, rows to the store as they come."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from calib.errors import TaskLost
+from calib.rooms.studies.conditions import Study
+from calib.rooms.studies.store import RowStore
+from calib.rooms.studies.trial import Trials, grouped, run_trials
+from calib.workers import Workers
+
+HURRY = 1.0  # [s] between two words on progress
+
+
+@dataclass
+class Progress:
+    """How far a command has come.
+
+    Attributes:
+        wanted: trials that this command has to run.
+        done, failed: that have ended; of these without an estimate.
+        lost: that no worker brought back.
+        seconds: since it began.
+    """
+
+    wanted: int
+    done: int = 0
+    failed: int = 0
+    lost: int = 0
+    spent: dict[str, list[float]] = field(default_factory=dict)
+    left: Counter = field(default_factory=Counter)
+    began: float = field(default_factory=time.monotonic)
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.began
+
+    @property
+    def remaining(self) -> float:
+        """Seconds that are left, by each method's own pace so far and by how many run at once."""
+        paces = {name: sum(own) / len(own) for name, own in self.spent.items()}
+        if not paces or self.seconds <= 0:
+            return float("nan")
+        worked = sum(sum(own) for own in self.spent.values())
+        mean = worked / max(self.done, 1)
+        ahead = sum(count * paces.get(name, mean) for name, count in self.left.items())
+        return ahead * self.seconds / max(worked, 1e-9)
+
+    def __str__(self) -> str:
+        words = f"{self.done} of {self.wanted} trials, {60 * self.done / max(self.seconds, 1e-9):.0f} a minute"
+        words += f", {self.failed} without an estimate" if self.failed else ""
+        words += f", {self.lost} lost" if self.lost else ""
+        left = self.remaining
+        return words if left != left or not self.wanted - self.done else f"{words}; {span(left)} to go"
+
+
+def span(seconds: float) -> str:
+    """Return a time for people: 40 s, 12 min, 3.1 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
+    """Yield the tasks whose rows a store lacks; data set by data set, so that all conditions fill up alike."""
+    most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
+    for number in range(most):
+        for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
+            seed, digest = first + number, condition.digest
+            wanted = [
+                name for name, count in runs.items() if number < count and not store.holds((digest, name, seed))
+            ]  # fmt: skip
+            yield from grouped(condition, wanted, seed)
+
+
+def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress], None]) -> Progress:
+    """Run what is missing; rows are in the store as soon as they are there.
+
+    Args:
+        say: called with how far it is, now and then.
+
+    Raises:
+        CalibError: where rows cannot be kept, or the workers are gone.
+    """
+    tasks = list(_missing(study, store))
+    progress = Progress(sum(len(task.methods) for task in tasks))
+    progress.left.update(name for task in tasks for name in task.methods)
+    said = 0.0
+    for number, rows in workers.completed(run_trials, tasks):
+        methods = tasks[number].methods
+        progress.left.subtract(methods)
+        if isinstance(rows, TaskLost):
+            progress.lost += len(methods)
+        else:
+            store.append(rows)
+            progress.done += len(rows)
+            progress.failed += sum(not row.found for row in rows)
+            for row in rows:
+                progress.spent.setdefault(row.method, []).append(row.seconds if row.seconds == row.seconds else 0.0)
+        if time.monotonic() - said > HURRY:
+            said = time.monotonic()
+            say(progress)
+    say(progress)
+    return progress

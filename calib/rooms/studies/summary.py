@@ -1,0 +1,195 @@
+"""What rows say: figures of merit of each method on each condition, and which methods can be told apart.
+
+Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
+on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
+data set go together and their distributions have long tails.
+
+The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
+motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set, are as good
+as the best; a method of fewer than `LEAST` runs is listed and takes no part. Of these one is taken that is cheap: no
+more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+
+from calib.rooms.studies.conditions import Condition, Study
+from calib.rooms.studies.trial import TrialRow
+
+RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0  # our choices
+LEAST = 6  # common data sets below which the sign test cannot tell at 5 %
+FIGURES = (
+    "torque_error", "torque_worst", "beta_error", "beta_distance", "beta_sigma", "coverage", "survey_tau", "survey_q",
+    "iterations", "simulations", "cpu", "seconds",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Quartiles:
+    """Median and quartiles of a figure over runs; failures are infinite in errors, and left out elsewhere."""
+
+    median: float
+    lower: float
+    upper: float
+    count: int
+
+
+@dataclass(frozen=True)
+class MethodSummary:
+    """One method on one condition.
+
+    Attributes:
+        trials: number of its rows; failures: status → how many of them gave no estimate.
+        examples: status → data set and message of the first of these.
+        figures: name of a figure (`FIGURES`) → its spread.
+        rank: by the median torque error, from 1.
+        as_good: not told from the best, or within `SLACK` of it, and reliable.
+        chosen: the one of those to take.
+        p: of the sign test against the best; NaN for the best itself.
+    """
+
+    method: str
+    trials: int
+    failures: Mapping[str, int]
+    examples: Mapping[str, str]
+    figures: Mapping[str, Quartiles]
+    rank: int = 0
+    as_good: bool = False
+    chosen: bool = False
+    p: float = float("nan")
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are runs enough to tell it from others."""
+        return self.trials >= LEAST
+
+    @property
+    def estimates(self) -> bool:
+        """Whether its median torque error is of estimates, not of failures."""
+        return bool(np.isfinite(self.figures["torque_error"].median))
+
+    @property
+    def reliable(self) -> bool:
+        return sum(self.failures.values()) <= (1.0 - RELIABLE) * self.trials
+
+
+@dataclass(frozen=True)
+class ConditionSummary:
+    """All methods on one condition, best first."""
+
+    condition: Condition
+    methods: tuple[MethodSummary, ...]
+
+    @property
+    def chosen(self) -> MethodSummary | None:
+        """The method to take; None where none is reliable."""
+        return next((one for one in self.methods if one.chosen), None)
+
+    @property
+    def best(self) -> MethodSummary | None:
+        """The first in rank of those with runs enough and an estimate; None without any."""
+        return next((one for one in self.methods if one.enough and one.estimates), None)
+
+    @property
+    def why_none(self) -> str:
+        """Why there is no method to take; "" where there is one, or no row."""
+        if self.chosen or not self.methods:
+            return ""
+        if not any(one.enough for one in self.methods):
+            return f"fewer than {LEAST} runs of any method tell nothing apart: --runs {LEAST} or more"
+        return f"no method of {LEAST} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
+
+
+def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
+    """Return what rows say of a study's conditions, all methods that have any.
+
+    Rows of other conditions do not count, nor do those of a method that has changed since.
+
+    What a study asks for is what is to be run; what is there stays in sight when a method is added or taken out.
+    """
+    kept: dict[str, dict[str, list[TrialRow]]] = {}
+    for row in (one for one in rows if one.current):
+        kept.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
+    result = []
+    for condition, runs in zip(study.conditions, study.runs):
+        own = kept.get(condition.digest, {})
+        result.append(_ranked(condition, {name: own[name] for name in dict.fromkeys((*runs, *own)) if name in own}))
+    return result
+
+
+def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
+    errors = {name: {row.seed: _error(row) for row in own} for name, own in rows.items()}
+    plain = [_summary(name, own) for name, own in rows.items()]
+    plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
+    if not plain:
+        return ConditionSummary(condition, ())
+    best = next((one for one in plain if one.enough), None)
+    judged = []
+    for rank, one in enumerate(plain, 1):
+        if best is None or one is best or not one.enough:
+            good = one is best and one.reliable and one.estimates
+            judged.append(replace(one, rank=rank, as_good=good))
+            continue
+        p = sign_test(errors[one.method], errors[best.method])
+        near = _ratio(errors[one.method], errors[best.method]) <= 1.0 + SLACK
+        judged.append(replace(one, rank=rank, as_good=one.reliable and best.reliable and (near or p > LEVEL), p=p))
+    good = [one for one in judged if one.as_good]
+    least = min((one.figures["cpu"].median for one in good), default=0.0)
+    chosen = next((one for one in good if not one.figures["cpu"].median > ALIKE * least), None)
+    return ConditionSummary(condition, tuple(replace(one, chosen=one is chosen) for one in judged))
+
+
+def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+    """Return the median of a method's error over another's on the same data sets; infinite where there are none."""
+    both = [(one[seed], other[seed]) for seed in one.keys() & other.keys() if np.isfinite(other[seed])]
+    return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
+
+
+def _error(row: TrialRow) -> float:
+    return row.torque_error if row.found else float("inf")
+
+
+def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
+    failures = Counter(row.status for row in rows if not row.found)
+    first = {row.status: row for row in sorted(rows, key=lambda row: -row.seed)}
+    examples = {status: f"data set {first[status].seed}: {first[status].message}" for status in failures}
+    figures = {}
+    for figure in FIGURES:
+        bad = figure in ("torque_error", "torque_worst", "beta_error", "beta_distance")
+        values = [float(getattr(row, figure)) for row in rows if row.found]
+        values += [float("inf")] * (len(rows) - len(values)) if bad else []
+        figures[figure] = spread(values)
+    return MethodSummary(name, len(rows), failures, examples, figures)
+
+
+def spread(values: Sequence[float]) -> Quartiles:
+    """Return median and quartiles of what is not NaN; of nothing, NaN."""
+    found = np.sort([value for value in values if value == value])
+    if not len(found):
+        return Quartiles(float("nan"), float("nan"), float("nan"), 0)
+    with np.errstate(invalid="ignore"):
+        lower, upper = (float(x) for x in np.quantile(found, [0.25, 0.75], method="nearest"))
+    return Quartiles(float(np.median(found)), lower, upper, len(found))
+
+
+def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+    """Return the two-sided p of the sign test that one method's error exceeds the other's as often as not.
+
+    Args:
+        one, other: seed → error; seeds in both count, ties do not.
+
+    Returns:
+        1 where fewer than `LEAST` data sets tell them apart.
+    """
+    both = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
+    larger, smaller = sum(a > b for a, b in both), sum(a < b for a, b in both)
+    count, few = larger + smaller, min(larger, smaller)
+    if count < LEAST:
+        return 1.0
+    return min(1.0, 2.0 * sum(comb(count, k) for k in range(few + 1)) / 2.0**count)

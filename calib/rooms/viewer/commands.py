@@ -1,0 +1,51 @@
+"""What a folder holds, in Rerun: view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.options import command
+from calib.cli.shared import Overwrite, say
+from calib.errors import UsageError, command_line
+
+app = typer.Typer()
+
+
+@command(app)
+def view(
+    folder: Annotated[Path, typer.Argument(metavar="DIR")],
+    save: Path | None = None,
+    spawn: Annotated[bool | None, typer.Option("--spawn/--no-spawn")] = None,
+    robot: str | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Show robot, errors, poses, motions or torques in Rerun.
+
+    Args:
+        folder: of a fit, a session, an identification, a motion; or a CSV
+        save: write a Rerun recording (.rrd), and open no window
+        spawn: open Rerun's window; by default where nothing is saved
+        robot: the arm to draw, where the folder does not say
+    """
+    from calib.files import results
+    from calib.procedure.robot_kinds import stage_of
+    from calib.rooms.viewer import viewer
+
+    stage_of(folder, "calib view")
+    if save is None and spawn is False:
+        raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
+    scene = None
+    if save:
+        inside = folder.iterdir() if folder.is_dir() else ()
+        read = [folder, robot, *(path for path in inside if path.suffix != ".rrd")]
+        with results([(save, (".rrd",))], read, overwrite):
+            scene = viewer.write(folder, save, robot)
+        size = f"{1e-6 * save.stat().st_size:.1f} MB"
+        say(f"{save}: {size}; {command_line(save, program='rerun')} shows it")
+    if spawn or (spawn is None and save is None):
+        scene = viewer.spawn(folder, robot)
+    for note in scene.notes if scene else ():
+        say(f"note: {note}")

@@ -1,0 +1,338 @@
+"""What there is to see in a folder, as plain arrays: `calib.rooms.viewer.viewer` shows it.
+
+A folder is that of a fit, an identification, an excitation, a planned motion, or a session that has several of them.
+All points are in the base of the arm that is drawn.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.config import read_toml
+from calib.data.csv_table import Table, read_table
+from calib.data.poses.plans import read_poses
+from calib.dynamics.torque_rows import MOTOR, ROWS
+from calib.errors import CalibError, UsageError
+from calib.geometry import installation_file
+from calib.geometry.installation import Installation, see
+from calib.identification import model_file
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.excitation import coefficients
+from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.measuring.run import is_run, rehearsed_samples
+from calib.records import shielded
+from calib.robot import calibrated, library
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward, joint_frames
+from calib.robot.load import load, resolve
+from calib.robot.visuals import Visual, visuals
+from calib.transforms import invert
+
+FRAMES = 50.0  # positions of the arm per second of motion; our choice
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """m measured poses: where the target was seen, and where the two arms say it is.
+
+    Attributes:
+        name: what they are.
+        q: (m, n) [rad or m].
+        seen, nominal, calibrated: (m, 3) [m].
+        unseen: (m,) whether the row was kept from the fit.
+        turned: (m, 3) rotation vector from the calibrated arm's orientation to the one seen, as ``residuals.csv`` has
+            it [rad]; NaN where none was measured.
+    """
+
+    name: str
+    q: np.ndarray
+    seen: np.ndarray
+    nominal: np.ndarray
+    calibrated: np.ndarray
+    unseen: np.ndarray
+    turned: np.ndarray
+
+    def arrow_scale(self, chain: Chain) -> float:
+        """Return the factor 1, 2 or 5 · 10^k that makes the larger arrows about a tenth of the arm long."""
+        span = float(np.ptp(skeleton(chain, self.q)[:, -1], axis=0).max()) or 1.0
+        large = float(np.quantile(np.linalg.norm(self.seen - self.nominal, axis=1), 0.9)) or 1e-3
+        wanted = 0.1 * span / large
+        steps = np.array([f * 10.0**k for k in range(7) for f in (1.0, 2.0, 5.0)])
+        return float(steps[np.argmin(np.abs(np.log(steps / wanted)))])
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A motion: times (N,) [s], joint values, and velocities where they are known (N, n)."""
+
+    name: str
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Torques:
+    """Measured and predicted torques (N, rows) of a recording, at times t (N,) [s], and its joints (N, n).
+
+    Attributes:
+        rows, units: what each torque is, by joint and kind, and its unit.
+    """
+
+    name: str
+    rows: tuple[str, ...]
+    units: tuple[str, ...]
+    t: np.ndarray
+    measured: np.ndarray
+    predicted: np.ndarray
+    q: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All there is to show.
+
+    Attributes:
+        title: of the recording.
+        chain: the arm that is drawn; None where none is known.
+        meshes: of its links.
+        measured: poses with their errors.
+        chosen: names and joint values of pose plans (m, n), in the order of choice.
+        played: motions.
+        torques: recordings.
+        notes: what could not be shown.
+    """
+
+    title: str
+    chain: Chain | None = None
+    meshes: tuple[Visual, ...] = ()
+    measured: tuple[Measured, ...] = ()
+    chosen: tuple[tuple[str, np.ndarray], ...] = ()
+    played: tuple[Played, ...] = ()
+    torques: tuple[Torques, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+
+def read(folder: str | Path, robot: str | None = None) -> Scene:
+    """Gather what `folder` holds.
+
+    Args:
+        folder: of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.
+        robot: the arm to draw; None for the folder's own.
+
+    Raises:
+        UsageError: where there is nothing to see.
+    """
+    folder = Path(folder)
+    if folder.is_file() and folder.suffix == ".csv":
+        return _of_poses(folder, robot)
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is no folder; give that of a fit, a session, an identification or a motion")
+    chain, source = _arm(folder, robot)
+    meshes, notes = _meshes(chain, source)
+    fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
+    motions = [path for name in (coefficients.SAMPLES, coefficients.PLANNED) for path in _below(folder, name)]
+    torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
+    plans = sorted(folder.glob("2-poses/*.csv"))
+    scene = Scene(
+        folder.resolve().name,
+        chain,
+        tuple(meshes),
+        tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
+        tuple((path.stem, _chosen(path, chain)) for path in plans if not is_run(path)) if chain else (),
+        (
+            *(_rehearsed(path, chain) for path in plans if chain and is_run(path)),
+            *(_played(path, folder) for path in motions),
+        ),
+        tuple(_torques(path, folder, chain) for path in torques),
+        tuple(notes),
+    )
+    if not (scene.measured or scene.chosen or scene.played or scene.torques):
+        raise UsageError(
+            f"{folder} holds nothing to see: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
+        )
+    if chain is None:
+        words = "no robot is drawn: the folder does not say which; give --robot"
+        return replace(scene, notes=(*scene.notes, words))
+    return scene
+
+
+def _of_poses(path: Path, robot: str | None) -> Scene:
+    """Return a scene of chosen poses, or of a run through them."""
+    if robot is None:
+        raise UsageError(f"{path}: say whose poses these are: --robot")
+    chain, source = load(robot), resolve(robot)
+    meshes, notes = _meshes(chain, source)
+    if is_run(path):
+        return Scene(path.stem, chain, tuple(meshes), played=(_rehearsed(path, chain),), notes=tuple(notes))
+    return Scene(path.stem, chain, tuple(meshes), chosen=((path.stem, _chosen(path, chain)),), notes=tuple(notes))
+
+
+def _below(folder: Path, pattern: str) -> list[Path]:
+    """Return files of the folder itself and of those up to two levels below, the folder's own first."""
+    return [path for depth in ("", "*/", "*/*/") for path in sorted(folder.glob(depth + pattern))]
+
+
+def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
+    """Return the arm to draw, and the file it was described in first."""
+    if robot is not None:
+        return load(robot), resolve(robot)
+    for place in (folder, folder / IN_SESSION):
+        if (place / calibrated.ROBOT).is_file():
+            known = calibrated.read(place)
+            return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
+    for place in sorted(folder.glob("1-robot/robot.*")):
+        return load(str(place)), place
+    try:
+        name = read_toml(folder / coefficients.NAME).get("robot", "")
+    except CalibError:
+        return None, None
+    return (load(name), None) if name in library.names() else (None, None)
+
+
+def _meshes(chain: Chain | None, source: Path | None) -> tuple[list[Visual], list[str]]:
+    """Return the meshes of the links that move, and what to say of those that are missing."""
+    if chain is None or source is None or source.suffix != ".urdf" or not chain.links:
+        return [], []
+    found, missing = visuals(source)
+    known = [one for one in found if one.link in (chain.base, *chain.links)]
+    words = (
+        f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: links are lines" if missing else ""
+    )
+    return known, [words] if words else []
+
+
+def _chosen(path: Path, chain: Chain) -> np.ndarray:
+    return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
+
+
+def _measured(place: Path) -> Measured:
+    """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
+    after, before = installation_file.read_arms(place)
+    with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
+        known = set(map(shielded, after.station_names))
+        rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in known]
+    joints = [shielded(f"{joint.name} [{joint.unit}]") for joint in after.chain.joints]
+    q = np.array([[float(row[name]) for name in joints] for row in rows]).reshape(-1, after.chain.n)
+    miss = 1e-3 * np.array([[float(row[f"d{axis} [mm]"]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
+    seen, nominal, modelled = (np.zeros((len(rows), 3)) for _ in range(3))
+    for s, t, own in _groups(rows, after):
+        base = invert(after.stations[s])
+        modelled[own] = _points(after, q[own], s, t) @ base[:3, :3].T + base[:3, 3]
+        seen[own] = modelled[own] + miss[own] @ base[:3, :3].T
+        known = after.station_names[s] in before.station_names
+        there = _points(before, q[own], s, t) if known else _points(replace(after, chain=before.chain), q[own], s, t)
+        nominal[own] = there @ base[:3, :3].T + base[:3, 3]
+    unseen = np.array([row["set"] != "fit" for row in rows], dtype=bool)
+    turns = [[float(row.get(f"dr{axis} [deg]") or "nan") for axis in "xyz"] for row in rows]
+    return Measured("measured", q, seen, nominal, modelled, unseen, np.radians(turns).reshape(-1, 3))
+
+
+def _joined(fitted: Measured, errors: Path) -> Measured:
+    """Return fitted rows and, behind them, a session's unseen ones."""
+    if not errors.is_file():
+        return fitted
+    table = read_table(errors)
+    if "x" not in table:  # written by an earlier version
+        return fitted
+    known = ~np.isnan(table.numbers("x", "length", gaps=True))
+    triples = [
+        np.column_stack([table.numbers(f"{head}{axis}", "length", gaps=True) for axis in "xyz"])[known]
+        for head in ("", "to_nominal_", "to_calibrated_")
+    ]
+    n = fitted.q.shape[1]
+    q = np.column_stack([table.numbers(name, "joint") for name in table.header[2 : 2 + n]])[known]
+    return Measured(
+        fitted.name,
+        np.vstack([fitted.q, q]),
+        np.vstack([fitted.seen, triples[0]]),
+        np.vstack([fitted.nominal, triples[0] + triples[1]]),
+        np.vstack([fitted.calibrated, triples[0] + triples[2]]),
+        np.concatenate([fitted.unseen, np.ones(len(q), dtype=bool)]),
+        np.vstack([fitted.turned, np.full((len(q), 3), np.nan)]),
+    )
+
+
+def _groups(rows: list[dict[str, str]], cell: Installation) -> list[tuple[int, int, np.ndarray]]:
+    """Return station, tool and indices of the rows that share them."""
+    keys = [(cell.station_names.index(r["station"]), cell.tool_names.index(r["tool"])) for r in rows]
+    return [(s, t, np.array([k for k, key in enumerate(keys) if key == (s, t)])) for s, t in sorted(set(keys))]
+
+
+def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
+    """Return the tool's positions (m, 3) in the station's frame, by the arm without its deflections' torques."""
+    from calib.robot.deflection import evaluate
+
+    terms = cell.deflection.terms
+    torque = None
+    if any(term.basis == "torque" for term in terms):
+        from calib.dynamics.gravity import gravity_torques
+
+        torque = gravity_torques(cell.chain, q)
+    return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
+
+
+def _rehearsed(path: Path, chain: Chain) -> Played:
+    """Return a measuring run as it will play, poses and ways between them."""
+    return Played(path.stem, *rehearsed_samples(path, chain))
+
+
+def _played(path: Path, folder: Path) -> Played:
+    table = read_table(path)
+    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), table.block("v"))
+
+
+def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
+    table = read_table(path)
+    measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
+    t = table.cells[table.index("t")]
+    rows, units = _torque_rows(path.parent, chain, measured.shape[1])
+    return Torques(_name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, table.block("q"))
+
+
+def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what the torques of an identification's folder are, and their units."""
+    for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
+        if chain is None or not folder.model.is_file():
+            continue
+        table = model_file.read_table(folder.path)
+        rows, unit = ROWS.get(table.get("kind", ""), MOTOR), table.get("unit", "N m")
+        if rows.count(chain.n) == count:
+            kind = f"{' motor' if rows.motors_alone else ''} {'torque' if unit == 'N m' else 'current'}"
+            units = rows.units([joint.kind == "prismatic" for joint in chain.joints])
+            return tuple(title + kind for title in rows.titles(chain.joint_names)), (
+                units if unit == "N m" else (unit,) * count
+            )
+    names = chain.joint_names if chain is not None and chain.n == count else [f"row {k + 1}" for k in range(count)]
+    return tuple(f"{name} torque" for name in names), ("N m or N",) * count
+
+
+def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
+    """Return columns letter1, letter2, … as (N, n), which the file has to hold."""
+    found = table.block(letter)
+    if found is None:
+        raise UsageError(f"{path} has no columns {letter}1, {letter}2, …; was it written by this toolkit?")
+    return found
+
+
+def _name(path: Path, folder: Path) -> str:
+    parent = path.parent
+    return path.stem if parent == folder else f"{parent.name}" if path.stem != "torques_1" else f"{parent.name} torques"
+
+
+def skeleton(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return where base, joints and tip stand (m, n + 2, 3) [m]."""
+    points = np.zeros((len(q), chain.n + 2, 3))
+    points[:, 1:-1] = joint_frames(chain, q)[:, :, :3, 3].transpose(1, 0, 2)
+    points[:, -1] = forward(chain, q)[:, :3, 3]
+    return points
+
+
+def thinned(t: np.ndarray, rate: float = FRAMES) -> np.ndarray:
+    """Return indices of samples at about `rate` [Hz], the last one included."""
+    step = max(1, round(1.0 / (rate * float(np.median(np.diff(t)))))) if len(t) > 1 else 1
+    return np.unique([*range(0, len(t), step), len(t) - 1])

@@ -1,0 +1,337 @@
+"""Show a scene in Rerun: the only home of rerun-sdk, which is loaded when something is shown, and never else.
+
+Everything plays on one clock, the timeline ``time``, in the order of the work: pose plans as they grow, measured poses
+one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.errors import CalibError, UsageError, command_line
+from calib.robot.chain import Chain
+from calib.robot.kinematics import joint_frames
+from calib.rooms.viewer import scene as viewing
+from calib.rooms.viewer.scene import Measured, Played, Scene, Torques
+from calib.transforms import to_quaternion
+
+ARM, BEFORE, AFTER, SEEN, LIMIT = (
+    [90, 100, 115], [213, 94, 0], [0, 130, 90], [40, 90, 180], [200, 60, 60],
+)  # fmt: skip
+GAP = 1.0  # between one part and the next [s]
+EACH = 0.2  # that a pose stands still [s]
+FILE = "session.rrd"
+
+
+def available() -> bool:
+    """Say whether rerun is installed, without loading it."""
+    from importlib.util import find_spec
+
+    return find_spec("rerun") is not None
+
+
+def _rerun() -> Any:
+    try:
+        import rerun
+    except ImportError as error:
+        raise UsageError(
+            "this needs Rerun, which is not installed here (there is none for Macs with Intel processors): "
+            "pip install rerun-sdk"
+        ) from error
+    return rerun
+
+
+def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Scene:
+    """Write what a folder holds as a recording for Rerun, whole or not at all.
+
+    Raises:
+        UsageError: where rerun is not installed, or there is nothing to see.
+    """
+    path = Path(path)
+    scene = viewing.read(folder, robot)
+    rr = _rerun()
+    with tempfile.TemporaryDirectory() as place:
+        temporary = Path(place) / "scene.rrd"
+        recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
+        recording.save(temporary, default_blueprint=_blueprint(scene))
+        _send(recording, scene)
+        recording.flush()
+        recording.disconnect()
+        files.write(path, temporary.read_bytes())
+    return scene
+
+
+def write_beside(folder: str | Path) -> str:
+    """Write ``session.rrd`` into a folder where that is possible, and say in a line what came of it; never raises.
+
+    A recording is a convenience: neither a missing package nor a full disk stops what it belongs to.
+    """
+    if not available():
+        return f"no {FILE}: Rerun is not installed (pip install rerun-sdk)"
+    try:
+        write(folder, Path(folder) / FILE)
+    except Exception as error:  # whatever rerun may raise
+        return f"no {FILE}: {error}"
+    return FILE
+
+
+def spawn(folder: str | Path, robot: str | None = None) -> Scene:
+    """Open Rerun's window on what a folder holds.
+
+    Raises:
+        UsageError: where no display is there, as over SSH.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        saved = command_line("view", folder, "--save", FILE)
+        raise UsageError(f"no display is here to open a window on; {saved} writes a file that rerun shows elsewhere")
+    scene = viewing.read(folder, robot)
+    rr = _rerun()
+    recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
+    try:
+        recording.spawn(default_blueprint=_blueprint(scene))
+    except Exception as error:
+        raise CalibError(f"Rerun's window did not open ({error}); calib view --save FILE.rrd writes a file") from error
+    _send(recording, scene)
+    recording.flush()
+    return scene
+
+
+def _send(recording: Any, scene: Scene) -> None:
+    """Log everything."""
+    rr = _rerun()
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    recording.log("about", rr.TextDocument(about(scene), media_type="text/markdown"), static=True)
+    start = 0.0
+    for name, q in scene.chosen:
+        if scene.chain is not None:
+            start = _chosen(recording, scene, scene.chain, name, q, start)
+    for measured in scene.measured:
+        start = _measured(recording, scene, measured, start)
+    for played in scene.played:
+        start = _played(recording, scene, played, start)
+    for torques in scene.torques:
+        start = _torques(recording, scene, torques, start)
+    _meshes(recording, scene)
+
+
+def about(scene: Scene) -> str:
+    """Return the text that stands beside the pictures."""
+    lines = [f"# {scene.title}"]
+    for measured in scene.measured:
+        sizes = [1e3 * np.linalg.norm(measured.seen - p, axis=1) for p in (measured.nominal, measured.calibrated)]
+        rms = [float(np.sqrt(np.mean(size**2))) for size in sizes]
+        scale = measured.arrow_scale(scene.chain) if scene.chain else 1.0
+        lines.append(
+            f"{len(measured.q)} measured poses ({int(measured.unseen.sum())} of them unseen): {rms[0]:.3f} mm rms "
+            f"nominal (orange), {rms[1]:.3f} mm calibrated (green). **Arrows are {scale:g} times as long as the "
+            "errors**; they start where the arm's model puts the target and point to where it was seen."
+        )
+    lines += [f"pose plan *{name}*: {len(q)} poses" for name, q in scene.chosen]
+    lines += [f"motion *{one.name}*: {one.t[-1]:.1f} s" for one in scene.played]
+    lines += [
+        f"torques *{one.name}*: measured orange, predicted green, and what remains [N·m, N]" for one in scene.torques
+    ]
+    return "\n\n".join([*lines, *(f"note: {note}" for note in scene.notes)])
+
+
+def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) -> list[Any]:
+    """Return the clock and a count of its own for `count` poses, or `some` of them, from `start` on [s]."""
+    rr = _rerun()
+    steps = np.arange(1, count + 1) if some is None else some + 1
+    return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
+
+
+def _measured(recording: Any, scene: Scene, measured: Measured, start: float) -> float:
+    """Log points and error arrows as a whole, and pose by pose; return when the next part may begin [s]."""
+    rr = _rerun()
+    if not len(measured.q) or scene.chain is None:
+        return start
+    scale = measured.arrow_scale(scene.chain)
+    index = _poses("pose", len(measured.q), start)
+    recording.log("world/seen", rr.Points3D(measured.seen, radii=0.006, colors=SEEN), static=True)
+    for name, points, colour in (("nominal", measured.nominal, BEFORE), ("calibrated", measured.calibrated, AFTER)):
+        errors = scale * (measured.seen - points)
+        place = f"world/errors_times_{scale:g}/{name}"
+        recording.log(place, rr.Arrows3D(vectors=errors, origins=points, colors=colour, radii=0.004), static=True)
+        recording.log(f"world/tool/{name}", rr.Points3D(points, radii=0.006, colors=colour), static=True)
+        size = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
+        _series(recording, f"errors/{name}", index, size, f"{name} [mm]", colour)
+    left = 1e3 * (measured.seen - measured.calibrated)
+    for k, axis in enumerate("xyz"):
+        _series(recording, f"axes/position/{axis}", index, left[:, k], f"{axis} in the arm's base [mm]")
+    known = np.flatnonzero(np.isfinite(measured.turned).all(axis=1))
+    if len(known):
+        some = _poses("pose", len(measured.q), start, known)
+        turned = 1e3 * measured.turned[known]
+        size = np.linalg.norm(turned, axis=1)
+        _series(recording, "turns/calibrated", some, size, "orientation, calibrated [mrad]", AFTER)
+        for k, axis in enumerate("xyz"):
+            _series(recording, f"axes/orientation/{axis}", some, turned[:, k], f"about {axis} [mrad]")
+    if measured.unseen.any():
+        kept = np.where(measured.unseen, 1.0, 0.0)
+        _series(recording, "errors/unseen", index, kept, "1: unseen, 0: fitted", SEEN)
+    here = rr.Points3D.columns(
+        positions=measured.seen, radii=np.full(len(measured.q), 0.015), colors=np.tile(SEEN, (len(measured.q), 1))
+    )
+    recording.send_columns("world/pose", indexes=index, columns=here)
+    _arm(recording, scene, index, measured.q)
+    return start + EACH * len(measured.q) + GAP
+
+
+def _chosen(recording: Any, scene: Scene, chain: Chain, name: str, q: np.ndarray, start: float) -> float:
+    """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
+    rr = _rerun()
+    tips = viewing.skeleton(chain, q)[:, -1]
+    counts = np.arange(1, len(q) + 1)
+    grown = np.concatenate([tips[:k] for k in counts])
+    columns = rr.Points3D.columns(positions=grown, radii=np.full(len(grown), 0.008)).partition(counts)
+    index = _poses(f"chosen: {name}", len(q), start)
+    recording.send_columns(f"world/chosen/{_part(name)}", indexes=index, columns=columns)
+    _series(recording, f"chosen/{_part(name)}", index, counts.astype(float), f"{name}: poses", SEEN)
+    _arm(recording, scene, index, q)
+    return start + EACH * len(q) + GAP
+
+
+def _played(recording: Any, scene: Scene, played: Played, start: float) -> float:
+    """Log a motion with its limits from `start` on [s], and return where the next may begin."""
+    rr = _rerun()
+    t = start + played.t - played.t[0]
+    some = viewing.thinned(played.t)
+    index = [rr.TimeColumn("time", duration=t[some])]
+    names = scene.chain.joint_names if scene.chain is not None else [f"q{k + 1}" for k in range(played.q.shape[1])]
+    ends = [rr.TimeColumn("time", duration=t[[0, -1]])]
+    for j, name in enumerate(names):
+        _series(recording, f"motion/position/{_part(name)}", index, played.q[some, j], name)
+        if played.v is not None:
+            _series(recording, f"motion/velocity/{_part(name)}", index, played.v[some, j], name)
+        if scene.chain is None:
+            continue
+        joint = scene.chain.joints[j]
+        for side, value in (("lower", joint.lower), ("upper", joint.upper)):
+            if np.isfinite(value):
+                _series(recording, f"limits/position/{_part(name)}/{side}", ends, [value] * 2, f"{name} {side}", LIMIT)
+        if np.isfinite(joint.velocity) and played.v is not None:
+            for sign, side in ((-1.0, "lower"), (1.0, "upper")):
+                value = sign * joint.velocity
+                _series(recording, f"limits/velocity/{_part(name)}/{side}", ends, [value] * 2, f"{name} {side}", LIMIT)
+    _arm(recording, scene, index, played.q[some])
+    return float(t[-1]) + GAP
+
+
+def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> float:
+    """Log measured and predicted torques and what remains, and the arm on the same clock."""
+    rr = _rerun()
+    t = start + torques.t - torques.t[0]
+    index = [rr.TimeColumn("time", duration=t)]
+    for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
+        measured, predicted = torques.measured[:, j], torques.predicted[:, j]
+        _series(recording, f"torques/{_part(name)}/measured", index, measured, f"measured [{unit}]", BEFORE)
+        _series(recording, f"torques/{_part(name)}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
+        _series(recording, f"residuals/{_part(name)}", index, measured - predicted, f"{name} [{unit}]")
+    if torques.q is not None:
+        some = viewing.thinned(torques.t)
+        _arm(recording, scene, [rr.TimeColumn("time", duration=t[some])], torques.q[some])
+    return float(t[-1]) + GAP
+
+
+def _part(name: str) -> str:
+    """Return a name as one part of an entity path."""
+    return _rerun().escape_entity_path_part(name)
+
+
+def _series(
+    recording: Any, path: str, index: list[Any], values: Sequence[float] | np.ndarray, name: str, colour: Any = None
+) -> None:
+    """Log one line of a plot with its legend."""
+    rr = _rerun()
+    recording.log(path, rr.SeriesLines(names=name, **({} if colour is None else {"colors": colour})), static=True)
+    recording.send_columns(path, indexes=index, columns=rr.Scalars.columns(scalars=np.asarray(values, dtype=float)))
+
+
+def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
+    """Log the arm's links as lines, and its links' frames where it has meshes."""
+    rr = _rerun()
+    if scene.chain is None or q.shape[1] != scene.chain.n:
+        return
+    points = viewing.skeleton(scene.chain, q)
+    thick = 0.006 if scene.meshes else 0.018
+    strips = rr.LineStrips3D.columns(
+        strips=list(points), radii=np.full(len(q), thick), colors=np.tile(ARM, (len(q), 1))
+    )
+    recording.send_columns("world/robot/lines", indexes=index, columns=strips)
+    count = points.shape[1]
+    spheres = rr.Points3D.columns(
+        positions=points.reshape(-1, 3), radii=np.full(count * len(q), 1.4 * thick),
+        colors=np.tile(ARM, (count * len(q), 1)),
+    )  # fmt: skip
+    recording.send_columns("world/robot/joints", indexes=index, columns=spheres.partition([count] * len(q)))
+    if scene.meshes:
+        frames = joint_frames(scene.chain, q)
+        for link, frame in zip(scene.chain.links, frames):
+            moves = rr.Transform3D.columns(translation=frame[:, :3, 3], quaternion=to_quaternion(frame))
+            recording.send_columns(f"world/robot/links/{_part(link)}", indexes=index, columns=moves)
+
+
+def _meshes(recording: Any, scene: Scene) -> None:
+    """Log the meshes, each once, under the frame of its link."""
+    rr = _rerun()
+    for number, mesh in enumerate(scene.meshes):
+        place = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
+        placed = rr.Transform3D(
+            translation=mesh.placement[:3, 3], quaternion=to_quaternion(mesh.placement), scale=mesh.scale
+        )
+        recording.log(place, placed, rr.Asset3D(path=mesh.file), static=True)
+
+
+def _blueprint(scene: Scene) -> Any:
+    """Return how the recording opens: the arm at the left, what goes with it at the right."""
+    import rerun.blueprint as rrb
+
+    tabs: list[Any] = []
+    silent = rrb.PlotLegend(visible=False)  # a line's name shows where the pointer is
+    if scene.chosen:
+        tabs.append(rrb.TimeSeriesView(origin="chosen", name="pose plans"))
+    if scene.measured:
+        sizes = [rrb.TimeSeriesView(origin="errors", name="position error [mm]")]
+        sides = [rrb.TimeSeriesView(origin="axes/position", name="what remains by axis [mm]")]
+        if any(np.isfinite(measured.turned).any() for measured in scene.measured):
+            sizes.append(rrb.TimeSeriesView(origin="turns", name="orientation error [mrad]"))
+            sides.append(rrb.TimeSeriesView(origin="axes/orientation", name="what remains about each axis [mrad]"))
+        tabs += [rrb.Vertical(*sizes, name="error of each pose"), rrb.Vertical(*sides, name="error by axis")]
+    if scene.played:
+        contents = [[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"] for kind in ("position", "velocity")]
+        views = [
+            rrb.TimeSeriesView(
+                origin="/", contents=words, name=f"{kind} [rad{unit} or m{unit}], limits in red", plot_legend=silent
+            )
+            for words, kind, unit in zip(contents, ("position", "velocity"), ("", "/s"))
+        ]
+        tabs.append(rrb.Vertical(*views, name="motion"))
+    if scene.torques:
+        each = _torque_names(scene)
+        plots = [rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent) for name in each]
+        rest = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
+        tabs.append(rrb.Vertical(rrb.Grid(*plots, grid_columns=2), rest, row_shares=[3, 1], name="torques"))
+    picture = rrb.Spatial3DView(origin="world", name="robot, nominal orange, calibrated green")
+    right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
+    text = rrb.TextDocumentView(origin="about", name="what is shown")
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(picture, text, row_shares=[4, 1]), right, column_shares=[3, 2]),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _torque_names(scene: Scene) -> list[str]:
+    """Return the names of all torque rows, each once."""
+    return list(dict.fromkeys(name for one in scene.torques for name in one.rows))
