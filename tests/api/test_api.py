@@ -69,7 +69,7 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.compensate("fit", "t.csv", tolerance=(1.0,)), "compensate: tolerance: expected 2 values, each"),
         (
             lambda: calib.validate("fit", "b.csv"),
-            "validate: result: expected GeometryFit, DynamicsModel, ParallelGeometry or ParallelDynamics",
+            "validate: result: expected GeometryFit, DynamicsModel or MechanismResult",
         ),
         (lambda: calib.new_session("s", "ur5", "cmm", poses=4.5), "new_session: poses: expected a whole number"),
         (lambda: calib.new_session("s", "ur5", "cmm", periode=4.5), "no key 'periode' .did you mean 'period'"),
