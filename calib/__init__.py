@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib.api.dynamic import DynamicsModel, identify_dynamics
+    from calib.api.dynamic import DynamicsModel, identify_dynamics, methods
     from calib.api.exporting import export
     from calib.api.kinematic import GeometryFit, JointCommands, PoseSelection, compensate, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
@@ -29,51 +29,45 @@ if TYPE_CHECKING:
     from calib.api.sessions import new_session, run_sessions
     from calib.api.validating import validate
     from calib.errors import CalibError
+    from calib.identification.identify_options import IdentifySettings
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
     from calib.robot.calibrated import CalibratedChain
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
 _HOMES = {
-    "load": "api.reading",
-    "read_poses": "api.reading",
-    "read_recording": "api.reading",
-    "select_poses": "api.kinematic",
-    "fit_geometry": "api.kinematic",
-    "design_excitation": "api.motions",
-    "plan_motion": "api.motions",
-    "identify_dynamics": "api.dynamic",
-    "validate": "api.validating",
-    "export": "api.exporting",
-    "compensate": "api.kinematic",
-    "new_session": "api.sessions",
-    "run_sessions": "api.sessions",
-    "CalibratedChain": "robot.calibrated",
-    "PoseSelection": "api.kinematic",
-    "GeometryFit": "api.kinematic",
-    "ExcitationDesign": "api.motions",
-    "MotionPlan": "api.motions",
-    "DynamicsModel": "api.dynamic",
-    "JointCommands": "api.kinematic",
-    "SelectionSettings": "procedure.kinematic_stage.settings",
-    "FitSettings": "procedure.kinematic_stage.settings",
-    "ExcitationSettings": "procedure.excitation.settings",
-    "PlanSettings": "procedure.excitation.settings",
-    "CalibError": "errors",
+    "api.reading": ("load", "read_poses", "read_recording"),
+    "api.kinematic": ("select_poses", "fit_geometry", "compensate", "PoseSelection", "GeometryFit", "JointCommands"),
+    "api.motions": ("design_excitation", "plan_motion", "ExcitationDesign", "MotionPlan"),
+    "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
+    "api.validating": ("validate",),
+    "api.exporting": ("export",),
+    "api.sessions": ("new_session", "run_sessions"),
+    "robot.calibrated": ("CalibratedChain",),
+    "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
+    "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
+    "identification.identify_options": ("IdentifySettings",),
+    "errors": ("CalibError",),
 }
 
 __all__ = [  # noqa: RUF022 (in the order of use)
     "load", "read_poses", "read_recording", "select_poses", "fit_geometry", "design_excitation", "plan_motion",
-    "identify_dynamics", "validate", "export", "compensate", "new_session", "run_sessions", "CalibratedChain",
-    "PoseSelection", "GeometryFit", "ExcitationDesign", "MotionPlan", "DynamicsModel", "JointCommands",
-    "SelectionSettings", "FitSettings", "ExcitationSettings", "PlanSettings", "CalibError",
+    "identify_dynamics", "methods", "validate", "export", "compensate", "new_session", "run_sessions",
+    "CalibratedChain", "PoseSelection", "GeometryFit", "ExcitationDesign", "MotionPlan", "DynamicsModel",
+    "JointCommands", "SelectionSettings", "FitSettings", "ExcitationSettings", "PlanSettings", "IdentifySettings",
+    "CalibError",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("armature-calib")
+    home = next((home for home, names in _HOMES.items() if name in names), None)
+    if home is None:
         raise AttributeError(f"module 'calib' has no attribute {name!r}")
-    value = getattr(import_module(f"calib.{_HOMES[name]}"), name)
+    value = getattr(import_module(f"calib.{home}"), name)
     globals()[name] = value
     return value
 

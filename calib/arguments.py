@@ -61,6 +61,8 @@ def _plain(value: Any) -> Any:
     """Return numpy's numbers and arrays, and tuples, as the numbers and lists of a file."""
     if hasattr(value, "tolist"):
         return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
     return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 

@@ -384,9 +384,11 @@ class OneOrMany(_Read):
     of: Real
 
     def read(self, value: Any) -> Any:
-        if value in ([], ()):
+        if not isinstance(value, (list, tuple)):
+            return self.of.read(value)
+        if not value:
             raise _Refused("at least one number", value)
-        return tuple(map(self.of.read, value)) if isinstance(value, (list, tuple)) else self.of.read(value)
+        return tuple(map(self.of.read, value))
 
     @property
     def json(self) -> Mapping[str, Any]:

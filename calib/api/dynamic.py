@@ -13,9 +13,11 @@ from calib.api.given import listed, optional
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
-from calib.identification.identify_options import IdentifyOptions, read_options
+from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
+from calib.identification.methods.method import MethodEntry
+from calib.identification.methods.registry import LISTING
 from calib.procedure.dynamic_stage import folder, identify, inputs, metric_tables
 from calib.procedure.findings import Verdict
 from calib.procedure.robot_kinds import Mechanism, stage_of
@@ -114,10 +116,16 @@ class DynamicsModel:
         return as_text(self.renderables())
 
 
+def methods() -> tuple[MethodEntry, ...]:
+    """Return the methods of identification: ``name``, ``description``, ``source``, and what each ``needs``."""
+    return LISTING
+
+
 @checked
 def identify_dynamics(
     robot: str | Path | CalibratedChain | Mechanism,
     recordings: Recorded | Sequence[Recorded],
+    settings: IdentifySettings | None = None,
     *,
     validate: Recorded | Sequence[Recorded] = (),
     method: str | None = None,
@@ -138,9 +146,10 @@ def identify_dynamics(
         robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
             the same members and an outcome of its own.
         recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or what `read_recording` returned.
-        validate: the same of other motion.
-        method, friction: in place of the options'; see ``calib identify --help``.
-        options: drives, payloads, gains, filters, closed loop (``calib formats identify-options``).
+        settings: method, friction, drives, payloads, gains, filters, closed loop.
+        validate: recordings of other motion.
+        method, friction: in place of the settings'; see `methods`.
+        options: the settings as a TOML file (``calib formats identify-options``).
         seed: of everything random.
         on_read: called with what was read, before the identification begins.
         progress: called with a few words now and then.
@@ -149,7 +158,9 @@ def identify_dynamics(
         MeasurementError: for logs that cannot be right, naming row and column.
         Unidentifiable: where the motion tells no parameter.
     """
+    require(settings is None or options is None, "settings and options say the same: give one of them")
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
+    chosen = chosen if settings is None else options_of(settings)
     if (stage := stage_of(robot, "identify", base, tip)) is not None:
         return stage.run(
             listed(recordings), listed(validate), options=chosen, method=method, friction=friction, seed=seed,

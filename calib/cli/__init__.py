@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
+import calib
 from calib.cli import dynamics, geometry, motion, session
 from calib.extensions import offered
 from calib.workers.threads import limit_process
@@ -47,9 +48,16 @@ for _group in (geometry.app, dynamics.app, motion.app, session.app, *offered("co
     app.add_typer(_group)
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"calib {calib.__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def options(
     debug: Annotated[bool, typer.Option("--debug", help="show tracebacks (or set CALIB_DEBUG)")] = False,
+    version: Annotated[bool, typer.Option("--version", help="print the version", callback=_show_version)] = False,
 ) -> None:
     if debug:
         os.environ["CALIB_DEBUG"] = "1"

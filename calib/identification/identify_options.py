@@ -87,6 +87,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from calib.arguments import checked
 from calib.config import check_keys, inherited, own_table, parse, read_toml, strict
 from calib.config_types import (  # fmt: skip
     Checked,
@@ -165,10 +166,14 @@ class TermTable:
     side: Annotated[str, OneOf(("motor", "link"))] = "motor"
 
 
-@strict
+@checked
 @dataclass(frozen=True)
-class OptionsFile:
-    """The keys of the file; None where it says nothing and the default of `IdentificationSettings` stands."""
+class IdentifySettings:
+    """How to identify: the keys of the options file, see ``calib formats identify-options``.
+
+    None where nothing is said and the default of `calib.identification.settings.IdentificationSettings` stands. Tables
+    may be given as dictionaries: ``IdentifySettings(method="iv", filter={"cutoff": 20.0})``.
+    """
 
     friction: Annotated[str, OneOf(NAMES)] | None = None
     method: Annotated[str, OneOf(tuple(METHODS))] | None = None
@@ -202,7 +207,7 @@ class OptionsFile:
 
 
 _TABLES = ("loop", "slow", "gains", "gain_identification")  # beside the keys of `IdentificationSettings`
-_SETTINGS = [key.name for key in fields(OptionsFile) if key.default is None and key.name not in _TABLES]
+_SETTINGS = [key.name for key in fields(IdentifySettings) if key.default is None and key.name not in _TABLES]
 _FIELDS = {"drives": "sets", "rows": "torque_rows"}  # where `IdentificationSettings` calls a key otherwise
 
 
@@ -256,7 +261,19 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> Identify
     """Return the options that a parsed TOML table holds; `source` is for messages."""
     own = {key: table[key] for key in ("payload",) if key in table}  # bodies; in [files] their labels: not handed down
     rest = inherited({key: value for key, value in table.items() if key not in own}, FileSettings)
-    read = parse(OptionsFile, rest | own, source)
+    return options_of(parse(IdentifySettings, rest | own, source), source)
+
+
+def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOptions:
+    """Return the options that settings come to.
+
+    Args:
+        read: the keys of an options file.
+        source: names it in complaints.
+
+    Raises:
+        UsageError: for a term that cannot be, or a file's payload that is none.
+    """
     stated = {_FIELDS.get(key, key): getattr(read, key) for key in _SETTINGS if getattr(read, key) is not None}
     if read.rows is not None:
         stated["torque_rows"] = ROWS[read.rows]

@@ -66,7 +66,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 SCHEMAS: Mapping[str, tuple[str, str]] = {
     "options": ("calib.data.poses.fit_options", "FitOptions"),
-    "identify-options": ("calib.identification.identify_options", "OptionsFile"),
+    "identify-options": ("calib.identification.identify_options", "IdentifySettings"),
     "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),

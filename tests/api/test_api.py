@@ -16,6 +16,7 @@ from without_figures import run
 import calib
 from calib import cli
 from calib.errors import MeasurementError, UsageError
+from calib.identification.identify_options import options_of, parse_options
 from calib.robot import description
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.cell import measure
@@ -110,8 +111,8 @@ def test_a_data_frame_is_refused_by_its_name():
         calib.fit_geometry("ur5", frame)
 
 
-def test_at_most_25_names_all_documented():
-    assert len(calib.__all__) <= 25 and set(calib.__all__) <= set(dir(calib))
+def test_at_most_30_names_all_documented():
+    assert len(calib.__all__) <= 30 and set(calib.__all__) <= set(dir(calib))
     for name in calib.__all__:
         found = getattr(calib, name)
         assert (found.__doc__ or "").strip(), name
@@ -120,6 +121,20 @@ def test_at_most_25_names_all_documented():
             assert all(parameter in found.__doc__ for parameter in named), name
     with pytest.raises(AttributeError):
         calib.no_such_name  # noqa: B018
+
+
+def test_the_version_and_the_methods_can_be_asked_for(capsys):
+    assert cli.run(["--version"]) == 0 and calib.__version__ in capsys.readouterr().out
+    assert {"wls", "iv", "didim"} <= {one.name for one in calib.methods()}
+
+
+def test_settings_of_an_identification_are_the_keys_of_the_options_file():
+    stated = calib.IdentifySettings(method="iv", filter={"cutoff": np.float64(20.0)}, keep=["ZZ1R"])  # type: ignore[arg-type]
+    assert options_of(stated) == parse_options(
+        {"method": "iv", "filter": {"cutoff": 20.0}, "keep": ["ZZ1R"]}, "settings"
+    )
+    with pytest.raises(UsageError, match=r"IdentifySettings: method: expected one of .*did you mean 'iv'"):
+        calib.IdentifySettings(method="ivv")
 
 
 def test_a_fit_is_what_the_command_writes(fitted, cell, tmp_path, capsys):

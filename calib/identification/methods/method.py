@@ -281,3 +281,8 @@ class MethodEntry:
     def needs_simulation(self) -> bool:
         """Whether it asks for a model whose motion can be computed from torques."""
         return self.method.needs_simulation
+
+    def __str__(self) -> str:
+        needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""
+        tuned = f"; tuned: {', '.join(self.tunes)}" if self.tunes else ""
+        return f"{self.name:10} {self.description} ({self.source}){needs}{tuned}"

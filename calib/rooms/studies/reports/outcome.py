@@ -16,7 +16,6 @@ from pathlib import Path
 
 from calib import files
 from calib.errors import UsageError
-from calib.identification.methods.registry import LISTING
 from calib.rooms.studies import summary
 from calib.rooms.studies.conditions import Study, read_study, shipped
 from calib.rooms.studies.reports import report
@@ -139,17 +138,6 @@ def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
     if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
         raise UsageError(f"{out} holds {', '.join(foreign)} which no study left there; choose another (--out)")
-
-
-def method_lines() -> list[str]:
-    """Return a line per method: what it is, whose, and what it needs."""
-    lines = []
-    for one in LISTING:
-        needs = "the loop" if one.needs_controller else "simulation" if one.needs_simulation else ""
-        words = f"; needs {needs}" if needs else ""
-        tuned = f"; tuned: {', '.join(one.tunes)}" if one.tunes else ""
-        lines.append(f"{one.name:10} {one.description} ({one.source}){words}{tuned}")
-    return lines
 
 
 def study_lines() -> list[str]:
