@@ -19,9 +19,8 @@ from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.certificate import FileRow
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
-from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, read_state
-from calib.procedure.session.geometry_steps import chain_of, measured_files, robot_file
+from calib.procedure.session.geometry_steps import chain_of
 from calib.records import read_json, read_lines
 
 Say = Callable[[str], None]
@@ -86,7 +85,7 @@ def _whole_report(session: Session) -> fit_report.Report:
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
     lines = read_lines(session.path(f"{place}/{CHECKED}"))
-    files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
+    files_there = session.brought("validation" if place == "3-measured" else "unseen")
     said = read_state(session).notes(unseen)
     names = tuple(f"{each.name}: " for each in files_there)
     return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
@@ -126,7 +125,7 @@ def _made_by(session: Session) -> list[tuple[str, str]]:
 
 def _measured_setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
     """Return what stands under Setup on the certificate of a fit."""
-    settings, fitted = session.settings, measured_files(session)
+    settings, fitted = session.settings, _measured(session)
     instrument = settings.instrument
     stated = f", σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else ", σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
@@ -135,7 +134,7 @@ def _measured_setup(session: Session, found: fit_report.Report) -> list[tuple[st
         ("description", settings.robot.given),
         ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
-        ("measurements", _named([*fitted[0], *fitted[1]])),
+        ("measurements", _named(fitted)),
         ("pose plan", _session_plan(session).words),
         *_pose_checks(session),
         ("model", found.metrics.model),
@@ -156,7 +155,7 @@ def _dynamic_setup(session: Session) -> list[tuple[str, str]]:
     """Return the dynamics' lines under Setup."""
     if not session.dynamic:
         return []
-    wanted, (training, unseen) = session.settings.dynamics, recordings(session)
+    wanted = session.settings.dynamics
     allowed = wanted.tolerance_percent
     torques = {
         "motor": "motors'",
@@ -165,11 +164,19 @@ def _dynamic_setup(session: Session) -> list[tuple[str, str]]:
     }
     loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())
     rows = [
-        ("recordings", _named([*training, *unseen])),
+        ("recordings", _named(_recorded(session))),
         ("torques", torques[wanted.torques]),
         ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none was given: pass below 10 %"),
     ]
     return [*rows, ("payloads", loads)] if loads else rows
+
+
+def _measured(session: Session) -> list[Path]:
+    return [*session.brought("measured"), *session.brought("validation")]
+
+
+def _recorded(session: Session) -> list[Path]:
+    return [*session.brought("training"), *session.brought("unseen")]
 
 
 def _named(paths: list[Path]) -> str:
@@ -214,11 +221,12 @@ def listed(session: Session) -> list[FileRow]:
     exported.sort(key=lambda path: path.name != URDF)
     wanted = [
         *exported[:1],
-        robot_file(session),
-        *(path for paths in measured_files(session) for path in _filed(paths)),
+        session.robot_file,
+        *_filed(session.brought("measured")),
+        *_filed(session.brought("validation")),
     ]
     if session.dynamic:
-        wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
+        wanted += [path for path in _recorded(session) if path.is_file()]
         if session.settings.dynamics.plan:  # else other motions were played
             wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]

@@ -30,25 +30,10 @@ from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
 Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
-SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
 SHORTER, OTHER = (
     0.8,
     3,
 )  # the validation motion's period over the training's, and what is added to its seed (our choice)
-
-
-def recordings(session: Session) -> tuple[list[Path], list[Path]]:
-    """Return the logs people have brought: to learn from, and unseen (names starting with validation)."""
-    place = session.path("7-recorded")
-    found = [path for path in sorted(place.glob("*")) if _is_log(path)] if place.is_dir() else []
-    unseen = [path for path in found if path.name.lower().startswith("validation")]
-    return [path for path in found if path not in unseen], unseen
-
-
-def _is_log(path: Path) -> bool:
-    if path.name.startswith("."):
-        return False
-    return (path / "metadata.yaml").exists() if path.is_dir() else path.suffix.lower() in SUFFIXES
 
 
 def _calibrated(session: Session) -> Chain:
@@ -67,7 +52,7 @@ def options_of(session: Session) -> IdentifyOptions:
     known = {label: Payload(float(mass)) for label, mass in wanted.payloads.items()}
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
     own = dict(options.files)
-    for path in (*recordings(session)[0], *recordings(session)[1]):
+    for path in (*session.brought("training"), *session.brought("unseen")):
         carried = tuple(label for label in known if label.lower() in path.stem.lower())
         if carried:
             own[path.name] = replace(
@@ -119,7 +104,7 @@ def excite(session: Session, say: Say) -> list[str]:
 def record(session: Session, say: Say) -> list[str]:
     """Check the recordings to learn from."""
     cuts, notes = {}, []
-    for path in recordings(session)[0]:
+    for path in session.brought("training"):
         say(f"reading {path.name}")
         found, told = _check_recording(session, path, "training")
         cuts[path.name] = found
@@ -176,7 +161,7 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
     """Return the recordings to learn from, and what is held out of them, as paths with cuts."""
     cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
     share = session.settings.dynamics.holdout
-    training = recordings(session)[0]
+    training = session.brought("training")
     if not share:
         return _cut_paths(training, cuts), []
     middle = {name: stop - share * (stop - start) for name, (start, stop) in cuts.items()}
@@ -217,7 +202,7 @@ def identify(session: Session, say: Say) -> list[str]:
 def predict(session: Session, say: Say) -> list[str]:
     """Hold the identified model against motion it has not seen, and judge."""
     training, held = _divided(session)
-    unseen = recordings(session)[1]
+    unseen = session.brought("unseen")
     notes, aside = [], {}
     for path in unseen:
         aside[path.name], told = _check_recording(session, path, "validation")

@@ -39,6 +39,8 @@ from typing import Any
 from calib import files
 from calib.config import parse
 from calib.config_types import Text
+from calib.data.camera.corner_file import FILE as CORNERS
+from calib.data.poses.image_folders import is_image_folder
 from calib.errors import CalibError, SessionError, command_line
 from calib.folders import CERTIFICATE, METRICS, PARAMETERS
 from calib.folders import SESSION as SETTINGS
@@ -59,6 +61,11 @@ PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
 PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
 POSES, UNSEEN, WAYS = "poses.csv", "validation.csv", "poses_run.csv"  # as planned, in 2-poses
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
+LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3")
+BROUGHT = {  # what people bring: where to, and how its name begins
+    "measured": ("3-measured", ""), "validation": ("3-measured", "validation"), "drift": ("3-measured", "drift"),
+    "training": ("7-recorded", ""), "unseen": ("7-recorded", "validation"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,30 @@ class Session:
     def path(self, name: str) -> Path:
         """Return a file of the session by its name relative to the folder."""
         return self.folder / name
+
+    def named(self, name: str) -> Path | None:
+        """Return a file that ``session.toml`` names; None where it names none."""
+        return self.path(name) if name else None
+
+    @property
+    def robot_file(self) -> Path:
+        """The robot's description."""
+        return self.path(self.settings.robot.file)
+
+    def brought(self, kind: str) -> list[Path]:
+        """Return the files, and folders of images or bags, that people have brought (`BROUGHT`); files come first."""
+        folder, prefix = BROUGHT[kind]
+        others = [start for where, start in BROUGHT.values() if where == folder and start and start != prefix]
+        belongs = _is_log if folder == "7-recorded" else _is_measured
+        found = [path for path in self.path(folder).glob("*") if belongs(path)]
+        named = [path for path in found if path.name.lower().startswith(prefix)]
+        mine = [path for path in named if prefix or not path.name.lower().startswith(tuple(others))]
+        return sorted(mine, key=lambda path: (path.is_dir(), path))
+
+    def files_brought(self, kind: str) -> list[Path]:
+        """Return the same file by file; the corners found in images are ours."""
+        behind = (sorted(each for each in path.rglob("*") if each.is_file()) or [path] for path in self.brought(kind))
+        return [each for paths in behind for each in paths if each.name != CORNERS]
 
     @property
     def dynamic(self) -> bool:
@@ -149,6 +180,16 @@ class Session:
         if self.dynamic and (out / ROBOT).exists() and not any(out.rglob(PARAMETERS)):
             found["dynamics"] = found["dynamics"].for_prediction("the dynamics could not be exported")
         return Verdicts(found, geometry.deliverables if geometry else {})
+
+
+def _is_log(path: Path) -> bool:
+    if path.name.startswith("."):
+        return False
+    return (path / "metadata.yaml").exists() if path.is_dir() else path.suffix.lower() in LOGS
+
+
+def _is_measured(path: Path) -> bool:
+    return path.suffix == ".csv" if path.is_file() else is_image_folder(path)
 
 
 def create(

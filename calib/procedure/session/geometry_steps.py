@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.camera.corner_file import FILE as CORNERS
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
-from calib.data.poses.image_folders import is_image_folder
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, filled_in, read_poses, write_poses
@@ -44,16 +42,11 @@ from calib.units import JOINT
 Say = Callable[[str], None]
 
 
-def robot_file(session: Session) -> Path:
-    """Return the session's robot description."""
-    return session.path(session.settings.robot.file)
-
-
 def chain_of(session: Session) -> Chain:
     """Return the nominal arm."""
     robot = session.settings.robot
     options = _options_of(session)
-    return inputs.load_robot(robot_file(session), None, options, robot.base or None, robot.tip or None)[0]
+    return inputs.load_robot(session.robot_file, None, options, robot.base or None, robot.tip or None)[0]
 
 
 def _options_of(session: Session) -> FitOptions:
@@ -78,31 +71,6 @@ def _tolerance_of(session: Session) -> float | None:
     return 1e-3 * session.settings.fit.tolerance_mm or None
 
 
-def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
-    """Return the files and folders of images people have brought: for the fit, and for validation (by their names)."""
-    place = session.path("3-measured")
-    folders = [path for path in sorted(place.iterdir()) if is_image_folder(path)] if place.is_dir() else []
-    found = [*sorted(place.glob("*.csv")), *folders]
-    unseen = [path for path in found if path.name.lower().startswith("validation")]
-    aside = [*unseen, *measured_again(session)]
-    return [path for path in found if path not in aside], unseen
-
-
-def all_files(paths: Sequence[Path]) -> list[Path]:
-    """Return what people have brought at these paths, file by file; the corners found in images are ours."""
-    return [
-        each
-        for path in paths
-        for each in (sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path])
-        if not (path.is_dir() and each.name == CORNERS)
-    ]
-
-
-def measured_again(session: Session) -> list[Path]:
-    """Return the files of poses measured once more at the end (names starting with drift); they are not fitted."""
-    return [path for path in sorted(session.path("3-measured").glob("*.csv")) if path.name.lower().startswith("drift")]
-
-
 def describe(session: Session, say: Say) -> list[str]:
     """Read the robot, and write down how it was understood."""
     chain = chain_of(session)
@@ -116,7 +84,7 @@ def describe(session: Session, say: Say) -> list[str]:
     if session.geometric:
         return [lines[0]]
     robot = session.settings.robot
-    known = load_calibrated(robot_file(session), robot.base or None, robot.tip or None)
+    known = load_calibrated(session.robot_file, robot.base or None, robot.tip or None)
     session.fit.path.mkdir(exist_ok=True)
     calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
     return [lines[0], "nothing is measured: this geometry is taken as calibrated"]
@@ -134,7 +102,7 @@ def select(session: Session, say: Say) -> list[str]:
                 f"{session.path('3-measured')}, and put the plain list back or remove it"
             )
     say("choosing poses")
-    chosen = plan(session, robot_file(session), chain, say)
+    chosen = plan(session, session.robot_file, chain, say)
     kinds = [joint.kind for joint in chain.joints]
     names = chain.joint_names
     write_poses(session.path(f"2-poses/{POSES}"), chosen.fit, names, unit="deg", kinds=kinds)
@@ -167,7 +135,7 @@ def _selection_prediction(session: Session) -> SelectionPrediction | None:
 def arrive(session: Session, say: Say) -> list[str]:
     """Check the files that were brought for the fit."""
     chain, notes = chain_of(session), []
-    fit, _ = measured_files(session)
+    fit = session.brought("measured")
     plan = _planned(session, chain, "poses")
     for path in fit:
         notes += check_file(session, chain, path, plan)
@@ -206,7 +174,7 @@ def _drifts(session: Session, chain: Chain) -> list[str]:
     options = _options_of(session)
     first, again = (
         [block for path in paths for block in inputs.read_file(path, chain, options)]
-        for paths in (measured_files(session)[0], measured_again(session))
+        for paths in (session.brought("measured"), session.brought("drift"))
     )
     return arrival.drift(chain, first, again, session.settings.instrument.sigma_position)
 
@@ -225,9 +193,9 @@ def _fit_settings(session: Session) -> FitSettings:
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the robot with the fit's measurements, and with validation files if asked for."""
     chain = chain_of(session)
-    links = (chain.base, chain.tip) if robot_file(session).suffix == ".urdf" else (None, None)
+    links = (chain.base, chain.tip) if session.robot_file.suffix == ".urdf" else (None, None)
     return inputs.gather(
-        robot_file(session), measured_files(session)[0], validate, options=_options_of(session),
+        session.robot_file, session.brought("measured"), validate, options=_options_of(session),
         settings=_fit_settings(session), base=links[0], tip=links[1],
     )  # fmt: skip
 
@@ -258,7 +226,7 @@ def fit(session: Session, say: Say) -> list[str]:
 
 def validate(session: Session, say: Say) -> list[str]:
     """Hold the fitted robot against poses it has not seen, and judge, as `calib fit` does with validation files."""
-    chain, unseen, notes = chain_of(session), measured_files(session)[1], []
+    chain, unseen, notes = chain_of(session), session.brought("validation"), []
     fit, out = session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
     plan = _planned(session, chain, "validation")
@@ -294,7 +262,7 @@ def export(session: Session, say: Say) -> list[str]:
 def _exported(session: Session, out: Path, say: Say) -> list[str]:
     from calib.procedure.export.delivery import USES, deliver
 
-    source = robot_file(session)
+    source = session.robot_file
     if session.geometric:
         lines = deliver(session.fit.path, source, out)
     else:

@@ -8,8 +8,8 @@ from calib.data.csv_table import read_table
 from calib.data.poses.pixels import Pixels
 from calib.errors import SessionError, command_line
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
-from calib.procedure.session import dynamics_steps, geometry_steps
 from calib.procedure.session.folder import UNSEEN, WAYS, Session
+from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.steps import WAITING, State
 from calib.robot.chain import Chain
 
@@ -21,7 +21,7 @@ def asks(session: Session, state: State) -> tuple[str, str]:
     if state.kind == WAITING and state.step.name in ("measure", "validate"):
         name = "poses" if state.step.name == "measure" else "validation"
         target = "measured.csv" if name == "poses" else UNSEEN
-        both = name == "poses" and not geometry_steps.measured_files(session)[1]
+        both = name == "poses" and not session.brought("validation")
         return _at_the_robot(session, name, both), _form(session, target, both)
     again = f"put it into {session.folder} and run {command_line('next', session.folder)} again"
     return f"step {state.step.name} needs {state.words}", again
@@ -117,9 +117,8 @@ def _play(session: Session, step: str) -> str:
 
 def _motions(session: Session, step: str) -> list[str]:
     """Return which of the motions are still to be recorded."""
-    training, unseen = dynamics_steps.recordings(session)
-    names = [] if step == "predict" or training else ["training"]
-    return names + (["validation"] if session.settings.dynamics.validation and not unseen else [])
+    names = [] if step == "predict" or session.brought("training") else ["training"]
+    return names + (["validation"] if session.settings.dynamics.validation and not session.brought("unseen") else [])
 
 
 def _log(session: Session, step: str) -> str:
@@ -143,6 +142,6 @@ def _log(session: Session, step: str) -> str:
 
 def _chain(session: Session) -> Chain:
     try:
-        return geometry_steps.chain_of(session)
+        return chain_of(session)
     except Exception as error:
         raise SessionError(f"the robot cannot be read: {error}") from error

@@ -1,17 +1,17 @@
-"""The steps of a session in their order: what each reads, and what it makes."""
+"""The steps of a session as a table: what each reads, its settings, what it makes and what people bring to it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from calib.folders import CERTIFICATE
-from calib.procedure.excitation import coefficients
-from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.session import certificate, dynamics_steps, geometry_steps
 from calib.procedure.session.folder import (
     AS_GIVEN,
+    BROUGHT,
     CUTS,
     MARK,
     MOTION_CHECKED,
@@ -28,6 +28,7 @@ from calib.procedure.session.folder import (
 )
 
 Say = Callable[[str], None]
+FOLDERS = {"geometry": ("2-", "3-", "4-", "5-", "export/"), "dynamics": ("6-", "7-", "8-")}  # of one stage alone
 
 
 @dataclass(frozen=True)
@@ -36,162 +37,117 @@ class SessionStep:
 
     Attributes:
         name, purpose: for people.
-        settings: sections of ``session.toml`` it depends on, or single keys of them (``dynamics.period``).
-        inputs: the files it reads, as they are now.
         make: runs it; returns what is to be said.
-        outputs: names or patterns, relative to the session, of what it makes.
+        reads: the files it reads, by names between blanks: of the session, with ``?`` where one may be missing;
+            ``fit/`` and ``export/`` stand for the folders of this session; ``poses:constraints``: what that key of
+            ``session.toml`` names; ``measured`` …: what people brought (`BROUGHT`).
+        makes: names or patterns of what it makes.
+        settings: sections of ``session.toml`` it depends on, or keys of one (``dynamics.period,rate``).
         stage: ``geometry`` or ``dynamics``, where only sessions with that have it.
+        brings: what people bring before it, and in words.
+        kept: what it is not made again for, once that is brought, and in words; empty: always made again.
     """
 
     name: str
     purpose: str
-    settings: tuple[str, ...]
-    inputs: Callable[[Session], list[Path]]
     make: Callable[[Session, Say], list[str]]
-    outputs: tuple[str, ...]
+    reads: str
+    makes: str
+    settings: str
     stage: str = ""
+    brings: tuple[str, str] = ("", "")
+    kept: tuple[tuple[str, ...], str] = ((), "")
+
+    def inputs(self, session: Session) -> dict[Path, bool]:
+        """Return the files the step reads, and whether each may be missing."""
+        names = self.reads.split()
+        return {path: name.endswith("?") for name in names for path in _paths(session, name.rstrip("?"))}
+
+    def waits(self, session: Session) -> str:
+        """Say which of people's files the step waits for; empty where it waits for none."""
+        kind, words = self.brings
+        poses, dynamics = session.settings.poses, session.settings.dynamics
+        holdouts = {"validation": (poses, session.settings.fit), "unseen": (dynamics, dynamics)}
+        if kind in holdouts:
+            planned, judged = holdouts[kind]
+            if not planned.validation or judged.holdout:
+                return ""
+        return "" if not kind or session.brought(kind) else words
 
 
-def _robot(session: Session) -> list[Path]:
-    return [geometry_steps.robot_file(session)]
+def _paths(session: Session, name: str) -> Iterator[Path]:
+    """Yield the files behind a name that a step reads."""
+    left_out = () if session.geometric else FOLDERS["geometry"]
+    left_out += () if session.dynamic else FOLDERS["dynamics"]
+    if name in BROUGHT:
+        yield from session.files_brought(name)
+    elif name.startswith("fit/"):
+        yield session.fit.path / name.removeprefix("fit/")
+    elif ":" in name:
+        section, key = name.split(":")
+        if named := getattr(getattr(session.settings, section), key):
+            yield session.path(named)
+    elif not name.startswith(left_out) and not (name == VERDICT and session.geometric):
+        yield session.path(name.replace("export/", f"{session.export}/"))
 
 
-def _plan(session: Session) -> list[Path]:
-    name = session.settings.poses.constraints
-    return [*_robot(session), *([session.path(name)] if name else [])]
-
-
-def _arrived(session: Session) -> list[Path]:
-    brought = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
-    measured = geometry_steps.all_files(brought)
-    return [*_robot(session), session.path(f"2-poses/{POSES}"), *_options(session), *measured]
-
-
-def _options(session: Session) -> list[Path]:
-    name = session.settings.fit.options
-    return [session.path(name)] if name else []
-
-
-def _fitted(session: Session) -> list[Path]:
-    measured = geometry_steps.all_files(geometry_steps.measured_files(session)[0])
-    return [*_robot(session), *_options(session), *measured]
-
-
-def _validated(session: Session) -> list[Path]:
-    fit = [session.fit.robot, session.fit.report]
-    return [
-        *fit,
-        session.path(f"2-poses/{UNSEEN}"),
-        *_options(session),
-        *geometry_steps.all_files(geometry_steps.measured_files(session)[1]),
-    ]
-
-
-def _excited(session: Session) -> list[Path]:
-    name = session.settings.dynamics.limits
-    return [session.fit.robot, *([session.path(name)] if name else [])]
-
-
-def _recorded(session: Session) -> list[Path]:
-    plan = session.path(f"6-excitation/training/{coefficients.NAME}")
-    return [session.fit.robot, plan, *_reading(session), *_files_of(dynamics_steps.recordings(session)[0])]
-
-
-def _reading(session: Session) -> list[Path]:
-    name = session.settings.dynamics.options
-    return [session.path(name)] if name else []
-
-
-def _identified(session: Session) -> list[Path]:
-    own = [session.fit.robot, session.path(CUTS), *_reading(session)]
-    return [*own, *_files_of(dynamics_steps.recordings(session)[0])]
-
-
-def _predicted(session: Session) -> list[Path]:
-    found = session.identification
-    own = [found.robot, found.model, found.numbers]
-    plan = session.path(f"6-excitation/validation/{coefficients.NAME}")
-    training, unseen = dynamics_steps.recordings(session)
-    cuts = session.path(CUTS)
-    return [*own, plan, cuts, *_reading(session), *_files_of(training), *_files_of(unseen)]
-
-
-def _files_of(paths: list[Path]) -> list[Path]:
-    """Return the files behind paths, some of which are folders (ROS 2 bags)."""
-    return [each for path in paths for each in (sorted(p for p in path.rglob("*") if p.is_file()) or [path])]
-
-
-def _exported(session: Session) -> list[Path]:
-    own = [*_robot(session), session.fit.robot]
-    if session.geometric:
-        own += [session.fit.urdf, session.validation.judged]  # a failed robot's files say so
-    found = session.identification
-    return own + ([found.model, *found.tables, found.unseen.report] if session.dynamic else [])
-
-
-def _certified(session: Session) -> list[Path]:
-    made = [session.path(VERDICT)]
-    if session.geometric:
-        made = [session.fit.report, session.validation.judged, session.path(f"{session.export}/{URDF}")]
-        made += [session.path(SELECTION), session.path(POSES_CHECKED)]
-    if session.dynamic:
-        found = session.identification
-        made += [session.path(MOTION_CHECKED), found.numbers, found.tables[0], found.unseen.report]
-    return [*made, *([session.path(MARK)] if session.path(MARK).exists() else [])]
-
-
-PLAN = "plan validation period harmonics rate starts evaluations limits"
-MODEL = "torques friction method options payloads holdout"
-
-
-def _keys(names: str) -> tuple[str, ...]:
-    return tuple(f"dynamics.{name}" for name in names.split())
-
-
+MODEL = "torques,friction,method,options,payloads,holdout"
 STEPS = (
-    SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY, f"{AS_GIVEN}/*")),
     SessionStep(
-        "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
-        (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED, PREDICTION),
-        "geometry",
+        "describe", "read the robot", geometry_steps.describe, "robot:file", f"{SUMMARY} {AS_GIVEN}/*", "robot"
     ),
     SessionStep(
-        "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,
-        (POSES_CHECKED,), "geometry",
+        "select", "choose the poses to measure", geometry_steps.select, "robot:file poses:constraints",
+        f"2-poses/{POSES} 2-poses/{WAYS} 2-poses/{UNSEEN} {SELECTION} {PREDICTED} {PREDICTION}",
+        "robot instrument poses seed", "geometry",
+        kept=(("measured",), "files were measured to it (calib redo select: new poses)"),
     ),
     SessionStep(
-        "fit", "fit the geometry", ("robot", "instrument", "fit", "seed"), _fitted, geometry_steps.fit, ("4-fit/*",),
-        "geometry",
+        "measure", "check what was measured", geometry_steps.arrive,
+        f"robot:file 2-poses/{POSES}? fit:options measured drift", POSES_CHECKED, "robot instrument poses fit",
+        "geometry", ("measured", "a file of measured poses"),
     ),
     SessionStep(
-        "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
-        geometry_steps.validate,
-        ("5-validation/*",), "geometry",
+        "fit", "fit the geometry", geometry_steps.fit, "robot:file fit:options measured", "4-fit/*",
+        "robot instrument fit seed", "geometry",
     ),
     SessionStep(
-        "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamics_steps.excite,
-        ("6-excitation/*/*",), "dynamics",
+        "validate", "judge it on unseen poses", geometry_steps.validate,
+        f"fit/robot.toml fit/report.json 2-poses/{UNSEEN}? fit:options validation", "5-validation/*",
+        "robot instrument poses fit seed", "geometry", ("validation", "a file of measured validation poses"),
     ),
     SessionStep(
-        "record", "check what was recorded", _keys("plan repeats torques options payloads holdout"), _recorded,
-        dynamics_steps.record, (MOTION_CHECKED, CUTS), "dynamics",
+        "excite", "design the motions to record", dynamics_steps.excite, "fit/robot.toml dynamics:limits",
+        "6-excitation/*/*", "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed", "dynamics",
+        kept=(("training", "unseen"), "files were recorded to it (calib redo excite: new motions)"),
     ),
     SessionStep(
-        "identify", "identify the dynamics", (*_keys(MODEL), "seed"), _identified, dynamics_steps.identify,
-        ("8-dynamics/*",), "dynamics",
+        "record", "check what was recorded", dynamics_steps.record,
+        f"fit/robot.toml 6-excitation/training/{MOTION}? dynamics:options training", f"{MOTION_CHECKED} {CUTS}",
+        "dynamics.plan,repeats,torques,options,payloads,holdout", "dynamics",
+        ("training", "a recording of the training motion"),
     ),
     SessionStep(
-        "predict", "hold it against unseen motion",
-        (*_keys(f"plan validation repeats tolerance_percent {MODEL}"), "seed"), _predicted, dynamics_steps.predict,
-        ("8-dynamics/unseen/*",), "dynamics",
+        "identify", "identify the dynamics", dynamics_steps.identify,
+        f"fit/robot.toml {CUTS} dynamics:options training", "8-dynamics/*", f"dynamics.{MODEL} seed", "dynamics",
     ),
     SessionStep(
-        "export", "write the calibrated robot", ("robot",), _exported, geometry_steps.export,
-        ("6-export/*", "9-export/*", VERDICT),
+        "predict", "judge it on unseen motion", dynamics_steps.predict,
+        "8-dynamics/robot.toml 8-dynamics/dynamics.json 8-dynamics/metrics.json "
+        f"6-excitation/validation/{MOTION}? {CUTS} dynamics:options training unseen",
+        "8-dynamics/unseen/*", f"dynamics.plan,validation,repeats,tolerance_percent,{MODEL} seed", "dynamics",
+        ("unseen", "a recording of the validation motion"),
     ),
     SessionStep(
-        "certificate", "print the certificate",
-        ("name", "created", "instrument", "poses", "fit", *_keys("torques payloads tolerance_percent")), _certified,
-        certificate.certify, (CERTIFICATE,),
+        "export", "write the calibrated robot", geometry_steps.export,
+        "robot:file fit/robot.toml 4-fit/robot.urdf 5-validation/metrics.json 8-dynamics/dynamics.json "
+        "8-dynamics/estimate.csv 8-dynamics/covariance.csv 8-dynamics/unseen/report.json",
+        f"6-export/* 9-export/* {VERDICT}", "robot",
+    ),
+    SessionStep(
+        "certificate", "print the certificate", certificate.certify,
+        f"{VERDICT} 4-fit/report.json 5-validation/metrics.json export/robot.urdf {SELECTION}? {POSES_CHECKED} "
+        f"{MOTION_CHECKED} 8-dynamics/metrics.json 8-dynamics/estimate.csv 8-dynamics/unseen/report.json {MARK}?",
+        CERTIFICATE, "name created instrument poses fit dynamics.torques,payloads,tolerance_percent",
     ),
 )  # fmt: skip

@@ -15,26 +15,14 @@ from datetime import datetime
 
 from calib.errors import SessionError
 from calib.files import fingerprint
-from calib.procedure.excitation import coefficients
 from calib.procedure.report import certificate
-from calib.procedure.session import dynamics_steps, geometry_steps
-from calib.procedure.session.folder import (
-    EXPORT,
-    POSES,
-    SELECTION,
-    SETTINGS,
-    UNSEEN,
-    Session,
-    StateFile,
-    StepRecord,
-    read_state,
-)
+from calib.procedure.session.folder import EXPORT, SETTINGS, Session, StateFile, StepRecord, read_state
+from calib.procedure.session.geometry_steps import clear_staging
 from calib.procedure.session.settings import default_keys
 from calib.procedure.session.step_list import STEPS, SessionStep
 
 Say = Callable[[str], None]
 DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
-PLANS = (POSES, UNSEEN, SELECTION.rpartition("/")[2], coefficients.NAME)  # there only where we plan
 
 
 @dataclass(frozen=True)
@@ -72,15 +60,11 @@ def states(session: Session) -> list[State]:
     """Return how every step stands."""
     recorded, result, current = read_state(session), [], True
     for step in _steps_of(session):
-        state = _state(session, step, recorded) if current else _behind(session, step, recorded)
+        words = "made before; an earlier step comes first" if step.name in recorded.steps else "comes later"
+        state = _state(session, step, recorded) if current else State(step, AFTER, words)
         result.append(state)
         current = current and state.kind in (DONE, KEPT)
     return result
-
-
-def _behind(session: Session, step: SessionStep, recorded: StateFile) -> State:
-    words = "made before; an earlier step comes first" if step.name in recorded.steps else "comes later"
-    return State(step, AFTER, words)
 
 
 def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
@@ -92,7 +76,8 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
     if entry is None:
         return State(step, READY, step.purpose)
     if changes := _changes(entry.inputs, _inputs(session, step)):
-        if used := _used(session, step):
+        kinds, used = step.kept
+        if any(map(session.brought, kinds)):
             return State(step, KEPT, f"{changes}; kept, since {used}")
         return State(step, STALE, changes)
     gone = [name for name in entry.outputs if not session.path(name).exists()]
@@ -103,45 +88,23 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
     return State(step, DONE, f"{entry.finished[:16].replace('T', ' ')}{by_hand}")
 
 
-def _used(session: Session, step: SessionStep) -> str:
-    """Say why a plan is not replaced: people have worked to it."""
-    if step.name == "select" and geometry_steps.measured_files(session)[0]:
-        return "files were measured to it (calib redo select: new poses)"
-    if step.name == "excite" and any(dynamics_steps.recordings(session)):
-        return "files were recorded to it (calib redo excite: new motions)"
-    return ""
-
-
 def _missing(session: Session, step: SessionStep) -> str:
     """Say which of people's files a step waits for."""
-    fit, unseen = geometry_steps.measured_files(session)
-    if step.name == "measure" and not fit:
-        return "a file of measured poses"
-    if step.name == "validate" and session.settings.poses.validation and not (unseen or session.settings.fit.holdout):
-        return "a file of measured validation poses"
-    if step.name in ("record", "predict"):
-        training, unseen = dynamics_steps.recordings(session)
-        if step.name == "record" and not training:
-            return "a recording of the training motion"
-        wanted = session.settings.dynamics
-        if step.name == "predict" and wanted.validation and not (unseen or wanted.holdout):
-            return "a recording of the validation motion"
-    absent = [path for path in step.inputs(session) if not path.exists()]
-    own = [path for path in absent if not path.name.startswith(PLANS)]
-    return f"{own[0].relative_to(session.folder)}, which is missing" if own else ""
+    absent = (path for path, may_miss in step.inputs(session).items() if not may_miss and not path.exists())
+    path = next(absent, None)
+    return step.waits(session) or ("" if path is None else f"{path.relative_to(session.folder)}, which is missing")
 
 
 def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
     """Return the fingerprints of what a step depends on."""
     marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
     settings = asdict(session.settings)
-    for setting in step.settings:
-        section, _, key = setting.partition(".")
-        if section == "dynamics" and not session.dynamic:
-            continue
-        values = settings[section]
-        place = f"{SETTINGS} [{section}] {key}".rstrip()
-        marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
+    for setting in step.settings.split():
+        section, _, keys = setting.partition(".")
+        for key in keys.split(",") if session.dynamic or section != "dynamics" else ():
+            values = settings[section]
+            place = f"{SETTINGS} [{section}] {key}".rstrip()
+            marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
     return marks
 
 
@@ -180,7 +143,7 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
 
     The session has to be locked.
     """
-    geometry_steps.clear_staging(session)
+    clear_staging(session)
     _move_export(session)
     while True:
         state = next((each for each in states(session) if each.kind not in (DONE, KEPT)), None)
@@ -200,7 +163,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
     except BaseException:
         session.write_state(recorded)
         raise
-    produced = sorted({path for name in step.outputs for path in session.folder.glob(name) if path.is_file()})
+    produced = sorted({path for name in step.makes.split() for path in session.folder.glob(name) if path.is_file()})
     made = StepRecord(
         finished=datetime.now().astimezone().isoformat(timespec="seconds"),
         inputs=inputs,
