@@ -1,4 +1,4 @@
-"""Regressor, torques, inertia matrix and accelerations of a `Bodies` in batch: shape checks around the kernels.
+"""Regressor, torques and inertia matrix of a `Bodies` in batch: shape checks around the kernels.
 
     tau = Y(q, v, a) · chi,    chi the standard parameters XX XY XZ YY YZ ZZ MX MY MZ M, body after body.
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.arrays import shaped
 from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies
-from calib.errors import CalibError
 
 
 def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -146,47 +145,13 @@ def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.nda
     return out
 
 
-def forward_dynamics(
-    bodies: Bodies,
-    parameters: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
-    tau: np.ndarray,
-    added: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return the accelerations (N, n) that solve (M(q) + added) a = tau - c(q, v) - g(q).
-
-    Args:
-        tau: (N, n), friction already taken off.
-        added: (n, n) constant inertia beside the bodies': diag(Ia), coupling terms off the diagonal; None for none.
-
-    Raises:
-        CalibError: naming the sample where the inertia matrix is not positive definite.
-    """
-    from calib.dynamics import kernels
-
-    q, v, tau = _states(bodies, q=q, v=v, tau=tau)
-    extra = np.zeros((bodies.n, bodies.n)) if added is None else shaped(added, (bodies.n, bodies.n), "added inertia")
-    out = np.empty_like(q)
-    extra = np.ascontiguousarray(extra)
-    failed = kernels.forward_dynamics(
-        bodies.links, bodies.constants, kernel_parameters(bodies, parameters), extra, q, v, tau, out
-    )
-    if failed >= 0:
-        raise CalibError(
-            f"sample {failed}: the inertia matrix is not positive definite, so these parameters belong to no possible "
-            f"robot there; use a physically consistent estimate to simulate"
-        )
-    return out
-
-
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
-    """Return standard parameters (10 B,) as `kernels.accelerate` wants them: about frames whose moving axis is z."""
+    """Return standard parameters (10 B,) as the kernels want them: about frames whose moving axis is z."""
     rows = shaped(parameters, (10 * bodies.count,), "standard parameters").reshape(bodies.count, 10)
     return np.take_along_axis(rows, bodies.order, axis=1).ravel()
 
 
-_NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accelerations a", "tau": "torques tau"}
+_NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accelerations a"}
 
 
 def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:

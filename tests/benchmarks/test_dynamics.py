@@ -111,15 +111,6 @@ def test_inverse_dynamics(benchmark):
     per_sample(benchmark, "inverse dynamics")
 
 
-@pytest.mark.parametrize("robot", ["lwr4plus", "tx40"])
-def test_forward_dynamics(benchmark, robot):
-    chain = load(robot)
-    chi, bodies = standard_parameters(chain), bodies_of(chain)
-    q, v, tau = STATES[:, :, : chain.n]
-    benchmark.pedantic(rigid_body.forward_dynamics, (bodies, chi, q, v, tau), rounds=20, warmup_rounds=2)
-    per_sample(benchmark, f"forward dynamics, {robot}")
-
-
 @pytest.mark.parametrize("sets", ["", "Ia Fv Fc off"])
 def test_base_parameters(benchmark, sets):
     full = IdentificationModel(BODIES, drives.standard([sets] * 7))

@@ -15,8 +15,8 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.dynamics import model, rigid_body
-from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics import model
+from calib.dynamics.bodies import standard_parameters
 from calib.identification.cases import Case, make_case
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import identify_instrumental
@@ -101,7 +101,7 @@ def python_loop(plant, controller, reference, count):
 
 
 @pytest.mark.benchmark(group=f"forward dynamics, TX40, {STATES} states")
-@pytest.mark.parametrize("what", ["about the base's origin, drives included", "body by body", "Pinocchio in a loop"])
+@pytest.mark.parametrize("what", ["about the base's origin, drives included", "Pinocchio in a loop"])
 def test_forward_dynamics(benchmark, what):
     plant, _ = setting()
     q, v, tau = states()
@@ -109,8 +109,6 @@ def test_forward_dynamics(benchmark, what):
     parameters = standard_parameters(chain)
     if what.startswith("about"):
         call = lambda: forward_dynamics(plant, q, v, tau)  # noqa: E731
-    elif what.startswith("body"):
-        call = lambda: rigid_body.forward_dynamics(bodies_of(chain), parameters, q, v, tau)  # noqa: E731
     else:
         call = lambda: model.forward_dynamics(chain, parameters, q, v, tau)  # noqa: E731
     call()
