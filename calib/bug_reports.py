@@ -20,7 +20,7 @@ from calib.errors import CalibError, brief
 
 CODE = 4
 """Exit code of an error that nobody foresaw."""
-PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "cvxpy")
+PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "clarabel")
 
 
 def report(error: BaseException, command: Sequence[str], folder: Path | None = None) -> str:

@@ -106,8 +106,8 @@ class DriveTerm:
 
         acts, out = np.zeros((1, 8)), np.empty((rows, len(seen.v)))
         acts[0, 1 : 1 + len(self.settings)] = self.settings
-        series = (seen.x, seen.v, seen.v if seen.state is None else seen.state)
-        shape_kernels.fill(CODES[self.shape], acts, *map(np.ascontiguousarray, series), out)
+        x, v, state = map(np.ascontiguousarray, (seen.x, seen.v, seen.v if seen.state is None else seen.state))
+        shape_kernels.fill(CODES[self.shape], acts, x, v, state, out)
         return out
 
 

@@ -87,4 +87,12 @@ def _basis() -> np.ndarray:
     return basis
 
 
-BASIS = _basis()
+def _units() -> np.ndarray:
+    """Return an orthonormal basis (10, 4, 4) of the symmetric matrices."""
+    row, column = np.triu_indices(4)
+    units = np.zeros((10, 4, 4))
+    units[np.arange(10), row, column] = units[np.arange(10), column, row] = np.where(row == column, 1.0, np.sqrt(0.5))
+    return units
+
+
+BASIS, UNITS = _basis(), _units()

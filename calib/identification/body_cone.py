@@ -3,24 +3,23 @@
     { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not tell of χ is free
 
 (Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the data want to leave that
-convex cone, the optimum on it is found as a semidefinite program (cvxpy, Clarabel), and the cone is replaced by the
+convex cone, the optimum on it is found as a semidefinite program (Clarabel), and the cone is replaced by the
 plane that touches it there, νᵀ β >= νᵀ β*: the same optimum, with one multiplier, and a covariance that takes the plane
 as an equality (our choice; the cone is bent beyond it).
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from calib.arrays import frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import NotConverged
+from calib.estimation.convex.cone_program import minimise
 
 SIZE = 0.1  # [m] of a body of one kilogram, in whose units the program is written
 LARGEST = 1e4  # of a body in those units: keeps finite what the data do not tell
@@ -64,52 +63,39 @@ class BodyCone:
         Raises:
             NotConverged: where no bodies satisfy the bounds.
         """
-        import cvxpy
-
-        cp: Any = cvxpy
-        p, B = len(factor) - 1, len(self.labels)
+        p, count, base = len(factor) - 1, len(self.labels), len(self.transform)
         unit = np.linalg.norm(factor[:p, :p], axis=0)
         size = max(1.0, float(np.linalg.norm(factor[:p, p])))
         R, z = factor[:p, :p] / unit, factor[:p, p] / size  # β = size · b / unit
         root = np.diag([SIZE, SIZE, SIZE, 1.0])
-        units = root @ np.eye(16).reshape(16, 4, 4) @ root
-        block = pseudo_inertia.to_standard(0.5 * (units + units.transpose(0, 2, 1))).T
-        b, bodies = cp.Variable(p), [cp.Variable((4, 4), PSD=True) for _ in range(B)]
-        terms = cp.Variable(len(self.positive))
-        base = len(self.transform)
-        scale = unit[:base, None] / size
-        made = scale * self.transform[:, 10 * B :] @ terms
-        for i, body in enumerate(bodies):
-            made = made + (scale * self.transform[:, 10 * i : 10 * i + 10] @ block) @ cp.vec(body, order="C")
-        same = b[:base] == made
-        bounds: list[Any] = [same, *(cp.trace(body) <= LARGEST for body in bodies)]
-        bounds += [terms[k] >= 0.0 for k in np.flatnonzero(self.positive)]
-        rows = matrix / unit * size
-        for known, sign in ((np.isfinite(lower), 1.0), (np.isfinite(upper), -1.0)):
-            if known.any():
-                edge = (lower if sign > 0 else upper)[known]
-                length = np.linalg.norm(rows[known], axis=1)
-                bounds.append(sign * (rows[known] / length[:, None]) @ b >= sign * edge / length)
-        task = cp.Problem(cp.Minimize(cp.sum_squares(R @ b - z)), bounds)
-        try:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message="Solution may be inaccurate")
-                task.solve(solver=cp.CLARABEL)
-        except cp.SolverError as error:
-            raise NotConverged(f"bodies that can exist: Clarabel found no optimum ({error})") from error
-        if b.value is None:
-            raise NotConverged(f"bodies that can exist: Clarabel says '{task.status}'")
-        held = -0.5 * np.asarray(same.dual_value)  # the gradient's part that the cone balances
+        block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T  # of the unknowns' pseudo-inertia
+        made = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
+        made = np.asarray(
+            block_diag(made, np.eye(p - base))
+        )  # b of bodies and terms, and of columns that are none of theirs
+        free = made.shape[1] - 10 * count
+        bodies = np.einsum("ij,krs->irsjk", np.eye(count), pseudo_inertia.UNITS).reshape(count, 4, 4, 10 * count)
+        bodies = np.concatenate([bodies, np.zeros((count, 4, 4, free))], axis=3)
+        rows = [-np.einsum("irrj->ij", bodies) / LARGEST]
+        rows.append(np.eye(made.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
+        low, high = np.isfinite(lower), np.isfinite(upper)
+        sides = np.vstack([matrix[low], -matrix[high]]) / unit * size
+        lengths = np.linalg.norm(sides, axis=1, keepdims=True)
+        edges = np.concatenate([lower[low], -upper[high]]) / lengths[:, 0]
+        sides = sides / lengths
+        offset = np.concatenate([np.repeat([1.0, 0.0], [count, int(self.positive.sum())]), -edges])
+        found = minimise(R @ made, z, np.vstack([*rows, sides @ made]), offset, bodies)
+        b = made @ found.values
+        # the gradient's part that the cone balances
+        held = (R.T @ (R @ b - z) - sides.T @ found.rows[len(offset) - len(edges) :])[:base]
         if np.abs(held).max() < TOUCHES * max(float(np.abs(R.T @ z).max()), 1e-300):
             return None
         normal = np.zeros(p)
         normal[:base] = held
-        border = [
-            label
-            for label, body in zip(self.labels, bodies)
-            if (eigen := np.linalg.eigvalsh(body.value))[0] < BORDER * max(eigen[-1], BORDER)
-        ]
-        return _Plane(normal * unit / size, float(normal @ b.value), tuple(border))
+        eigenvalues = np.linalg.eigvalsh(bodies @ found.values)
+        border = eigenvalues[:, 0] < BORDER * np.maximum(eigenvalues[:, -1], BORDER)
+        labels = tuple(label for label, near in zip(self.labels, border) if near)
+        return _Plane(normal * unit / size, float(normal @ b), labels)
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:

@@ -13,7 +13,7 @@ from calib.errors import NotConverged
 from calib.estimation.triangles import require_rank
 
 SLACK = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
-ACCURACIES = 1e-10, 1e-8  # of the scaled problem; the second where rounding forbids the first
+ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +84,34 @@ def scale(factor: np.ndarray, rows: np.ndarray, offset: np.ndarray) -> Scaled:
     return Scaled(upper, factor[:p, p] / length, unit, length, rows * unit / sizes[:, None], offset / sizes, sizes)
 
 
-def minimise(
-    problem: Scaled, fixed: Scaled, matrices: np.ndarray, least: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return b, and multipliers of rows, of matrices (k, n, n) and of equalities; t = R b - z is a variable too.
+@dataclass(frozen=True, eq=False)
+class ConeOptimum:
+    """Optimum b (p,) of a cone program, and multipliers of rows (c,), of matrices (k, n, n), of equalities (e,)."""
 
-    So nothing is squared.
+    values: np.ndarray
+    rows: np.ndarray
+    matrices: np.ndarray
+    equalities: np.ndarray
+
+
+def minimise(
+    upper: np.ndarray,
+    target: np.ndarray,
+    rows: np.ndarray,
+    offset: np.ndarray,
+    matrices: np.ndarray,
+    least: np.ndarray | float = 0.0,
+    equal: np.ndarray | None = None,
+    held: np.ndarray | None = None,
+) -> ConeOptimum:
+    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; t = R b - z is an unknown: no squares.
+
+    Args:
+        upper, target: R (m, p), z (m,), of order one.
+        rows, offset: A (c, p), c (c,).
+        matrices: (k, n, n, p), M_k = Σ_j A_kj b_j.
+        least: λ, one or (k,).
+        equal, held: E (e, p), d (e,); None for none.
 
     Raises:
         NotConverged: where no point satisfies all.
@@ -97,34 +119,29 @@ def minimise(
     import clarabel
     from scipy import sparse
 
-    size, n, _, p = matrices.shape
+    (m, p), (size, n, _, _) = upper.shape, matrices.shape
+    equal, held = np.zeros((0, p)) if equal is None else equal, np.zeros(0) if held is None else held
     i, j = np.tril_indices(n)[::-1]  # upper triangle, column by column
     weight = np.where(i == j, 1.0, np.sqrt(2.0))
     flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
-    rows = np.vstack([problem.upper, fixed.rows, -problem.rows, -flat])
-    beside = np.zeros((len(rows), p))
-    beside[:p] = -np.eye(p)
-    right = np.concatenate([
-        problem.target, -fixed.offset, problem.offset, -np.tile(np.where(i == j, least, 0.0), size)
-    ])  # fmt: skip
-    ends = np.cumsum([p, len(fixed.rows), len(problem.rows)])
-    cones = [clarabel.ZeroConeT(int(ends[1]))]
-    if len(problem.rows):
-        cones.append(clarabel.NonnegativeConeT(len(problem.rows)))
+    system = np.vstack([upper, equal, -rows, -flat])
+    right = np.concatenate([target, held, offset, -np.outer(np.broadcast_to(least, size), i == j).ravel()])
+    ends = np.cumsum([m, len(equal), len(rows)])
+    cones = [clarabel.ZeroConeT(int(ends[1])), *[clarabel.NonnegativeConeT(len(rows))][: len(rows)]]
     cones += [clarabel.PSDTriangleConeT(n)] * size
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
-    cost = sparse.diags(np.repeat([0.0, 1.0], p)).tocsc()
-    system = sparse.csc_matrix(np.hstack([rows, beside]))
+    cost = sparse.diags(np.repeat([0.0, 1.0], [p, m])).tocsc()
+    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
     for accuracy in ACCURACIES:
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
-        found = clarabel.DefaultSolver(cost, np.zeros(2 * p), system, right, cones, settings).solve()
+        found = clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings).solve()
         if str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
             break
     b, dual = np.array(found.x)[:p], np.array(found.z)
     if str(found.status) not in ("Solved", "AlmostSolved"):
-        raise NotConverged(f"the constraints may contradict each other: Clarabel says {found.status}", b * problem.unit)
+        raise NotConverged(f"the constraints may contradict each other: Clarabel says {found.status}", b)
     pushes = np.zeros((size, n, n))
     pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
     pushes[:, j, i] = pushes[:, i, j]
-    return b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]]
+    return ConeOptimum(b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]])

@@ -154,7 +154,9 @@ class _Planes:
         for rounds in count():
             if not len(used):
                 used = np.argsort(small.least_eigenvalues(self.free / problem.unit)[0])[:ENTER]
-            b, mu, pushes, rates = minimise(problem, fixed, small.matrices[used], small.least)
+            goal = problem.upper, problem.target, problem.rows, problem.offset
+            solved = minimise(*goal, small.matrices[used], small.least, fixed.rows, -fixed.offset)
+            b, mu, pushes, rates = solved.values, solved.rows, solved.matrices, solved.equalities
             sizes, normals = small.least_eigenvalues(b)
             traces = np.einsum("kii->k", pushes)
             bind = traces > BINDS

@@ -2,7 +2,7 @@
 
     min ‖R T χ - z‖   over   P_i(χ) ⪰ 0,  Ia, Fv, Fc >= 0
 
-(Sousa & Cortesão 2014; Wensing, Kim & Slotine 2018): a semidefinite program, written in cvxpy and solved by Clarabel.
+(Sousa & Cortesão 2014; Wensing, Kim & Slotine 2018): a semidefinite program (Clarabel).
 Its optimum lies on the border wherever the estimate itself is impossible; it says what consistency costs and no more.
 With a pull γ towards the prior bodies P_i⁰ = L Lᵀ it is the Euclidean counterpart of the entropic prior of
 `calib.identification.possible.solve`, whose second order it is: + ½ γ Σ ½ ‖L⁻¹ P_i L⁻ᵀ - 1‖², the drives' likewise. In
@@ -11,14 +11,11 @@ these coordinates no weight between kg and kg m² is needed; unlike the entropic
 
 from __future__ import annotations
 
-import warnings
-from typing import Any
-
 import numpy as np
 import scipy.linalg
 
 from calib.dynamics import pseudo_inertia
-from calib.errors import NotConverged
+from calib.estimation.convex.cone_program import minimise
 from calib.estimation.triangles import retriangulate
 from calib.identification.possible.information import Information
 from calib.identification.possible.problem import DRIVE, BodyCost
@@ -36,45 +33,33 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     Raises:
         NotConverged: where Clarabel finds no optimum.
     """
-    import cvxpy
-
-    cp: Any = cvxpy
-    matrix = _coordinates(problem)
+    matrix, count = _coordinates(problem), problem.bodies
     columns = problem.factor[:, :-1] @ matrix
     fixed = ~problem.free
-    given = np.where(fixed[10 * problem.bodies :], problem.fixed, 0.0)
-    target = problem.factor[:, -1] - problem.factor[:, 10 * problem.bodies : -1] @ given
-    triangle = retriangulate(np.column_stack([columns, target]))
-    scale = max(1.0, float(np.linalg.norm(triangle[:-1, -1])))
-    bodies = [
-        cp.Variable((4, 4), symmetric=True) if i == spared else cp.Variable((4, 4), PSD=True)
-        for i in range(problem.bodies)
-    ]
-    terms = cp.Variable(len(problem.sizes))
-    unknowns = cp.hstack([*(cp.vec(body, order="C") for body in bodies), terms])
-    bound = [cp.trace(body) <= 4.0 * LARGEST for body in bodies]
-    bound += [terms[k] >= 0.0 for k in np.flatnonzero(problem.positive) if problem.bodies + k != spared]
-    rows = triangle[:-1] / scale
-    goal = cp.sum_squares(rows[:, :-1] @ unknowns - rows[:, -1])
+    given = np.where(fixed[10 * count :], problem.fixed, 0.0)
+    target = problem.factor[:, -1] - problem.factor[:, 10 * count : -1] @ given
+    goal = retriangulate(np.column_stack([columns, target]))[:-1]
     if pull > 0.0:
-        drawn = [0.5 * w * cp.sum_squares(body - np.eye(4)) for w, body in zip(problem.weights(pull), bodies)]
-        drawn += [
-            0.5 * DRIVE * cp.square(terms[k] - 1.0) if problem.positive[k] else cp.square(terms[k])
-            for k in np.flatnonzero(problem.sizes > 0.0)
-        ]
-        goal = goal + cp.sum(cp.hstack(drawn)) / scale**2
-    task = cp.Problem(cp.Minimize(goal), bound)
-    try:
-        with warnings.catch_warnings():  # a reduced accuracy (1e-5) does for a distance in sigmas
-            warnings.filterwarnings("ignore", message="Solution may be inaccurate")
-            task.solve(solver=cp.CLARABEL)
-    except cp.SolverError as error:
-        raise NotConverged(f"the nearest possible robot was not found: {error}") from error
-    if unknowns.value is None:
-        raise NotConverged(f"the nearest possible robot was not found: Clarabel says '{task.status}'")
-    result = np.asarray(matrix @ unknowns.value)
-    result[10 * problem.bodies :] += given
-    return result
+        goal = np.vstack([goal, _pulling(problem, pull)])
+    goal = goal / max(1.0, float(np.linalg.norm(goal[:, -1])))
+    bodies = np.einsum("ij,krs->irsjk", np.eye(count), pseudo_inertia.UNITS).reshape(count, 4, 4, 10 * count)
+    bodies = np.concatenate([bodies, np.zeros((count, 4, 4, len(problem.sizes)))], axis=3)
+    positive = [k for k in np.flatnonzero(problem.positive) if count + k != spared]
+    rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * LARGEST), np.eye(len(matrix))[10 * count :][positive]])
+    offset = np.repeat([1.0, 0.0], [count, len(positive)])
+    least = np.where(np.arange(count) == spared, -4.0 * LARGEST, 0.0)
+    result = matrix @ minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, least).values
+    result[10 * count :] += given
+    return np.asarray(result)
+
+
+def _pulling(problem: BodyCost, pull: float) -> np.ndarray:
+    """Return the Euclidean prior as rows of [W y] in the coordinates of `_coordinates`."""
+    flat = pseudo_inertia.UNITS.reshape(10, 16).T
+    bodies = [np.sqrt(0.5 * weight) * np.column_stack([flat, np.eye(4).ravel()]) for weight in problem.weights(pull)]
+    terms = np.sqrt(np.where(problem.positive, 0.5 * DRIVE, 1.0)) * (problem.sizes > 0.0)
+    unknowns = np.asarray(scipy.linalg.block_diag(*(one[:, :-1] for one in bodies), np.diag(terms)))
+    return np.column_stack([unknowns, np.concatenate([*(one[:, -1] for one in bodies), terms * problem.positive])])
 
 
 def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
@@ -91,10 +76,10 @@ def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[t
 
 
 def _coordinates(problem: BodyCost) -> np.ndarray:
-    """Return χ (p,) as a matrix times [vec Q_1; …; u], P_i = L Q_i Lᵀ, P_i⁰ = L Lᵀ, u in the terms' sizes."""
-    blocks = []
-    for known in problem.references:
-        root = np.linalg.cholesky(known)
-        units = root @ np.eye(16).reshape(16, 4, 4) @ root.T
-        blocks.append(pseudo_inertia.to_standard(0.5 * (units + units.transpose(0, 2, 1))).T)
-    return np.asarray(scipy.linalg.block_diag(*blocks, np.diag(problem.sizes)))
+    """Return χ (p,) as a matrix times [ξ_1; …; u], P_i = L Q_i Lᵀ, P_i⁰ = L Lᵀ, u in the terms' sizes.
+
+    ξ_i are the entries of Q_i by an orthonormal basis.
+    """
+    roots = np.linalg.cholesky(problem.references)[:, None]
+    blocks = pseudo_inertia.to_standard(roots @ pseudo_inertia.UNITS @ roots.transpose(0, 1, 3, 2))
+    return np.asarray(scipy.linalg.block_diag(*blocks.transpose(0, 2, 1), np.diag(problem.sizes)))

@@ -28,7 +28,7 @@ sigmas do not tell the errors of the model, and count d / √b times (Birge 1932
 otherwise overrule any CAD.
 
 Newton's method solves it in milliseconds, strictly inside the cone; the nearest possible robot without any prior lies
-on the border, a semidefinite program for cvxpy with Clarabel (`nearest`).
+on the border, a semidefinite program for Clarabel (`nearest`).
 """
 
 from __future__ import annotations
