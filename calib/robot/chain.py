@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -19,6 +20,7 @@ AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
 MAX_NUMBER = 1e12  # of masses, moments and lengths [SI] (our choice)
 MAX_GRAVITY = 100.0  # [m/s²] (our choice)
+MIN_LIMIT = 1e-6  # of a speed or effort that a description states [SI]; less is none (our choice)
 
 
 def check_gravity(gravity: np.ndarray, place: str = "") -> None:
@@ -27,7 +29,7 @@ def check_gravity(gravity: np.ndarray, place: str = "") -> None:
     Raises:
         RobotError: for one beyond `MAX_GRAVITY`, or not finite.
     """
-    if not np.linalg.norm(gravity) < MAX_GRAVITY:
+    if not math.hypot(*gravity) < MAX_GRAVITY:
         raise RobotError(f"{place}gravity {gravity.tolist()} is none: expected m/s², some 9.81 in all")
 
 
@@ -35,7 +37,7 @@ def check_gravity(gravity: np.ndarray, place: str = "") -> None:
 class Joint:
     """One actuated joint: its name, kind and limits (SI; infinite where none are given).
 
-    `unstated` names limits of 0 or below as they were written (``velocity 0``): taken as not stated, and told.
+    `unstated` names limits below `MIN_LIMIT` as they were written (``velocity 0``): taken as not stated, with a remark.
     """
 
     name: str
@@ -54,8 +56,8 @@ class Joint:
         for what in ("velocity", "effort"):
             if not getattr(self, what) >= 0.0:
                 raise RobotError(f"joint '{self.name}': {what} {getattr(self, what):g} is no limit: expected 0 or more")
-            if getattr(self, what) == 0.0:
-                object.__setattr__(self, "unstated", (*self.unstated, f"{what} 0"))
+            if getattr(self, what) < MIN_LIMIT:
+                object.__setattr__(self, "unstated", (*self.unstated, f"{what} {getattr(self, what):g}"))
                 object.__setattr__(self, what, np.inf)
 
     @property

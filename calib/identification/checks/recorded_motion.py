@@ -21,6 +21,7 @@ from trajectories.errors import BadInput
 from trajectories.recall import Recalled, find_periods, sliding_products
 
 STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
+MAX_GAP = 60.0  # between samples that the grid bridges [s]; a log may go on after weeks
 LIKE = 0.9  # share of the motion's variance a recorded period has to explain
 SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
 UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
@@ -125,8 +126,15 @@ def explain(
 
 
 def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    grid = np.arange(recording.t[0], recording.t[-1], STEP)
+    grid = _coarse(recording.t)
     return grid, _sampled(recording.t, recording.q, grid)
+
+
+def _coarse(t: np.ndarray) -> np.ndarray:
+    """Return times every `STEP` over those of samples (N,) [s]; of longer gaps than `MAX_GAP` the rest is left out."""
+    last = np.flatnonzero(np.diff(t) > MAX_GAP)
+    spans = zip(t[np.append(0, last + 1)], np.append(t[last] + MAX_GAP, t[-1]))
+    return np.concatenate([np.arange(start, stop, STEP) for start, stop in spans])
 
 
 def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -190,7 +198,7 @@ def share_of_nominal(
         gravity: [m/s²], where it is not the robot's own.
         static: compare torques of gravity alone, the others left free like friction.
     """
-    grid = np.arange(t[0], t[-1], STEP)
+    grid = _coarse(t)
     torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
     q, v, a = (_smooth(place, order) for order in range(3))
     bodies, parameters = bodies_of(chain), standard_parameters(chain)

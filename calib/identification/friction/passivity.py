@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.data.signals.motion import moving
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import Joined
 from calib.errors import MeasurementError
@@ -20,7 +21,7 @@ LEAST = -0.01  # of the energy that a joint moves: noise and what other columns 
 def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     """Return the energy that each joint's friction takes, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
 
-    Joints that do not move have zero.
+    Joints that do not move have zero: noise moves none.
     """
     model = dynamics.model
     n, first = model.n, model.inertial
@@ -29,15 +30,16 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
         for one, value in zip(model.columns, dynamics.values[first:])
         if one.form.dissipative and value != 0.0
     ]
-    taken, moved = np.zeros(n), np.zeros(n)
+    taken, moved, moves = np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool)
     for case in cases:
         v = case.motion.v
         load = dynamics.transmitted(case) if any(one.form.loaded for one, _ in terms) else None
         moved += np.abs(v * case.target[:, -n:]).sum(axis=0)
+        moves |= moving(case.motion).any(axis=0)
         for one, value in terms:
             for row, values in term_columns(one, case, load):
                 taken[row] += value * float(v[:, row] @ values)
-    return np.where(moved > 0.0, taken / np.where(moved > 0.0, moved, 1.0), 0.0)
+    return np.where(moves & (moved > 0.0), taken / np.where(moved > 0.0, moved, 1.0), 0.0)
 
 
 def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarray:

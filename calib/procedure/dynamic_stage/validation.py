@@ -102,7 +102,6 @@ def assess(
     dynamics: Dynamics,
     findings: ModelFindings,
     wrong: Sequence[int] | None = None,
-    tolerance: float = 0.0,
     progress: Progress | None = None,
 ) -> Assessment:
     """Predict every recording and judge: in the command, and of a model read from its folder.
@@ -112,7 +111,6 @@ def assess(
         dynamics: the model.
         findings: what is known of it.
         wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
-        tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
     """
     say = progress or (lambda words: None)
     wrong = driven(dynamics, inputs.cases) if wrong is None else wrong
@@ -158,8 +156,7 @@ def assess(
         *findings.notes,
     )  # fmt: skip
     return Assessment(
-        fit, validation, predictions, repeated, excitation, _tolerated(verdict, proofs, tolerance),
-        tuple(dict.fromkeys(said)), tracking, expected,
+        fit, validation, predictions, repeated, excitation, verdict, tuple(dict.fromkeys(said)), tracking, expected,
     )  # fmt: skip
 
 
@@ -169,11 +166,3 @@ def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
         return verdict
     words = "its inertias are not physically consistent: predict torques with it, simulate the exported robot"
     return replace(verdict, reason=f"{verdict.reason}; {words}")
-
-
-def _tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:
-    """Return the verdict, made to fail where the tolerance [%] is not kept."""
-    worst = max((one.raw.total for one in proofs.values()), default=0.0)
-    if not tolerance or worst <= tolerance:
-        return verdict
-    return replace(verdict, level="fail", reason=f"{verdict.reason}; above the tolerance of {tolerance:g} %")

@@ -37,6 +37,7 @@ BLOCKED = 3.0  # times that a straight move which does not keep clear is taken t
 PLACES = 8  # of a straight move that are looked at to guess whether it keeps clear
 ROUNDS, QUICK, PATIENT = 4, 250, 1000  # orders tried, and random places per way in them and in the last; our choice
 NEAR = 8  # turns of a pose, and poses to come from, that are tried to tell whether there is any way; our choice
+MIN_STEP = 0.01  # of a joint's range that the search for a way goes at once, however slow the joint is; our choice
 FORBIDDEN = 1e4  # [s] a move for which no way was found
 Progress = Callable[[str], None]
 Ways = dict[tuple[int, int], np.ndarray]  # by the numbers of two poses, the smaller one first
@@ -298,4 +299,5 @@ def _room(chain: Chain, limits: Any, velocity: np.ndarray) -> Room:
     def clear(q: np.ndarray) -> np.ndarray:
         return np.ones(len(q), dtype=bool) if model is None else model.free(q, 0.5 * clearance)
 
-    return Room(limits.lower, limits.upper, clear, max(clearance, 1e-3) / reach, velocity)
+    unit = np.maximum(velocity, MIN_STEP * (limits.upper - limits.lower))
+    return Room(limits.lower, limits.upper, clear, max(clearance, 1e-3) / reach, unit)

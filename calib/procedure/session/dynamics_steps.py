@@ -8,22 +8,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from calib import files
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
+from calib.errors import CalibError
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
-from calib.procedure.dynamic_stage.validation import assess
+from calib.procedure.dynamic_stage.validation import Assessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
-from calib.procedure.findings import UNJUDGED
+from calib.procedure.findings import UNJUDGED, Verdict
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
+from calib.procedure.session.geometry_steps import deliver_identified
 from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
@@ -212,9 +215,31 @@ def predict(session: Session, say: Say) -> list[str]:
         session.fit.path, training, [*held, *_cut_paths(unseen, aside)], options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
-    place, tolerance = session.identification, session.settings.dynamics.tolerance_percent
-    found = assess(given, place.dynamics(), place.findings(), tolerance=tolerance, progress=say)
+    place = session.identification
+    found = assess(given, place.dynamics(), place.findings(), progress=say)
+    place.unseen.write(given, found)  # the export is judged by the torques written here
+    found = replace(found, verdict=_as_delivered(session, found))
     place.unseen.write(given, found)
     known = place.metrics().warnings
     fresh = [words for words in found.warnings if words not in known]
     return [*notes, str(found.verdict), *fresh]
+
+
+def _as_delivered(session: Session, found: Assessment) -> Verdict:
+    """Return the verdict on the robot as it will be exported; of a model that cannot be, for prediction only."""
+    from calib.procedure.export.delivery import prediction as prediction_of_export
+
+    verdict, known = found.verdict, None
+    with TemporaryDirectory() as folder:
+        try:
+            deliver_identified(session, Path(folder))
+            known = prediction_of_export(Path(folder))
+        except CalibError as error:
+            verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
+    worst = max((one.raw.total for name, one in found.validation.items() if name not in found.repeated), default=0.0)
+    left, what = (worst, "identified model") if known is None else (known.exported, "exported robot")
+    tolerance = session.settings.dynamics.tolerance_percent
+    if not tolerance or left <= tolerance:
+        return verdict
+    why = f"the {what} leaves {left:.2f} %, above the tolerance of {tolerance:g} %"
+    return Verdict("fail", f"{verdict.reason}; {why}")

@@ -16,7 +16,7 @@ from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, filled_in, read_poses, write_poses
-from calib.errors import RobotError, UsageError
+from calib.errors import CalibError, UsageError
 from calib.folders import write_staged
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import UNJUDGED
@@ -270,18 +270,24 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
         write_staged(out, USES, partial(_copy, session.fit.robot))
     if not session.dynamic:
         return lines
-    from calib.procedure.export.dynamics import deliver_dynamics
-
     say("all parameters of possible bodies")
     for name in USES:  # a second robot.urdf, by earlier versions
         (out / "dynamics" / name).unlink(missing_ok=True)
     with suppress(OSError):  # not there, or not empty
         (out / "dynamics").rmdir()
     try:
-        found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
-    except (RobotError, UsageError) as error:  # the geometry stands by itself
+        found = deliver_identified(session, out)
+    except CalibError as error:  # the geometry stands by itself
         return [*lines, f"the dynamics were not exported: {error}"]
     return [*found, *(lines[1:] if session.geometric else lines)]
+
+
+def deliver_identified(session: Session, out: Path) -> list[str]:
+    """Write the identified robot into `out`, see `calib.procedure.export.dynamics.deliver_dynamics`."""
+    from calib.procedure.export.dynamics import deliver_dynamics
+
+    source = robot_file(session)
+    return deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
 
 
 def _copy(source: Path, folder: Path) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.errors import RobotError, require, suggestion
-from calib.robot.chain import Joint
+from calib.robot.chain import MIN_LIMIT, Joint
 from calib.robot.formats.markup import Node, parse
 from calib.transforms import from_xyz_rpy
 from calib.words import listing
@@ -284,9 +284,9 @@ def _mimic(node: Node, place: str) -> Mimic | None:
 
 
 def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float, tuple[str, ...]]:
-    """Return lower, upper, velocity, effort, and which of the last two are 0 or below as they are written.
+    """Return lower, upper, velocity, effort, and which of the last two are below `MIN_LIMIT`, as written.
 
-    Infinite where not given or beyond 1e9, the last two also where 0 or below: URDF demands velocity and effort, so 0
+    Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF demands velocity and effort, so 0
     is what people write who do not know them, and 1e9 is what we write.
     """
     found = node.first("limit")
@@ -299,9 +299,10 @@ def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, flo
                 found_limits = f"lower limit {lower:g} is not below the upper {upper:g}"
                 raise RobotError(f"{place}: {found_limits}; correct them, or make the joint fixed or continuous")
         velocity, effort = _float(found, "velocity", np.inf, place), _float(found, "effort", np.inf, place)
-        unstated = [f"{what} {size:g}" for what, size in (("velocity", velocity), ("effort", effort)) if size <= 0]
+        sizes = {"velocity": velocity, "effort": effort}
+        unstated = [f"{what} {size:g}" for what, size in sizes.items() if size < MIN_LIMIT]
     lower, upper = lower if lower > -UNLIMITED else -np.inf, upper if upper < UNLIMITED else np.inf
-    velocity, effort = (size if 0 < size < UNLIMITED else np.inf for size in (velocity, effort))
+    velocity, effort = (size if MIN_LIMIT <= size < UNLIMITED else np.inf for size in (velocity, effort))
     return lower, upper, velocity, effort, tuple(unstated)
 
 

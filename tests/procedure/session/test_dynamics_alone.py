@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 from sessions import go_on
 from without_figures import run
 
+from calib.errors import NotConverged
+from calib.procedure.export import dynamics as export
 from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.session import steps
 from calib.procedure.session.commands import NewSession, begin
@@ -71,6 +74,27 @@ def test_torques_in_amperes_are_good_for_prediction_only(tmp_path: Path, capsys:
     assert not session.path("9-export/robot.urdf").exists()
     assert "PASS (prediction only)" in session.path("certificate.html").read_text()
     assert run("next", session.folder) == 0 and "no robot was exported" in capsys.readouterr().out
+
+
+def test_no_file_says_another_verdict_than_that_of_what_is_delivered(tmp_path: Path) -> None:
+    session = recorded(tmp_path, "tau")
+    for tolerance, exports, verdict, why in (
+        (1e-6, True, "fail", "the exported robot leaves"), (0.0, False, PREDICTION_ONLY, "no such robot"),
+    ):  # fmt: skip
+        path = session.path("session.toml")
+        path.write_text(re.sub("tolerance_percent = [^ ]+", f"tolerance_percent = {tolerance}", path.read_text()))
+        with pytest.MonkeyPatch.context() as patch:
+            if not exports:
+                patch.setattr(export, "read", refuse)
+            assert go_on(session) is None
+        whole = json.loads(session.path("verdict.json").read_text())["dynamics"]
+        report = json.loads(session.path("8-dynamics/unseen/report.json").read_text())
+        assert whole["verdict"] == report["verdict"] == verdict and why in report["reason"] == whole["reason"]
+        assert json.loads(session.path("8-dynamics/metrics.json").read_text())["verdict"] == ""
+
+
+def refuse(*arguments: object) -> None:
+    raise NotConverged("no such robot")
 
 
 def test_a_session_has_something_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
