@@ -12,6 +12,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
@@ -128,13 +129,13 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
         MeasurementError: for a file that is missing, empty, not UTF-8, without a header, or with decimal commas; for
             a name that occurs twice; for a row of another length than the header.
     """
-    lines, separator, found = _open(path, header is None)
-    names, units = (tuple(header), ("",) * len(header)) if header is not None else _split_units(found)
-    if not doubles and len(set(names)) < len(names):
-        name = next(name for i, name in enumerate(names) if name in names[:i])
-        places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
-        raise MeasurementError(f"stands in the header more than once (columns {places})", path, column=name)
-    cells = _read_columns(lines, separator, names, path)
+    with _opened(path, header is None) as (lines, separator, found):
+        names, units = (tuple(header), ("",) * len(header)) if header is not None else _split_units(found)
+        if not doubles and len(set(names)) < len(names):
+            name = next(name for i, name in enumerate(names) if name in names[:i])
+            places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
+            raise MeasurementError(f"stands in the header more than once (columns {places})", path, column=name)
+        cells = _read_columns(lines, separator, names, path)
     require(len(cells[0]), "has a header but no data rows", MeasurementError, path)
     rows = frozen(np.arange(1, len(cells[0]) + 1), int)
     if header is None and names[-1] == f"column {len(names)}" and not _filled(cells[-1]):
@@ -144,25 +145,30 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
 
 def read_header(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the column names and units of the CSV file at `path` without reading its rows."""
-    lines, _, found = _open(path, True)
-    lines.close()
-    return _split_units(found)
+    with _opened(path, True) as (_, _, found):
+        return _split_units(found)
 
 
 def row_width(path: str | Path) -> int:
     """Return the number of cells in the first line of the CSV file at `path`."""
-    lines, _, first = _open(path, False)
-    lines.close()
-    return len(first)
+    with _opened(path, False) as (_, _, first):
+        return len(first)
 
 
-def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
-    """Open a file and return it behind its header line, with the separator and the header's cells."""
+@contextmanager
+def _opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[str]]]:
+    """Open a file behind its header line, with the separator and the header's cells."""
     try:
         check_regular(path)
-        file = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (the caller reads on, and closes it)
+        opened = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error
+    with opened as file:
+        yield file, *_first_line(file, path, headed)
+
+
+def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, list[str]]:
+    """Return the separator and the header's cells, and leave a file behind its header line."""
     try:
         comment, place = "", 0
         for line in iter(partial(file.readline, LONGEST), ""):
@@ -182,18 +188,12 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
                 if _headless(first, path) or not headed:
                     file.seek(place)
                     first = _comment_header(comment, separator, len(first), path) if headed else first
-                return file, separator, [cell.strip() for cell in first]
+                return separator, [cell.strip() for cell in first]
             place = file.tell()
     except UnicodeDecodeError as error:
-        file.close()
         raise _not_utf8(error, path) from error
     except (csv.Error, StopIteration) as error:
-        file.close()
         raise MeasurementError(f"is no CSV: {error}", path) from error
-    except MeasurementError:
-        file.close()
-        raise
-    file.close()
     raise MeasurementError("is empty: no header and no rows", path)
 
 
@@ -260,8 +260,6 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
         parts = _read_cells(body, separator, names, path, done)
     except UnicodeDecodeError as error:
         raise _not_utf8(error, path) from error
-    finally:
-        lines.close()
     table = _transposed(blocks, len(names))
     if not any(parts):
         return tuple(table)
