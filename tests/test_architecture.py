@@ -15,7 +15,7 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 
 # heavy dependency -> the only modules that may import it (a trailing dot: all of that package)
 HOMES = {
-    "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.formats.readback"],
+    "pinocchio": ["calib.robot.collision", "calib.robot.formats.readback"],
     "coal": ["calib.robot.collision"],
     "numba": [
         "calib.dynamics.gradient_kernels",

@@ -1,4 +1,4 @@
-"""Compiled rigid-body kernels (numba) on the arrays of `Bodies`: torques, regressor, accelerations.
+"""Compiled rigid-body kernels (numba) on the arrays of `Bodies`: torques, regressor, inertia.
 
 Notation, all in body i's own frame: w angular velocity, dw its derivative, a acceleration of the frame's origin minus
 gravity, (u_j, s_j) angular and linear velocity of the frame per unit rate of coordinate j. The wrench of body i,

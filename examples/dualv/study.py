@@ -21,6 +21,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from computed_torque import ComputedTorque, ParallelRun, simulate
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
@@ -35,7 +36,6 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.rooms.parallel.design import ParallelDesign, design_parallel
 from calib.rooms.parallel.mechanism import library, parallel_files
 from calib.rooms.parallel.mechanism.closure import closed
-from calib.rooms.parallel.mechanism.computed_torque import ComputedTorque, ParallelRun, simulate
 from calib.rooms.parallel.mechanism.distribution import distributed, overconstraint
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 

@@ -6,9 +6,10 @@ batch without a compiler can be.
 """
 
 import numpy as np
+import pinocchio_model as model
 import pytest
 
-from calib.dynamics import base, drives, model, rigid_body
+from calib.dynamics import base, drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot.load import load

@@ -10,12 +10,12 @@ import sys
 from functools import cache
 
 import numpy as np
+import pinocchio_model as model
 import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.dynamics import model
 from calib.dynamics.bodies import standard_parameters
 from calib.identification.cases import Case, make_case
 from calib.identification.loop.loop_recordings import Loop

@@ -3,11 +3,12 @@
 from functools import cache
 
 import numpy as np
+import pinocchio_model as model
 import pytest
 from arms import motley, physical, states
 from differences import check
 
-from calib.dynamics import base, drives, model, rigid_body
+from calib.dynamics import base, drives, rigid_body
 from calib.dynamics import drives as friction
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel, from_chain

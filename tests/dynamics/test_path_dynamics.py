@@ -6,11 +6,11 @@ import arms
 import numpy as np
 import pinocchio
 import pytest
+from pinocchio_model import model as pinocchio_model
 
 from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.model import model as pinocchio_model
 from calib.dynamics.path_dynamics import of_base, of_standard
 from calib.dynamics.torque_rows import BOTH, DRIVE, MOTOR
 from calib.errors import CalibError

@@ -1,12 +1,13 @@
 """Identities: regressor · parameters = inverse dynamics = Pinocchio; gradients."""
 
 import numpy as np
+import pinocchio_model as model
 import pytest
 from arms import LIBRARY, motley, physical, states
 from closed_tree import from_inertia
 from differences import check
 
-from calib.dynamics import model, rigid_body
+from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.gravity import gravity_torques
 from calib.errors import CalibError, RobotError

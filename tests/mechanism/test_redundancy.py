@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from computed_torque import ComputedTorque, simulate
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
@@ -13,7 +14,6 @@ from calib.identification.identify import identify_model
 from calib.identification.settings import IdentificationSettings
 from calib.rooms.parallel.mechanism import library, parallel_files
 from calib.rooms.parallel.mechanism.closure import closed
-from calib.rooms.parallel.mechanism.computed_torque import ComputedTorque, simulate
 from calib.rooms.parallel.mechanism.distribution import distributed, overconstraint
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from pinocchio_model import PINOCCHIO_ORDER, to_inertia
 
 from calib.dynamics.bodies import PRISMATIC, bodies_of
-from calib.dynamics.model import PINOCCHIO_ORDER, to_inertia
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.leg_links import Posture
 

@@ -9,9 +9,9 @@ from functools import cache, partial
 
 import excited_arm as arm
 import numpy as np
+import pinocchio_model as model
 import pytest
 
-from calib.dynamics import model
 from calib.dynamics.bodies import standard_parameters
 from trajectories.bspline import bspline_family
 from trajectories.constraints import BoxLimit, TorqueLimit, box_limits

@@ -62,7 +62,7 @@ def test_forward_dynamics_undo_inverse_dynamics_with_drives(chain):
 
 
 def test_it_runs_like_pinocchios_aba_under_rk4():
-    from calib.dynamics import model
+    import pinocchio_model as model
 
     chain = description.read(library.path("tx40"))
     parameters, h = standard_parameters(chain), 1e-3
@@ -85,8 +85,7 @@ def test_it_runs_like_pinocchios_aba_under_rk4():
 
 def test_energy_stays_without_friction_and_controller_and_the_drift_falls_with_the_fourth_power():
     import pinocchio as pin
-
-    from calib.dynamics.model import model
+    from pinocchio_model import model
 
     chain = description.read(library.path("tx40"))
     made = model(chain)

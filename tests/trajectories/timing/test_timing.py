@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pinocchio
 import pytest
+from pinocchio_model import model as pinocchio_model
 from planned import CHAIN, WAYPOINTS, Cart, cart_limits, limits, lwr
 
-from calib.dynamics.model import model as pinocchio_model
 from calib.robot.chain import random_joints
 from calib.rooms.cells.known_robots import truth
 from trajectories.errors import BadInput, NothingFeasible

@@ -13,6 +13,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+import run_kernels
 
 from calib.arrays import frozen
 from calib.dynamics import rigid_body
@@ -82,8 +83,6 @@ def simulate(
         CannotSimulate: for a run that leaves its reference.
         UsageError: for other drive terms.
     """
-    from calib.rooms.parallel.mechanism import closure_kernels
-
     known, robot = model.known, model.known.robot
     motion = along(known, x, v, a)
     plan = (
@@ -98,7 +97,7 @@ def simulate(
     read, held = np.empty((2, len(x), robot.n))
     omega = 2.0 * np.pi * controller.frequency
     state = (np.array(motion.posture.q[0]), np.array(motion.posture.pose[0]))
-    left = closure_kernels.run(
+    left = run_kernels.run(
         _compiled(model), _parameters(model, values, carried), *state, np.array(motion.rate[0]),
         tuple(np.ascontiguousarray(part) for part in plan), controller.encoder * noise,
         np.array([joint.effort for joint in robot.joints]), np.array([omega**2, 2.0 * controller.damping * omega]),
@@ -114,7 +113,7 @@ def simulate(
 
 
 def _compiled(model: ParallelModel) -> tuple:
-    """Return the robot as `closure_kernels.accelerate` reads it."""
+    """Return the robot as `run_kernels.accelerate` reads it."""
     robot = model.known.robot
     legs = [compiled(leg) for leg in robot.legs]
     kinds = [bodies.links for bodies, _ in legs], [bodies.constants for bodies, _ in legs], [tail for _, tail in legs]
@@ -134,7 +133,7 @@ def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
 
 
 def _parameters(model: ParallelModel, values: np.ndarray, carried: Collection[str] | None) -> tuple:
-    """Return parameters as `closure_kernels.accelerate` reads them."""
+    """Return parameters as `run_kernels.accelerate` reads them."""
     drives = np.zeros((int(model.known.robot.starts[-1]), 5))
     drives[:, 4] = 1.0
     for one, value in zip(model.terms, values[model.inertial :]):

@@ -1,0 +1,306 @@
+"""Compiled kernels (numba) of a simulated run of a parallel robot; notation of `closure_kernels` of the mechanism."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from calib.dynamics.kernels import OPTIONS, inverse_dynamics, mass_matrix
+from calib.rooms.parallel.mechanism.closure_kernels import SCALE, invert, one_leg
+
+
+@njit(**OPTIONS)
+def _cross(a, b, out):
+    """Add a × b to `out`."""
+    out[0] += a[1] * b[2] - a[2] * b[1]
+    out[1] += a[2] * b[0] - a[0] * b[2]
+    out[2] += a[0] * b[1] - a[1] * b[0]
+
+
+@njit(**OPTIONS)
+def _add(A, x, out):
+    """Add A x to `out`."""
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            out[i] += A[i, k] * x[k]
+
+
+@njit(**OPTIONS)
+def _platform(body, pose, turn, gravity, M, h):
+    """Write the platform's inertia M (6, 6), zero on entry, and its wrench h (6,) where the twist does not change."""
+    S, across, spin, load = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(6)
+    own = np.array([[body[0], body[1], body[2]], [body[1], body[3], body[4]], [body[2], body[4], body[5]]])
+    for i in range(3):
+        M[i, i] = body[9]
+        for k in range(3):
+            S[i] += pose[i, k] * body[6 + k]
+            for a in range(3):
+                for b in range(3):
+                    M[3 + i, 3 + k] += pose[i, a] * own[a, b] * pose[k, b]
+    for i in range(3):
+        for k in range(3):
+            spin[i] += M[3 + i, 3 + k] * turn[k]
+    _cross(turn, S, across)
+    _cross(turn, across, load[:3])
+    _cross(turn, spin, load[3:])
+    _cross(gravity, S, load[3:])
+    for i in range(3):
+        h[i], h[3 + i] = load[i] - body[9] * gravity[i], load[3 + i]
+    M[0, 4] = M[4, 0] = S[2]
+    M[1, 5] = M[5, 1] = S[0]
+    M[2, 3] = M[3, 2] = S[1]
+    M[0, 5] = M[5, 0] = -S[1]
+    M[1, 3] = M[3, 1] = -S[2]
+    M[2, 4] = M[4, 2] = -S[0]
+
+
+@njit(**OPTIONS)
+def _bent(full, v, turn, lever, out):
+    """Write the shift (6,) of a leg's acceleration equations J q̈ = G ṫ - out, see `velocities`."""
+    w, moved, turned, across = np.zeros(3), np.empty(3), np.empty(3), np.zeros(3)
+    for j in range(v.shape[0]):
+        for m in range(3):
+            moved[m], turned[m] = full[m, j] * v[j], full[3 + m, j] * v[j]
+        _cross(w, moved, out)
+        _cross(w, turned, out[3:])
+        for m in range(3):
+            w[m] += turned[m]
+        _cross(w, moved, out)
+    _cross(turn, lever, across)
+    for m in range(3):
+        across[m] = -across[m]
+    _cross(turn, across, out)
+
+
+@njit(**OPTIONS)
+def _freedoms(full, inverse, carried, held, starts, selected, D, back):
+    """Write D (6, r), the twists that all legs can follow, and `back` (L, 6, 6), t_0 = Σ_k back[k] e_k; zero on entry.
+
+    The legs' equations J q̇ = G t - e leave (1 - J J⁺) (G t - e) = 0; of it the twist's other parts by least squares,
+    the selected ones of t_0 being zero (`calib.rooms.parallel.mechanism.closure.twists`).
+    """
+    L, r = starts.shape[0] - 1, selected.shape[0]
+    others = np.empty(6 - r, np.int64)
+    count = 0
+    for i in range(6):
+        free = True
+        for k in range(r):
+            free = free and selected[k] != i
+        if free:
+            others[count] = i
+            count += 1
+    square, mixed = np.zeros((6 - r, 6 - r)), np.zeros((6 - r, r))
+    rows, across = np.zeros((L, 6, 6)), np.zeros((L, 6, 6))
+    for leg in range(L):
+        n, c = starts[leg + 1] - starts[leg], held[leg]
+        for i in range(c):
+            across[leg, i, i] = 1.0
+            for m in range(c):
+                for j in range(n):
+                    across[leg, i, m] -= full[leg, i, j] * inverse[leg, j, m]
+        for i in range(c):
+            for m in range(c):
+                for a in range(6):
+                    rows[leg, i, a] += across[leg, i, m] * carried[leg, m, a]
+        for a in range(6 - r):
+            for i in range(c):
+                for b in range(6 - r):
+                    square[a, b] += rows[leg, i, others[a]] * rows[leg, i, others[b]]
+                for b in range(r):
+                    mixed[a, b] += rows[leg, i, others[a]] * rows[leg, i, selected[b]]
+    solved = np.empty((6 - r, 6 - r))
+    invert(square, solved)
+    for b in range(r):
+        D[selected[b], b] = 1.0
+        for a in range(6 - r):
+            for k in range(6 - r):
+                D[others[a], b] -= solved[a, k] * mixed[k, b]
+    for leg in range(L):
+        for k in range(6 - r):
+            for m in range(held[leg]):
+                through = 0.0
+                for i in range(held[leg]):
+                    through += rows[leg, i, others[k]] * across[leg, i, m]
+                for a in range(6 - r):
+                    back[leg, others[a], m] += solved[a, k] * through
+
+
+@njit(**OPTIONS)
+def _follow(held, inverse, carried, gap, mend, D, q, J):
+    """Move a leg's joints q (n,) after the platform's step `mend` (6,), and write J (n, r), q̇ = J v; zero on entry."""
+    for m in range(held):
+        missing = -gap[m]
+        for a in range(6):
+            missing += carried[m, a] * mend[a]
+        for j in range(q.shape[0]):
+            q[j] += inverse[j, m] * missing
+            for a in range(6):
+                for i in range(D.shape[1]):
+                    J[j, i] += inverse[j, m] * carried[m, a] * D[a, i]
+
+
+@njit(**OPTIONS)
+def _leg_share(links, constants, parameters, drives, held, inverse, carried, shift, still, q, rates, tau, J, M, h):
+    """Add a leg's share to the inertia M (r, r) and to the force h (r,) where the twist changes by `still`.
+
+    Args:
+        drives: (n, 5); q, rates, tau: (n,); J: (n, r) of its joints.
+    """
+    n, r = q.shape[0], h.shape[0]
+    rows, inertia = np.zeros((6, 1, n)), np.zeros((1, n, n))
+    amount, cosine, sine, v, a, need = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    for j in range(n):
+        amount[0, j], v[0, j] = constants[j, SCALE] * q[j], rates[j]
+        cosine[0, j], sine[0, j] = np.cos(amount[0, j]), np.sin(amount[0, j])
+        for m in range(held):
+            bent = -shift[m]
+            for b in range(6):
+                bent += carried[m, b] * still[b]
+            a[0, j] += inverse[j, m] * bent
+    inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, need)
+    mass_matrix(links, constants, parameters, amount, cosine, sine, inertia)
+    for j in range(n):
+        inertia[0, j, j] += drives[j, 0]
+        need[0, j] += drives[j, 0] * a[0, j] + drives[j, 1] * v[0, j] + drives[j, 3] - tau[j]
+        need[0, j] += drives[j, 2] * np.tanh(v[0, j] / drives[j, 4])
+    for i in range(r):
+        for j in range(n):
+            h[i] += J[j, i] * need[0, j]
+            for k in range(n):
+                for m in range(r):
+                    M[i, m] += J[j, i] * inertia[0, j, k] * J[k, m]
+
+
+@njit(**OPTIONS)
+def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
+    """Write v̇ (r,) into `change`, q̇ (n_t,) into `rates`, t (6,) into `twist`; close the gaps in q and pose on the way.
+
+    Args:
+        robot: of L legs of B bodies or fewer: links (L, B, 4 + B), constants (L, B + 1, 13), tails and attachments
+            (L, 4, 4), starts, held, selected, actuated, gravity, and whether the platform's twist is always the
+            selected parts alone.
+        values: parameters of the legs' bodies (L, 10 B), of the platform (10,), drives (n_t, 5) Ia Fv Fc off and v0.
+        q: (n_t,); pose: (4, 4) of the platform; rate: (r,); tau: (n,) of the actuators.
+    """
+    links, constants, tails, attachments, starts, held, selected, actuated, gravity, fixed = robot
+    parameters, body, drives = values
+    r, n_t, L, most = rate.shape[0], q.shape[0], starts.shape[0] - 1, links.shape[1]
+    full, inverse, carried = np.zeros((L, 6, most)), np.zeros((L, most, 6)), np.zeros((L, 6, 6))
+    gap, lever, shift, back = np.zeros((L, 6)), np.zeros((L, 3)), np.zeros((L, 6)), np.zeros((L, 6, 6))
+    frame, D, J = np.zeros((4, 6 + 3 * most)), np.zeros((6, r)), np.zeros((n_t, r))
+    M, whole = np.zeros((r, r)), np.zeros((6, 6))
+    mend, still, wrench, h, torque = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(r), np.zeros(n_t)
+    for leg in range(L):
+        one_leg(
+            links[leg], constants[leg], tails[leg], attachments[leg], held[leg], q[starts[leg] : starts[leg + 1]], pose,
+            full[leg], inverse[leg], carried[leg], gap[leg], lever[leg], frame,
+        )  # fmt: skip
+    if fixed:
+        for i in range(r):
+            D[selected[i], i] = 1.0
+    else:
+        _freedoms(full, inverse, carried, held, starts, selected, D, back)
+        for leg in range(L):
+            _add(back[leg], gap[leg], mend)
+        _turn(1.0, mend, pose, pose)
+    for i in range(6):
+        twist[i] = 0.0
+    _add(D, rate, twist)
+    for i in range(n_t):
+        rates[i] = 0.0
+    for j in range(actuated.shape[0]):
+        torque[actuated[j]] = tau[j]
+    for leg in range(L):
+        first, last = starts[leg], starts[leg + 1]
+        _follow(held[leg], inverse[leg], carried[leg], gap[leg], mend, D, q[first:last], J[first:last])
+        _add(J[first:last], rate, rates[first:last])
+        _bent(full[leg], rates[first:last], twist[3:], lever[leg], shift[leg])
+        _add(back[leg], shift[leg], still)
+    for leg in range(L):
+        first, last = starts[leg], starts[leg + 1]
+        _leg_share(
+            links[leg], constants[leg], parameters[leg], drives[first:last], held[leg], inverse[leg], carried[leg],
+            shift[leg], still, q[first:last], rates[first:last], torque[first:last], J[first:last], M, h,
+        )  # fmt: skip
+    _platform(body, pose, twist[3:], gravity, whole, wrench)
+    _add(whole, still, wrench)
+    for i in range(r):
+        for a in range(6):
+            h[i] += D[a, i] * wrench[a]
+            for b in range(6):
+                for m in range(r):
+                    M[i, m] += D[a, i] * whole[a, b] * D[b, m]
+    solved = np.empty((r, r))
+    invert(M, solved)
+    for i in range(r):
+        change[i] = 0.0
+        for k in range(r):
+            change[i] -= solved[i, k] * h[k]
+
+
+@njit(**OPTIONS)
+def _turn(factor, twist, pose, out):
+    """Write a pose moved by `factor` times a twist (6,): p += v, R = Exp(ω) R (Rodrigues); `out` may be `pose`."""
+    x, y, z = factor * twist[3], factor * twist[4], factor * twist[5]
+    angle = np.sqrt(x * x + y * y + z * z)
+    one = np.sin(angle) / angle if angle > 1e-12 else 1.0
+    two = 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-12 else 0.5
+    for k in range(3):
+        a, b, c = pose[0, k], pose[1, k], pose[2, k]
+        dx, dy, dz = y * c - z * b, z * a - x * c, x * b - y * a
+        out[0, k] = a + one * dx + two * (y * dz - z * dy)
+        out[1, k] = b + one * dy + two * (z * dx - x * dz)
+        out[2, k] = c + one * dz + two * (x * dy - y * dx)
+        out[k, 3] = pose[k, 3] + factor * twist[k]
+
+
+@njit(**OPTIONS)
+def run(robot, values, q, pose, rate, plan, noise, limit, gains, step, far, read, held):
+    """Simulate a run under computed torque; see `computed_torque`. -1, or the sample it leaves at.
+
+    Args:
+        q, pose, rate: the state it starts from, changed: that of the last sample.
+        plan: reference of the encoders (N, n), forces (N, r), inertia (N, r, r), J⁺ (N, r, n), preload (N, n).
+        noise: (N, n) of the encoders; limit (n,); gains: of the error and of its rate.
+        read, held: (N, n) what is written: readings, and torques held from sample to sample.
+    """
+    wanted, forces, inertia, back, preload = plan
+    actuated, n, r = robot[7], robot[7].shape[0], rate.shape[0]
+    rates, change, twist, push = np.zeros(q.shape[0]), np.zeros(r), np.zeros(6), np.zeros(r)
+    q2, pose2, rate2 = q.copy(), pose.copy(), rate.copy()
+    for k in range(wanted.shape[0]):
+        for i in range(r):
+            push[i] = 0.0
+        for j in range(n):
+            read[k, j] = q2[actuated[j]] + noise[k, j]
+            off = wanted[k, j] - read[k, j]
+            if not abs(off) < far:
+                return k
+            slow = (wanted[k, j] - wanted[k - 1, j] - read[k, j] + read[k - 1, j]) / step if k else 0.0
+            for i in range(r):
+                push[i] += back[k, i, j] * (gains[0] * off + gains[1] * slow)
+        for j in range(n):
+            total = preload[k, j]
+            for i in range(r):
+                force = forces[k, i]
+                for m in range(r):
+                    force += inertia[k, i, m] * push[m]
+                total += back[k, i, j] * force
+            held[k, j] = min(max(total, -limit[j]), limit[j])
+        for half in range(2):  # one call of what is joined into this loop by the compiler: two take it twice as long
+            _accelerate(robot, values, q2, pose2, rate2, held[k], rates, twist, change)
+            length = step if half else 0.5 * step
+            if not half:
+                for i in range(3):
+                    for m in range(4):
+                        pose[i, m] = pose2[i, m]
+            for i in range(q.shape[0]):
+                if not half:
+                    q[i] = q2[i]
+                q2[i] = q[i] + length * rates[i]
+            for i in range(r):
+                if not half:
+                    rate[i] = rate2[i]
+                rate2[i] = rate[i] + length * change[i]
+            _turn(length, twist, pose, pose2)
+    return -1
