@@ -286,7 +286,7 @@ def deliver_identified(session: Session, out: Path) -> list[str]:
     """Write the identified robot into `out`, see `calib.procedure.export.dynamics.deliver_dynamics`."""
     from calib.procedure.export.dynamics import deliver_dynamics
 
-    source = robot_file(session)
+    source = session.robot_file
     return deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
 
 
