@@ -184,6 +184,8 @@ class Real(_Read):
             raise _Refused(self.words or self._expected, value)
         if self.above is not None and found <= self.above:
             raise _Refused(self.words or self._expected, value)
+        if self.above is None and self.least is not None and found < self.least:
+            raise _Refused(self.words or f"{self.least:g} or more", value)
         if (self.least is not None and found < self.least) or (self.most is not None and found > self.most):
             raise _Refused(self.words or self._span, value)
         return found
@@ -194,11 +196,9 @@ class Real(_Read):
 
     @property
     def _span(self) -> str:
-        if self.most is None:
-            return f"{self.least:g} or more"
         hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
         low = "" if self.least is None else f"at least {self.least:g} and "
-        return f"{self.unit or 'a number'}, {low}at most {self.most:g}{hint}"
+        return f"{self.unit or 'a number'}, {low}at most {self.most or math.inf:g}{hint}"
 
     @property
     def json(self) -> Mapping[str, Any]:

@@ -158,7 +158,7 @@ def identify_dynamics(
         MeasurementError: for logs that cannot be right, naming row and column.
         Unidentifiable: where the motion tells no parameter.
     """
-    require(settings is None or options is None, "settings and options say the same: give one of them")
+    require(settings is None or options is None, "settings and options say the same: give one of them", UsageError)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
     chosen = chosen if settings is None else options_of(settings)
     if (stage := stage_of(robot, "identify", base, tip)) is not None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from calib.cli.options import command
 from calib.cli.shared import Base, Plots, Seed, Tip, Workers, exit_failed, make_console, reporting, say
-from calib.errors import CalibError, UsageError, command_line
-
-if TYPE_CHECKING:
-    from calib.procedure.session.questions import Answers
+from calib.errors import CalibError, UsageError, command_line, require
+from calib.procedure.session.answers import Answers
 
 app = typer.Typer()
 
@@ -22,24 +21,8 @@ Folder = Annotated[Path, typer.Argument(help="the session's folder")]
 @command(app)
 def new(
     folder: Folder,
-    robot: str | None = None,
-    instrument: str | None = None,
-    tool: str | None = None,
-    limits: Path | None = None,
-    instrument_at: str | None = None,
-    cone: str | None = None,
-    facing: str | None = None,
-    box: str | None = None,
-    obstacle: list[str] | None = None,
-    mounting: str | None = None,
-    lens: str | None = None,
-    board: str | None = None,
-    carried: str | None = None,
-    stands: str | None = None,
-    dynamics: Annotated[bool | None, typer.Option("--dynamics/--geometry-only")] = None,
+    given: Answers,
     dynamics_only: Annotated[bool, typer.Option("--dynamics-only")] = False,
-    payload: list[str] | None = None,
-    torques: str | None = None,
     poses: int = 40,
     validation: int = 20,
     base: Base = "",
@@ -54,42 +37,20 @@ def new(
     stands on the certificate.
 
     Args:
-        robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit
-        instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none
-        tool: x,y,z: where the target roughly sits in the tip's frame [m]
-        limits: TOML: where, how fast the arm may go; poses and motions
-        instrument_at: x,y,z: where the instrument stands in the robot's base frame [m], or unknown
-        cone: half angle in which the target sees the instrument [deg], or unknown
-        facing: where the target faces in the tip's frame: z, -x …
-        box: x,x,y,y,z,z that no part of the arm leaves [m]; unknown, or none
-        obstacle: 'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]; unknown, none; repeatable
-        mounting: of a camera: in hand (the arm carries it), to hand (the board), or unknown
-        lens: camera_info YAML of the camera, roughly right; or unknown
-        board: board.toml, or unknown
-        carried: 'x,y,z facing z': camera or board in the tip's frame [m]; or unknown
-        stands: 'x,y,z facing z': the other in the base frame [m]; or unknown
-        dynamics: identify the dynamics, too (default)
         dynamics_only: measure nothing: the description is taken as calibrated
-        payload: label=kg of a body to record with as well; may be repeated
-        torques: motor, link, or both: what the log holds
         poses: poses to choose for the fit
         validation: poses to measure and never fit; 0 for none
     """
     from calib.api.sessions import new_session
     from calib.procedure.robot_kinds import stage_of
-    from calib.procedure.session.questions import Answers, checked
+    from calib.procedure.session.questions import checked
 
-    stage_of(robot, "a guided session")
-    told = tuple(obstacle) if obstacle else None
+    stage_of(given.robot, "a guided session")
     if dynamics_only:
-        if instrument not in (None, "none"):
-            raise UsageError(f"--dynamics-only measures nothing; the instrument is {instrument}")
-        instrument = "none"
-    given = Answers(
-        robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box,
-        told, mounting, lens, board, carried, stands,
-    )  # fmt: skip
-    if robot is None or instrument is None:
+        words = f"--dynamics-only measures nothing; the instrument is {given.instrument}"
+        require(given.instrument in (None, "none"), words, UsageError)
+        given = replace(given, instrument="none")
+    if given.robot is None or given.instrument is None:
         given = _asked(given)
     made = new_session(
         folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)

@@ -15,7 +15,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     height = [0.2, 1.5]              # z; a single number is the least
     axis_distance = 0.3              # least distance from the base's z axis
     reach = 1.2                      # largest distance from the base's origin
-    facing = [0, 0, 1]               # the direction it faces, in its own frame (default z); a list of them for several
+    facing = [0, 0, 1]               # the direction it faces, in its own frame (default z), "-x" …; a list of several
     [instrument]                     # camera or tracker
     xyz = [2.0, 0.0, 1.0]            # where it stands, and how: rpy (or matrix)
     rpy = [0, 0, "180 deg"]
@@ -74,12 +74,18 @@ Box = Annotated[tuple[Span, Span, Span], Expect("three lists of 2 numbers, x, y 
 Size = Annotated[tuple[Annotated[float, Real(above=0, quantity="length")], ...], Expect("lengths above 0")]
 
 
+AXES = {
+    f"{sign}{axis}": [(-1.0 if sign == "-" else 1.0) * (k == j) for j in range(3)]
+    for k, axis in enumerate("xyz")
+    for sign in ("", "+", "-")
+}
 _ONE = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
 _PAIR = {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": ["number", "string"]}}
 
 
 def _directions(value: Any) -> Any:
-    """Make a single direction a list of one."""
+    """Make a single direction, or the name of an axis, a list of one."""
+    value = AXES.get(value, value) if isinstance(value, str) else value
     single = isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple)
     return [value] if single else value
 
@@ -94,7 +100,7 @@ class TargetTable:
     reach: Annotated[float, Real(above=0, quantity="length")] | None = None
     facing: Annotated[
         tuple[Annotated[tuple[float, float, float], Expect("a list of 3 numbers")], ...],
-        Checked(_directions, {"anyOf": [_ONE, {"type": "array", "items": _ONE, "minItems": 1}]}),
+        Checked(_directions, {"anyOf": [{"enum": [*AXES]}, _ONE, {"type": "array", "items": _ONE, "minItems": 1}]}),
     ] = ((0.0, 0.0, 1.0),)
 
     def __post_init__(self) -> None:

@@ -45,10 +45,10 @@ from calib.procedure.kinematic_stage.settings import (  # fmt: skip
     Method,
     Stations,
 )
+from calib.procedure.session.answers import Torques
 
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
-TORQUES = ("motor", "link", "both")
 NOTHING = "nothing"  # is measured: the geometry is taken as it is described
 MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
@@ -187,7 +187,7 @@ class DynamicsSection:
     starts: Starts = DEFAULT_DESIGN.starts
     evaluations: Evaluations = DEFAULT_DESIGN.evaluations
     limits: Beside = ""
-    torques: Annotated[str, OneOf(TORQUES)] = "motor"
+    torques: Torques = "motor"
     friction: Annotated[str, OneOf(FRICTION)] = IdentificationSettings.friction
     method: Annotated[str, OneOf(tuple(METHODS))] = IdentificationSettings.method
     options: Beside = ""

@@ -11,6 +11,7 @@ from differences import check
 
 import calib
 from calib.cli import run
+from calib.config import parse
 from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.measuring.cell_answers import cell_tables
@@ -86,33 +87,36 @@ def test_several_reflectors_let_more_poses_be_seen_and_only_seen_rows_count(tmp_
 
 def test_the_cell_as_told_becomes_tables():
     told = cell_tables(
-        "3,0,1", "30", "-z", "none", ["table box 1.2,0.8,0.05 at 0.7,0,-0.04; pole cylinder 0.1,2 at 1,1,1"]
-    )
-    assert told["instrument"] == {"xyz": [3.0, 0.0, 1.0], "sight": pytest.approx(np.pi / 6)}
-    assert told["target"] == {"facing": [0.0, 0.0, -1.0]} and told["without"] == ["box"]
+        instrument_at="3,0,1", cone="30", facing="-z", box="none",
+        obstacles=["table box 1.2,0.8,0.05 at 0.7,0,-0.04; pole cylinder 0.1,2 at 1,1,1"],
+    )  # fmt: skip
+    assert told["instrument"] == {"xyz": [3.0, 0.0, 1.0], "sight": "30 deg"}
+    assert told["target"] == {"facing": "-z"} and told["without"] == ["box"]
+    read = parse(ConstraintsFile, told, "the cell")
+    assert read.target.facing == ((0.0, 0.0, -1.0),) and read.instrument.sight == pytest.approx(np.pi / 6)
     assert [one["name"] for one in told["obstacle"]] == ["table", "pole"]
-    assert cell_tables("unknown", "unknown", "unknown", "", ["?"]) == {}
+    assert cell_tables(instrument_at="unknown", cone="unknown", facing="unknown", box="", obstacles=["?"]) == {}
 
 
 @pytest.mark.parametrize(
     ("answers", "words"),
     [
-        ({"instrument_at": "3000,0,1"}, "look like mm"),
+        ({"instrument_at": "3000,0,1"}, "are these mm"),
         ({"instrument_at": "3,0"}, "expected x,y,z in metres, or unknown"),
-        ({"cone": "30"}, "say where the instrument stands"),
-        ({"instrument_at": "3,0,1", "cone": "wide"}, "--cone wide"),
-        ({"instrument_at": "3,0,1", "cone": "0"}, "1 to 180"),
-        ({"facing": "up"}, "an axis of the tip's frame"),
+        ({"cone": "30"}, "sight needs the place of the instrument"),
+        ({"instrument_at": "3,0,1", "cone": "wide"}, "instrument.sight: cannot read"),
+        ({"instrument_at": "3,0,1", "cone": "0"}, "instrument.sight: expected"),
+        ({"facing": "up"}, "--facing up: cannot read"),
         ({"box": "1,2,-1,1,0,2"}, "the robot's base, at 0,0, stands outside"),
         ({"box": "1,-1,-1,1,0,2"}, "the smaller one first"),
         ({"mounting": "on top"}, "expected in hand"),
         ({"carried": "0,0,0.1"}, "Say --mounting, too"),
-        ({"mounting": "in hand", "carried": "40,0,60"}, "look like mm"),
+        ({"mounting": "in hand", "carried": "40,0,60"}, "are these mm"),
         ({"mounting": "in hand", "stands": "0.5,0,0"}, "and the way it faces"),
-        ({"mounting": "in hand", "stands": "0.5,0,0 facing up"}, "an axis of the base's frame"),
+        ({"mounting": "in hand", "stands": "0.5,0,0 facing up"}, "--stands .*cannot read"),
         ({"mounting": "in hand", "lens": "nix.yaml"}, "no such file"),
         ({"obstacles": ["table"]}, "expected NAME box|sphere|cylinder SIZES at"),
-        ({"obstacles": ["table box 1,0,1 at 0,0,0"]}, "sizes are above 0"),
+        ({"obstacles": ["table box 1,0,1 at 0,0,0"]}, "expected a number above 0"),
     ],
 )
 def test_answers_that_cannot_be(answers, words):

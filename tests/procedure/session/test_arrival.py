@@ -11,13 +11,13 @@ from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import take
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.measuring.cell_answers import CAMERA
 from calib.procedure.session import arrival
+from calib.procedure.session.answers import CAMERA, Answers
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of, check_file
-from calib.procedure.session.questions import QUESTIONS, Answers, checked, with_answer
+from calib.procedure.session.questions import QUESTIONS, checked, with_answer
 from calib.robot.chain import random_joints
 from calib.rooms.cells.cell import measure, wandering
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -65,7 +65,7 @@ def test_answers_are_checked_as_they_come() -> None:
     ask = {question.name: question for question in QUESTIONS}
     given = with_answer(Answers(), ask["robot"], "lwr4plus")
     given = with_answer(given, ask["instrument"], "cmm")
-    with pytest.raises(UsageError, match="look like mm"):
+    with pytest.raises(UsageError, match="tool: expected x,y,z in metres"):
         with_answer(given, ask["tool"], "50,0,50")
     given = with_answer(given, ask["tool"], "0.05,0,0.05")
     with pytest.raises(UsageError, match="label=kg"):
