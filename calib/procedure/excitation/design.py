@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, re
 from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
-from calib.procedure.excitation.prediction import MotionOutlook, foretell
+from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.interrupts import finishing
@@ -53,6 +53,7 @@ class Designed:
         playback: what a controller is to run.
         notes: what a user should know.
         outlook: what the motion will tell; None where no torque limits say how large errors are.
+        predicted: sigmas of the parameters; empty there.
     """
 
     inputs: ExcitationInputs
@@ -66,6 +67,7 @@ class Designed:
     playback: Playback
     notes: tuple[str, ...]
     outlook: MotionOutlook | None = None
+    predicted: Sequence[PredictedSigma] = ()
 
     @property
     def family(self) -> Family:
@@ -134,14 +136,14 @@ def excite(
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
-    outlook = None
+    outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
-        outlook = _outlook(given, settings, problem, found, say)
+        outlook, predicted = _outlook(given, settings, problem, found, say)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
     return Designed(
         given, settings, problem, found, proof, condition_found,
         _reached(problem, found), front, played,
-        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook,
+        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook, predicted,
     )  # fmt: skip
 
 
@@ -151,7 +153,7 @@ def _outlook(
     problem: ExcitationProblem,
     found: SearchResult,
     say: Progress,
-) -> MotionOutlook | None:
+) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
     """Return what a motion will tell, and what others of other periods would."""
 
     def problem_of(period: float) -> ExcitationProblem:

@@ -71,7 +71,7 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
             rows = [[*map(float, row), bool(best)] for row, best in zip(designed.front.values, designed.front.best)]
             files.write_table(folder / "front.csv", [*designed.front.names, "not dominated"], rows)
         if designed.outlook is not None:
-            prediction.write(designed.outlook, folder)
+            prediction.write(designed.predicted, folder)
         files.write_json(folder / METRICS, design_metrics(designed))
 
     return write_staged(out, ALL, write)
@@ -165,7 +165,7 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
             "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
             "approach": _seconds(designed.playback.approach), "rehearsal": _seconds(designed.playback.rehearsal),
         },
-        "prediction": None if designed.outlook is None else prediction.table(designed.outlook),
+        "prediction": designed.outlook,
         "limits": given.limits.bounds.lines(),
         "notes": list(designed.notes),
     }  # fmt: skip

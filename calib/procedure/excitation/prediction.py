@@ -12,13 +12,11 @@ holds. It is taken as a share of the torque limits, stated or `NOISE`; all sigma
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,17 +27,15 @@ from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
-from calib.procedure.sigma_comparison import compare_sigmas
+from calib.records import Array, read_json, read_rows
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
 from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
-HEADER = ("name", "unit", "value", "sigma", "rsd")
 NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
 PERIODS = (5.0, 10.0, 20.0, 40.0)
-TOLD = 0.3  # a parameter that is known to so much of its value is told (our choice)
 INSTANTS = 500  # over a period
 TASK = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
 
@@ -49,15 +45,25 @@ class MotionPrediction:
     """What a log of a motion will tell.
 
     Attributes:
-        seconds: of motion; rows: independent ones per joint.
-        sigmas: (c,) of the parameters.
-        torque: (n,) rms of the predicted torque's sigma over the typical task [N m or N].
+        seconds: of motion; rows_per_joint: independent ones.
+        torque_sigma: (n,) rms of the predicted torque's sigma over the typical task [N m or N].
+        torque_sigma_share: the same, rms over the joints, as a share of the torque limits.
     """
 
     seconds: float
-    rows: float
-    sigmas: np.ndarray
-    torque: np.ndarray
+    rows_per_joint: float
+    torque_sigma: Array
+    torque_sigma_share: float
+
+
+class PredictedSigma(NamedTuple):
+    """A row of ``prediction.csv``: a parameter, its value where it is known, and what the motion as run will tell."""
+
+    name: str
+    unit: str
+    value: float | None
+    sigma: float
+    rsd: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,29 +71,15 @@ class MotionOutlook:
     """What a designed motion will tell, and what others of other lengths would.
 
     Attributes:
-        names, units: (c,) of the parameters; values (c,), NaN where nobody knows them.
-        noise: (n,) taken as the torques' error [N m or N]; share: of the torque limits.
-        limits: (n,) of the torques.
-        own: of the motion as it is to be run; others: of other lengths. Longer ones run the same motion again, shorter
-            ones are designed quickly.
+        noise: (n,) taken as the torques' error [N m or N]; noise_share: of the torque limits.
+        own: of the motion as it is to be run; by_period: of other lengths. Longer ones run the same motion again,
+            shorter ones are designed quickly.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: np.ndarray
-    noise: np.ndarray
-    share: float
-    limits: np.ndarray
+    noise_share: float
+    noise: Array
     own: MotionPrediction
-    others: tuple[MotionPrediction, ...]
-
-    def told(self, one: MotionPrediction) -> int:
-        """Return how many parameters are known to `TOLD` of their value."""
-        return int(np.sum(one.sigmas < TOLD * np.abs(np.nan_to_num(self.values))))
-
-    def torque_share(self, one: MotionPrediction) -> float:
-        """Return the sigma of torques on the typical task, rms over the joints, as a share of the limits."""
-        return float(np.sqrt(np.mean((one.torque / self.limits) ** 2)))
+    by_period: tuple[MotionPrediction, ...]
 
 
 def foretell(
@@ -99,8 +91,8 @@ def foretell(
     problem_of: Callable[[float], ExcitationProblem],
     evaluations: int,
     seed: int,
-) -> MotionOutlook | None:
-    """Return what a motion found will tell; None where a joint has no torque limit to take an error from.
+) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
+    """Return what a motion will tell, of torques and of parameters; None where a joint has no torque limit.
 
     Args:
         given, problem, found: the robot, what was solved, and the motion.
@@ -112,24 +104,29 @@ def foretell(
     """
     limits, share = given.limits.torque, NOISE if noise is None else noise
     if not np.isfinite(limits).all():
-        return None
+        return None, ()
     sigmas = share * limits
     task = _task(given, seed)
     tell = partial(_prediction, given, sigmas, task)
-    own = tell(problem.family, found.x, found.factor, repeat)
+    own, spread = tell(problem.family, found.x, found.factor, repeat)
     others = []
     own_period = problem.family.period * found.factor
     for period in PERIODS if evaluations else ():
         if period >= own_period - 1e-9:
-            others.append(tell(problem.family, found.x, found.factor, period / own_period))
+            others.append(tell(problem.family, found.x, found.factor, period / own_period)[0])
             continue
         shorter = _shortened(problem, found, problem_of, period, evaluations)
-        others += [] if shorter is None else [tell(shorter[0], shorter[1].x, shorter[1].factor, 1.0)]
+        others += [] if shorter is None else [tell(shorter[0], shorter[1].x, shorter[1].factor, 1.0)[0]]
     model, columns = given.model, given.columns.columns
     kept = slice(None) if columns is None else columns
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
-    units = tuple(np.array(model.exact.units)[kept])
-    return MotionOutlook(given.columns.names, units, values[kept], sigmas, share, limits, own, tuple(others))
+    parts = given.columns.names, np.array(model.exact.units)[kept].tolist(), values[kept].tolist(), spread.tolist()
+    rows = []
+    for name, unit, value, sigma in zip(*parts):
+        known = np.isfinite(value) and value != 0.0
+        known_rsd = 100.0 * sigma / abs(value) if known else None
+        rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd))
+    return MotionOutlook(share, sigmas, own, tuple(others)), rows
 
 
 def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
@@ -151,8 +148,8 @@ def _columns(given: ExcitationInputs, Y: np.ndarray) -> np.ndarray:
 def _prediction(
     given: ExcitationInputs, noise: np.ndarray, task: np.ndarray, family: Family, x: np.ndarray, factor: float,
     repeat: float,
-) -> MotionPrediction:  # fmt: skip
-    """Return what `repeat` periods of a motion tell."""
+) -> tuple[MotionPrediction, np.ndarray]:  # fmt: skip
+    """Return what `repeat` periods of a motion tell, and the sigmas (c,) of the parameters."""
     period = family.period * factor
     motion = dense_motion(family, x, period / INSTANTS * np.arange(INSTANTS), factor)
     counted = np.ones(given.chain.n) if given.columns.sigmas is None else given.columns.sigmas
@@ -163,7 +160,8 @@ def _prediction(
     _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
     root = (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None] * np.sqrt(INSTANTS / rows)
     torque = np.sqrt(np.mean(np.sum((task @ root) ** 2, axis=2), axis=0))
-    return MotionPrediction(period * repeat, rows, np.linalg.norm(root, axis=1), torque)
+    share = float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
+    return MotionPrediction(period * repeat, rows, torque, share), np.linalg.norm(root, axis=1)
 
 
 def _band(motion: SampledMotion, period: float) -> float:
@@ -193,51 +191,19 @@ def _shortened(
     return (other.family, run) if isinstance(run, SearchResult) else None
 
 
-def table(one: MotionOutlook) -> dict[str, Any]:
-    """Return the entry of ``metrics.json``."""
-
-    def entry(each: MotionPrediction) -> dict[str, Any]:
-        return {
-            "seconds": each.seconds, "rows_per_joint": each.rows, "told": one.told(each),
-            "torque_sigma_share": one.torque_share(each), "torque_sigma": each.torque.tolist(),
-        }  # fmt: skip
-
-    return {
-        "noise_share": one.share, "noise": one.noise.tolist(), "own": entry(one.own),
-        "by_period": [entry(each) for each in one.others],
-    }  # fmt: skip
-
-
-def write(one: MotionOutlook, folder: Path) -> Path:
+def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     """Write the parameters' predicted sigmas as CSV; values and rsd [%] are left out where nobody knows the value."""
-    rows = []
-    for name, unit, value, sigma in zip(one.names, one.units, one.values, one.own.sigmas):
-        known = np.isfinite(value) and value != 0.0
-        rows.append((name, unit, float(value) if known else None, float(sigma), _percent(sigma, value, known)))
-    return files.write_table(folder / NAME, HEADER, rows)
-
-
-def _percent(sigma: float, value: float, known: bool) -> float | None:
-    return float(100.0 * sigma / abs(value)) if known else None
+    return files.write_table(folder / NAME, PredictedSigma._fields, rows)
 
 
 def lines(one: MotionOutlook) -> list[str]:
-    """Return the prediction in words: what this motion tells, and what other lengths would."""
-    own, c = one.own, len(one.names)
-    told = f"{one.told(own)} of {c} parameters to {TOLD:.0%} of their value, " if np.isfinite(one.values).all() else ""
-    result = [
-        f"predicted from {own.seconds:g} s, if {one.share:.2g} of the torque limits stays unexplained: {told}torques "
-        f"on a typical task to {100 * one.torque_share(own):.2g} % of the limits"
+    """Return the predicted σ of torques in words: from this motion, and from others of other lengths."""
+    others = ", ".join(f"{100 * each.torque_sigma_share:.2g} % from {each.seconds:g} s" for each in one.by_period)
+    return [
+        f"predicted σ of torques, typical task: {100 * one.own.torque_sigma_share:.2g} % of the limits from "
+        f"{one.own.seconds:g} s{' (' if others else ''}{others}{')' if others else ''}, if the torque residual is "
+        f"{100 * one.noise_share:.2g} %"
     ]
-    if one.others:
-        numbers = " / ".join(f"{each.seconds:g}" for each in one.others)
-        shares = " / ".join(f"{100 * one.torque_share(each):.2g}" for each in one.others)
-        counts = " / ".join(f"{one.told(each)}" for each in one.others)
-        more = f", {counts} parameters told" if told else ""
-        result.append(
-            f"from {numbers} s (longer: the same again; shorter: designed quickly): torques to {shares} %{more}"
-        )
-    return result
 
 
 def check_folder(folder: Path) -> None:
@@ -246,46 +212,50 @@ def check_folder(folder: Path) -> None:
         raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote")
 
 
-def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> list[str]:
-    """Return lines that hold what an excitation's folder predicted against what an identification states.
+@dataclass(frozen=True)
+class _Predicted:
+    prediction: MotionOutlook
+
+
+def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> str:
+    """Return a line that holds what an excitation's folder predicted against what an identification states.
 
     Raises:
         UsageError: where the folder holds no prediction, or one of other parameters.
     """
     limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
     rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
-    known = np.isfinite(limits).all() and len(rms) == len(limits) and np.isfinite(rms).all()
-    unexplained = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
-    return compared(folder, outcome.found.names, outcome.found.fitted.estimate.sigma, unexplained)
+    known = len(rms) == len(limits) and np.isfinite(rms / limits).all()
+    residual = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
+    return compared(folder, outcome.found.names, outcome.found.fitted.estimate.sigma, residual)
 
 
-def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, unexplained: float | None = None) -> list[str]:
-    """Return lines that hold what an excitation predicted against what an identification states.
+def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, residual: float | None = None) -> str:
+    """Return a line that holds what an excitation predicted against what an identification states.
 
     Args:
         folder: that `calib excite` wrote.
         names, sigmas: (b,) parameters of the estimate, and what it states of them.
-        unexplained: rms of its residuals as a share of the torque limits; None: not known.
+        residual: rms of its residuals as a share of the torque limits; None: not known.
 
     Raises:
         UsageError: where the folder holds no prediction, or one of other parameters.
     """
-    stated = {name: float(sigma) for name, sigma in zip(names, sigmas)}
+    check_folder(folder)
+    noise = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction.noise_share
+    stated = dict(zip(names, sigmas.tolist()))
     try:
-        noise = float(json.loads((folder / METRICS).read_text(encoding="utf-8"))["prediction"]["noise_share"])
-        with (folder / NAME).open(encoding="utf-8", newline="") as file:
-            predicted = {row["name"]: float(row["sigma"]) for row in csv.DictReader(file)}
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise UsageError(
-            f"{folder} holds no prediction: give the folder that calib excite wrote ({error!r})"
-        ) from error
-    found = compare_sigmas("parameters", "", predicted, stated)
-    if found is None:
+        rows = [row for row in read_rows(PredictedSigma, folder / NAME) if stated.get(row.name, 0.0) > 0.0]
+    except ValueError as error:
+        raise UsageError(f"{error}; give the folder that calib excite wrote") from error
+    if not rows:
         raise UsageError(f"{folder} predicts none of the {len(stated)} parameters identified: it is of another robot")
-    result = [f"sigmas stated over those predicted, {found.count} {found.kind}: {found.words}"]
-    if unexplained is not None:
-        result.append(
-            f"{unexplained:.2g} of the torque limits stayed unexplained, {noise:.2g} was taken: with that known "
-            f"before, the median would have been {found.ratio * noise / max(unexplained, 1e-12):.2g}"
-        )
-    return result
+    low, middle, high = np.quantile([stated[row.name] / row.sigma for row in rows], [0.1, 0.5, 0.9])
+    why = (
+        ""
+        if residual is None
+        else f"; torque residual {100 * residual:.2g} % of the limits, {100 * noise:.2g} % assumed"
+    )
+    return (
+        f"estimated σ / predicted σ ({len(rows)} parameters): median {middle:.2g} (10–90 %: {low:.2g}–{high:.2g}){why}"
+    )

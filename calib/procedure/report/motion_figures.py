@@ -135,9 +135,9 @@ def design_figures(designed: Designed) -> dict[str, Chart]:
     figures = {"motion": _motion_figure(designed), "path": _path_figure(designed), "history": _history_figure(designed)}
     if designed.front is not None and len(designed.front.values):
         figures["front"] = _front_figure(designed.front)
-    if (look := designed.outlook) is not None and look.others:
-        curve = [(one.seconds, 100 * look.torque_share(one)) for one in look.others]
-        own = (look.own.seconds, 100 * look.torque_share(look.own))
+    if (look := designed.outlook) is not None and look.by_period:
+        curve = [(one.seconds, 100 * one.torque_sigma_share) for one in look.by_period]
+        own = (look.own.seconds, 100 * look.own.torque_sigma_share)
         figures["outlook"] = outlook_figure(curve, own, "motion [s]", "σ of torques [% of limits]")
     return figures
 

@@ -198,7 +198,7 @@ def identify(session: Session, say: Say) -> list[str]:
     ]
     designed = session.path("6-excitation/training")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
-        notes += prediction.compared_with_identification(designed, outcome)
+        notes.append(prediction.compared_with_identification(designed, outcome))
     return [*notes, *outcome.warnings]
 
 

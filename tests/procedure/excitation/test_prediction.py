@@ -38,10 +38,12 @@ def outcome(designed: design.Designed) -> identify.IdentificationOutcome:
     """An identification of the motion, its torques as wrong in the band as was said: by white noise."""
     run, model, outlook = designed.playback.run, designed.inputs.model, designed.outlook
     assert outlook is not None and model.values is not None
-    band = outlook.own.rows / outlook.own.seconds / 2
+    band = outlook.own.rows_per_joint / outlook.own.seconds / 2
     noise = np.random.default_rng(0).normal(size=run.q.shape) * outlook.noise / np.sqrt(2 * band / run.rate)
     names = model.exact.names
-    friction = [0.05 * outlook.limits[int(name[2]) - 1] if name[:2] in ("Fv", "Fc") else 0.0 for name in names]
+    friction = [
+        0.05 * designed.inputs.limits.torque[int(name[2]) - 1] if name[:2] in ("Fv", "Fc") else 0.0 for name in names
+    ]
     tau = model.exact.regressor(run.q, run.v, run.a) @ (model.values + friction) + noise
     log = Recording(run.times, run.q, tau, "torque", tuple(designed.inputs.chain.joint_names))
     options = IdentifyOptions()
@@ -56,23 +58,22 @@ def test_sigmas_stated_are_those_predicted_within_a_factor(motion, outcome):
     ratios = [sigma / promised[name] for name, sigma in zip(found.names, found.fitted.estimate.sigma)]
     assert 0.85 < np.median(ratios) < 1.2
     assert np.quantile(ratios, 0.05) > 0.7 and np.quantile(ratios, 0.95) < 1.4
-    first, second = prediction.compared_with_identification(motion, outcome)
-    assert f"{len(found.names)} parameters: {np.median(ratios):.2g} in the median" in first
-    assert "0.01 was taken" in second
+    said = prediction.compared_with_identification(motion, outcome)
+    assert f"({len(found.names)} parameters): median {np.median(ratios):.2g}" in said and "1 % assumed" in said
 
 
 def test_longer_motion_tells_more_and_the_figures_are_in_the_folder(designed, motion):
     outlook = designed.outlook
-    shares = {round(one.seconds): outlook.torque_share(one) for one in outlook.others}
+    shares = {round(one.seconds): one.torque_sigma_share for one in outlook.by_period}
     assert set(shares) >= {10, 20, 40} and shares[20] == pytest.approx(shares[10] / np.sqrt(2))
-    assert shares[20] == pytest.approx(outlook.torque_share(outlook.own))  # two periods of 10 s are run
+    assert shares[20] == pytest.approx(outlook.own.torque_sigma_share)  # two periods of 10 s are run
     stored = json.loads((motion / "metrics.json").read_text())["prediction"]
     assert stored["own"]["torque_sigma_share"] == pytest.approx(shares[20])
     assert [one["seconds"] for one in stored["by_period"]][-2:] == [20.0, 40.0]
 
 
 def test_sigmas_go_with_the_noise(designed):
-    more = prediction.foretell(
+    more, rows = prediction.foretell(
         designed.inputs,
         designed.problem,
         designed.found,
@@ -82,7 +83,8 @@ def test_sigmas_go_with_the_noise(designed):
         0,
         SHORT.seed,
     )
-    assert more.own.sigmas == pytest.approx(3 * designed.outlook.own.sigmas) and more.others == ()
+    assert [row.sigma for row in rows] == pytest.approx([3 * row.sigma for row in designed.predicted])
+    assert more.by_period == ()
 
 
 def test_a_folder_without_a_prediction_is_refused(motion, outcome, tmp_path):
