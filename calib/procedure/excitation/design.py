@@ -143,7 +143,8 @@ def excite(
     return Designed(
         given, settings, problem, found, proof, condition_found,
         _reached(problem, found), front, played,
-        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook, predicted,
+        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook,
+        predicted,
     )  # fmt: skip
 
 
