@@ -14,9 +14,11 @@ import os
 import re
 import subprocess
 import sys
-from collections import Counter
+from bisect import bisect_left
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+import calib
 
 DATA = Path(os.environ.get("CALIB_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")).resolve()
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
@@ -38,7 +40,8 @@ COMMANDS = {  # name: (name of the one that must have run before, command line)
     "select_ur5": (None, "select ur5 -m 20 --out poses.csv --no-plots"),
     "select_lwr": (None, "select lwr4plus -m 15 --kind position --tool 0.1,0,0.1 --method tabu --candidates 200 "
                    "--out poses.csv --no-plots"),
-    "compensate": ("fit_sim", "compensate ../fit_sim/out ../practice/targets.csv --out commands.csv"),
+    "compensate": ("fit_sim", "compensate ../fit_sim/out ../practice/targets.csv --frame measured --tool tool "
+                   "--out commands.csv"),
     "excite": (None, "excite tx40 --period 5 --starts 1 --evaluations 60 --no-outlook --out motion --no-plots"),
     "excite_dualv": (None, "excite dualv --period 2 --starts 1 --evaluations 60 --no-outlook --out motion --no-plots"),
     "plan": (None, "plan ur10e --waypoints waypoints.csv --limits limits.toml --out motion --no-plots"),
@@ -55,7 +58,7 @@ COMMANDS = {  # name: (name of the one that must have run before, command line)
     "compare": ("practice", "compare tx40 ../practice/log1.csv --validate ../practice/log2.csv "
                 "--methods ols,wls,irls,tls --out table.csv"),
     "export_fit": ("fit_ur5", f"export ../fit_ur5/out --urdf {UR5}/model.urdf --into delivered"),
-    "export_dyn": ("identify_ur10e", f"export ../identify_ur10e/out --urdf {UR10E}/model.urdf --into delivered"),
+    "export_dyn": ("identify_lwr", f"export ../identify_lwr/out --urdf {LWR}/model.urdf --into delivered"),
     "study": (None, "study MCS-TX40-1-1 --methods ols,wls --runs 2 --out out --no-plots"),
     "demo": (None, "demo --out session"),
     "view_formats": (None, "formats options"),
@@ -70,7 +73,7 @@ practice.record("log1.csv", 1); practice.record("log2.csv", 2)
 
 def run(folder: Path, names: list[str]) -> None:
     """Run the commands, two at a time, each in a folder of its own below folder."""
-    examples = Path(__file__).resolve().parents[1] / "examples"
+    examples = Path(calib.__file__).resolve().parents[1] / "examples"
     folder.mkdir(parents=True, exist_ok=True)
     kept = folder / "codes.json"
     codes: dict[str, int] = json.loads(kept.read_text()) if kept.exists() else {}
@@ -123,24 +126,20 @@ def read(path: Path) -> dict[str, list[float]]:
     return {"": [float(text) for text in NUMBER.findall(path.read_text())]}
 
 
-def alike(one: float, two: float) -> bool:
-    """Return whether two numbers are equal within rounding."""
-    return one == two or abs(one - two) <= RELATIVE * max(abs(one), abs(two)) + ABSOLUTE
+def missing(before: list[float], after: list[float], ordered: bool) -> list[tuple[float, float]]:
+    """Return the numbers of before that after does not hold, each with the nearest (or the one in its place).
 
-
-def missing(before: list[float], after: list[float], ordered: bool) -> list[float]:
-    """Return the numbers of before that after does not hold (as often), within rounding."""
+    In order, what counts is the largest of all (a column of sensitivities has entries of rounding error).
+    """
     if ordered and len(before) == len(after):
-        return [one for one, two in zip(before, after) if not alike(one, two)]
-    left, lost, place = sorted(after), [], 0
-    for number in sorted(before):
-        while place < len(left) and left[place] < number and not alike(left[place], number):
-            place += 1
-        if place < len(left) and alike(left[place], number):
-            place += 1 if Counter(before)[number] > 1 and len(before) < 2000 else 0
-        else:
-            lost.append(number)
-    return lost
+        scale = max(map(abs, before), default=0.0)
+        return [(one, two) for one, two in zip(before, after) if abs(one - two) > RELATIVE * scale + ABSOLUTE]
+    known = sorted(after) or [float("inf")]
+    nearest = []
+    for number in before:
+        place = bisect_left(known, number)
+        nearest.append(min(known[max(place - 1, 0) : place + 1], key=lambda one: abs(one - number)))
+    return [(one, two) for one, two in zip(before, nearest) if abs(one - two) > RELATIVE * abs(one) + ABSOLUTE]
 
 
 def compare(before: Path, after: Path) -> int:
@@ -148,7 +147,9 @@ def compare(before: Path, after: Path) -> int:
     faults = 0
     codes = [json.loads((folder / "codes.json").read_text()) for folder in (before, after)]
     for name, code in codes[0].items():
-        said = [] if codes[1].get(name) == code else [f"exit code {code} became {codes[1].get(name)}"]
+        if name not in codes[1]:
+            continue
+        said = [] if codes[1][name] == code else [f"exit code {code} became {codes[1][name]}"]
         for path in sorted((before / name).rglob("*")):
             if path.suffix not in (".json", ".csv", ".urdf", ".toml", ".yaml") or not (after / name).exists():
                 continue
@@ -160,7 +161,7 @@ def compare(before: Path, after: Path) -> int:
             for column, values in old.items():
                 lost = missing(values, new.get(column, []), path.suffix != ".json")
                 if lost:
-                    said.append(f"{inside} {column}: {len(lost)} of {len(values)} numbers differ, e.g. {lost[:4]}")
+                    said.append(f"{inside} {column}: {len(lost)} of {len(values)} numbers differ, e.g. {lost[:3]}")
         print(f"{name}: {'equal' if not said else ''}", *said, sep="\n  " if said else "")
         faults += len(said)
     return int(faults > 0)
