@@ -25,7 +25,15 @@ from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking, track
-from calib.procedure.dynamic_stage.verdict import Resting, extrapolates, judge, warnings, with_intervals, with_prior
+from calib.procedure.dynamic_stage.verdict import (
+    Resting,
+    extrapolates,
+    judge,
+    warnings,
+    with_duration,
+    with_intervals,
+    with_prior,
+)
 from calib.procedure.findings import Verdict, settled
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE, without_gains
@@ -140,7 +148,7 @@ def assess(
     odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
-    verdict = with_prior(verdict, findings.rests).held_by(odd)
+    verdict = with_duration(with_prior(verdict, findings.rests).held_by(odd), excitation)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (

@@ -83,8 +83,6 @@ def judge(
     4. the unseen error is above `GOOD`, or `TRANSFER` times the fit's own: marginal;
     5. else pass.
 
-    Where that is no pass and the robot moves for less than `MIN_MOTION` in all training files, this comes first.
-
     Args:
         fit, validation: scores by file; validation without repeats.
         repeated: validation files that repeat the training motion.
@@ -93,24 +91,6 @@ def judge(
         rows: what the torque rows are called, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
         coordinate: what such a row belongs to, in a word.
     """
-    found = _judge(fit, validation, repeated, excitation, driven, rows, coordinate)
-    seconds = sum(report.seconds for report in excitation.values())
-    if found.level == "pass" or not excitation or seconds >= MIN_MOTION:
-        return found
-    told = f"the training motion lasts {seconds:.2g} s, too short to identify by: record 10 s or more of motion"
-    return Verdict(found.level, f"{told}; {found.reason}")
-
-
-def _judge(
-    fit: Mapping[str, Score],
-    validation: Mapping[str, Score],
-    repeated: Mapping[str, float],
-    excitation: Mapping[str, ExcitationReport],
-    driven: Sequence[int],
-    rows: Sequence[str],
-    coordinate: str,
-) -> Verdict:
-    """Return the verdict by rules 0 to 5, see `judge`."""
     if driven:
         named = ", ".join(str(joint + 1) for joint in driven)
         why = "is a torque's sign reversed, are columns swapped, is this the robot?"
@@ -118,6 +98,15 @@ def _judge(
     moves = {name: scored for name, scored in validation.items() if scored.motion_share >= MOVES}
     verdict = _judge_totals(fit, moves, len(moves) < len(validation), repeated, excitation)
     return _held_by_joint(verdict, moves or fit, rows, coordinate)
+
+
+def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) -> Verdict:
+    """Return a verdict that is no pass with its likely cause first: motion of less than `MIN_MOTION` in all files."""
+    seconds = sum(report.seconds for report in excitation.values())
+    if verdict.level == "pass" or not excitation or seconds >= MIN_MOTION:
+        return verdict
+    cause = f"the training motion lasts {seconds:.2g} s, too short to identify by: record 10 s or more of motion"
+    return replace(verdict, reason=f"{cause}; {verdict.reason}")
 
 
 def _judge_totals(

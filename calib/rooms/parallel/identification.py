@@ -28,6 +28,7 @@ from calib.procedure.dynamic_stage.verdict import (
     motion_warnings,
     parameter_warnings,
     resting_parameters,
+    with_duration,
     with_prior,
 )
 from calib.procedure.findings import Verdict
@@ -176,7 +177,7 @@ def _judged(
     labels = found.settings.torque_rows.titles(model.known.robot.joint_names)
     kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
     verdict = judge(fit, proofs, repeated, excitation, (), labels, kind)
-    return with_prior(verdict, resting_parameters(found))
+    return with_duration(with_prior(verdict, resting_parameters(found)), excitation)
 
 
 def _driven_joints(
