@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -96,7 +96,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     return replace(stages[verb], run=partial(stages[verb].run, found))
 
 
-def refuse_unread(settings: Any, plain: Any, read: tuple[str, ...], where: object = "") -> None:
+def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
     """Refuse settings that a stage does not read, where they are not as usual.
 
     Args:
@@ -110,5 +110,5 @@ def refuse_unread(settings: Any, plain: Any, read: tuple[str, ...], where: objec
     for each in fields(settings):
         value = getattr(settings, each.name)
         if each.name not in read and value != getattr(plain, each.name):
-            place = f"{where}: " if where else ""
-            raise UsageError(f"{place}{each.name} is for serial arms yet, not for this kind of robot: {value!r:.80}")
+            place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
+            raise UsageError(f"{place}{each.name}{shown} is for serial arms yet, not for this kind of robot")

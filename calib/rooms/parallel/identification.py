@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from calib import files
 from calib.data.recordings.recording import Recording
 from calib.data.signals.persistency import ExcitationReport, report_excitation
+from calib.dynamics.base import expressions
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import MeasurementError, UsageError
+from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
+from calib.estimation.estimate import Estimate
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.model_file import MODEL
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
@@ -32,23 +37,30 @@ from calib.procedure.dynamic_stage.verdict import (
     with_prior,
 )
 from calib.procedure.findings import Verdict
+from calib.procedure.robot_kinds import refuse_unread
+from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism.closure import NoPosture
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
+from calib.rooms.parallel.results import JudgedResult, ResultFolder, finite
 from calib.rooms.parallel.robots import ParallelMechanism
+from calib.workers.threads import one_blas_thread
 
-_NOT_YET = {
-    "couplings": "[[coupling]]", "terms": "[[term]]", "loop": "[loop]", "gravity": "gravity",
-    "payload_values": "known payloads",
-}  # fmt: skip
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calib.procedure.report.charts import Chart
+
+OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # settings
 APART = 1e-3  # rms by which redundant encoders contradict each other from which it is said [rad or m] (our choice)
+RATE = 100.0  # of torques_1.csv [Hz]
 FEW = 200  # samples of a recording at which they are asked
 DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.LEAST`
 
 Recorded = str | Path | Recording
 
 
-@dataclass(frozen=True, eq=False)
-class ParallelOutcome:
+@dataclass(frozen=True, eq=False, repr=False)
+class ParallelDynamics(JudgedResult):
     """What an identification of a parallel robot came to.
 
     Attributes:
@@ -72,8 +84,114 @@ class ParallelOutcome:
     validation: Mapping[str, Score]
     verdict: Verdict
     notes: tuple[str, ...]
+    folder: ClassVar = ResultFolder(
+        (MODEL, ESTIMATE, COVARIANCE, "torques_1.csv", "plot_*.png"), (MODEL,), "identification"
+    )
 
-    def with_unseen(self, validate: Sequence[Recorded]) -> ParallelOutcome:
+    @property
+    def estimate(self) -> Estimate:
+        """The base parameters with their covariance."""
+        return self.found.fitted.estimate
+
+    @property
+    def _essential(self) -> Mapping[str, float]:
+        """The essential parameters' values by their names; empty where none were asked for."""
+        gone = self.found.elimination
+        return {} if gone is None else dict(zip(gone.essential.estimate.names, gone.essential.estimate.values))
+
+    @one_blas_thread()
+    def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the rows (N, rows) of a motion q, v, a (N, n) of the actuated joints, no payload on board.
+
+        Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
+        their power [W]: as the model was identified.
+        """
+        return self.model.torque(self.found.dynamics.values, q, v, a, ())
+
+    @one_blas_thread()
+    def plot(self) -> dict[str, Figure]:
+        """Return the figures by name: measured and predicted rows."""
+        from calib.procedure.report import charts
+
+        return charts.figures(self._charts())
+
+    def _charts(self) -> dict[str, Chart]:
+        from calib.procedure.report.dynamics_figures import torques
+
+        drawn, prismatic = {}, [joint.kind == "prismatic" for joint in self.robot.known.robot.joints]
+        for number, case in enumerate((*self.cases, *self.unseen), 1):
+            target, model = (case.motion.in_band(x) for x in (case.target, predict(self.found.dynamics, case)))
+            rows, units = case.torque_rows.numbered(case.motion.n), case.torque_rows.units(prismatic)
+            drawn[f"torque_{number}"] = torques(case.motion.t, target, model, rows, units, case.name)
+        return drawn
+
+    def write(self, folder: Path, plots: bool) -> None:
+        """Write estimate, model, torques and figures."""
+        found, estimate, essential = self.found, self.estimate, self._essential
+        words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
+        write_estimate(folder, ("name", "expression", "unit", "value", "sigma", "rsd", "essential"), [
+            [name, expression, unit, float(value), finite(sigma), finite(rsd), essential.get(own)]
+            for name, expression, unit, value, sigma, rsd, own in zip(
+                found.names, words, estimate.units, estimate.values, estimate.sigma, estimate.rsd, estimate.names
+            )
+        ])  # fmt: skip
+        write_covariance(folder / COVARIANCE, found.names, estimate.covariance)
+        files.write_json(folder / MODEL, {
+            "robot": ROBOT, "kind": self.model.torque_rows.name, "payloads": list(self.model.payloads),
+            "v0": found.settings.v0[0], "values": dict(zip(self.model.names, map(float, found.dynamics.values))),
+            "base": dict(zip(found.names, words)), "covariance": COVARIANCE,
+        })  # fmt: skip
+        case = (*self.unseen, *self.cases)[0]
+        step, labels = max(1, round(case.motion.rate / RATE)), case.torque_rows.numbered(case.motion.n)
+        header = ["t [s]", *(f"{what}_{label}" for what in ("measured", "predicted") for label in labels)]
+        table = np.column_stack([case.motion.t, case.target, predict(found.dynamics, case)])
+        files.write_table(folder / "torques_1.csv", header, table[::step].tolist())
+        if plots:
+            from calib.procedure.report.charts import save_all
+
+            save_all(self._charts(), folder)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as ``metrics.json`` holds them."""
+        found, gone = self.found, self.found.elimination
+        return {
+            "robot": self.robot.known.robot.name,
+            "rows": list(self.model.torque_rows.numbered(self.model.n)),
+            "method": found.fitted.method,
+            "verdict": {"level": self.verdict.level, "reason": self.verdict.reason},
+            "identification": {name: _errors(one) for name, one in self.fit.items()},
+            "validation": {name: _errors(one) for name, one in self.validation.items()},
+            "parameters": {
+                "standard": self.model.p, "base": found.base.b,
+                "essential": found.base.b if gone is None else len(gone.kept),
+            },
+            "condition_number": dict(zip(("raw", "normalised"), map(finite, found.condition))),
+            "elimination": [] if gone is None else [{"name": one.name, "rsd": finite(one.rsd)} for one in gone.steps],
+            "notes": list(self.notes),
+            "seed": found.settings.seed,
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """Return what the command prints."""
+        robot, found, rows = self.robot.known.robot, self.found, self.model.torque_rows
+        lines = [
+            f"{robot.name}: {len(robot.legs)} legs, {robot.n} actuators, {robot.r} freedoms "
+            f"({', '.join(robot.freedom)}); rows: {rows.name}, {found.base.b} base parameters of {self.model.p}, by "
+            f"{found.fitted.method}"
+        ]
+        essential, estimate = self._essential, self.estimate
+        for name, own, unit, value, sigma, rsd in zip(
+            found.names, estimate.names, estimate.units, estimate.values, estimate.sigma, estimate.rsd
+        ):
+            kept = "" if not essential or own in essential else "  not essential"
+            lines.append(f"  {name:8} {value:12.5g} ± {sigma:.2g} {unit} ({rsd:.3g} %){kept}")
+        for what, scores in (("learnt from", self.fit), ("unseen", self.validation)):
+            lines += [
+                f"{name} ({what}): {one.filtered.total:.3g} % of the {rows.name} rows" for name, one in scores.items()
+            ]
+        return [*lines, *self.notes]
+
+    def with_unseen(self, validate: Sequence[Recorded]) -> ParallelDynamics:
         """Return an outcome judged anew on more unseen recordings; nothing is identified."""
         known = (*self.cases, *self.unseen)
         more = _cases(self.robot, self.model, self.options, validate, known, lambda words: None)
@@ -90,7 +208,7 @@ def identify_parallel(
     friction: str | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
-) -> ParallelOutcome:
+) -> ParallelDynamics:
     """Identify the dynamics of a parallel robot from recordings of its actuated joints, and judge it.
 
     Args:
@@ -148,7 +266,7 @@ def _cases(
 def _assessed(
     robot: ParallelMechanism, model: ParallelModel, options: IdentifyOptions, found: Identification[RegressorModel],
     cases: tuple[Case, ...], unseen: tuple[Case, ...],
-) -> ParallelOutcome:  # fmt: skip
+) -> ParallelDynamics:  # fmt: skip
     """Return the outcome: every recording predicted, and the verdict that follows."""
     scores = {case.name: score(case, predict(found.dynamics, case)) for case in (*cases, *unseen)}
     fit, validation = ({case.name: scores[case.name] for case in part} for part in (cases, unseen))
@@ -161,7 +279,7 @@ def _assessed(
         *_recording_notes(model, (*cases, *unseen)),
     )  # fmt: skip
     verdict = _judged(model, found, cases, fit, proofs, repeated, excitation)
-    return ParallelOutcome(robot, model, options, found, cases, unseen, fit, validation, verdict, notes)
+    return ParallelDynamics(robot, model, options, found, cases, unseen, fit, validation, verdict, notes)
 
 
 def _judged(
@@ -208,12 +326,10 @@ def _driven_joints(
 
 def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
     """Refuse what the identification of serial arms knows and this one does not."""
-    plain = IdentificationSettings()
-    for key, text in _NOT_YET.items():
-        if getattr(settings, key) != getattr(plain, key):
-            raise UsageError(f"{options.source or 'options'}: {text} is for serial arms yet, not for parallel robots")
-    if options.gain_pair is not None or options.cut_slow:
-        raise UsageError(f"{options.source}: [gain_identification] and cut_slow are for serial arms yet")
+    read = {each.name for each in fields(settings)} - OF_ARMS
+    refuse_unread(settings, IdentificationSettings(), read, options.source)
+    read = {each.name for each in fields(options)} - {"gain_pair", "cut_slow"}
+    refuse_unread(options, IdentifyOptions(), read, options.source)
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     method = method_named(settings.method)
@@ -226,6 +342,16 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
 def _of_arms(method: Method) -> bool:
     """Tell whether a method needs what only a serial arm's model has."""
     return method.needs_simulation or method.name == "ml"
+
+
+def _errors(one: Score) -> dict[str, Any]:
+    return {
+        key: {
+            "relative_error_percent": {"total": finite(part.total), "rows": [finite(x) for x in part.joints]},
+            "rms": [finite(x) for x in part.rms],
+        }
+        for key, part in (("raw", one.raw), ("filtered", one.filtered))
+    }
 
 
 def _recording_notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:

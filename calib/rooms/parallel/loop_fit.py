@@ -15,16 +15,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError, MeasurementError, UsageError, suggestion
+from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
+from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.verdict import GAIN, TRANSFER, WORSE
+from calib.procedure.robot_kinds import refuse_unread
+from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, NoPosture
 from calib.rooms.parallel.mechanism.geometric_fit import (
     LoopFit,
@@ -34,10 +38,11 @@ from calib.rooms.parallel.mechanism.geometric_fit import (
     platform_errors,
 )
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, ParallelRobot
+from calib.rooms.parallel.results import JudgedResult, ResultFolder, finite
 from calib.rooms.parallel.robots import ParallelMechanism
 
 FOLDS = 4  # of the rows, where none are unseen
-_NOT_YET = ("model", "loss", "folds", "stations", "tools", "refit_frames")
+READ = ("holdout", "tolerance", "seed")  # of the settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +60,8 @@ class _Rows:
         return _Rows(self.readings[rows], None if self.coordinates is None else self.coordinates[rows])
 
 
-@dataclass(frozen=True, eq=False)
-class ParallelFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class ParallelFit(JudgedResult):
     """A geometric calibration and its files.
 
     Attributes:
@@ -79,6 +84,29 @@ class ParallelFit:
     unseen: Mapping[str, np.ndarray]
     verdict: Verdict
     settings: FitSettings
+    folder: ClassVar = ResultFolder((ESTIMATE, COVARIANCE), (ROBOT,), "fit")
+
+    @property
+    def robot(self) -> ParallelMechanism:
+        """The calibrated robot: what identification, excitation and planning take."""
+        return ParallelMechanism(self.found.known, self.nominal.source)
+
+    @property
+    def estimate(self) -> Estimate:
+        """Changes of the loops' constants [m, rad] with their covariance."""
+        return self.found.estimate
+
+    @property
+    def origin(self) -> tuple[str, dict[str, Any]]:
+        """Where the calibrated robot is from, and which files it was fitted to."""
+        return f"calibrated from {self.nominal.source}", {"files": [str(each) for each in self.files]}
+
+    def write(self, folder: Path, plots: bool) -> None:
+        """Write the estimate."""
+        found = self.estimate
+        rows = zip(found.names, found.units, found.values.tolist(), map(finite, found.sigma))
+        write_estimate(folder, ("name", "unit", "value", "sigma"), list(map(list, rows)))
+        write_covariance(folder / COVARIANCE, found.names, found.covariance)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -92,7 +120,7 @@ class ParallelFit:
         """Errors of unseen rows, by name; of the fitted ones where there are none."""
         return self.unseen or {"fitted": self.own}
 
-    def metrics(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
         robot, found = self.nominal.known.robot, self.found
         both = np.concatenate(list(self.judged.values()), axis=1)
@@ -129,9 +157,9 @@ class ParallelFit:
             )
         return lines
 
-    def with_unseen(self, validate: Sequence[Path]) -> ParallelFit:
+    def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
         """Return a fit judged anew on more unseen files beside those of before; nothing is fitted again."""
-        known = self.nominal.known
+        known, validate = self.nominal.known, _paths(unseen)
         more = {f"{path.name}, unseen": read_rows(path, known.robot) for path in validate}
         _check_alike(self.rows, more)
         proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
@@ -142,25 +170,29 @@ class ParallelFit:
 
 def fit_parallel(
     robot: ParallelMechanism,
-    measured: Sequence[Path],
-    validate: Sequence[Path] = (),
+    measured: Sequence[str | Path],
+    validate: Sequence[str | Path] = (),
     *,
     settings: FitSettings | None = None,
     options: FitOptions | None = None,
+    poses: object = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelFit:
     """Fit the geometry of a parallel robot to measured files, and judge it on rows it has not seen.
 
     Args:
         settings: holdout, tolerance and seed; the others are for serial arms.
-        options: ``fix`` alone.
+        options: ``fix`` alone; poses: None, since none are chosen for parallel robots.
 
     Raises:
         UsageError: for options that only serial arms know.
         MeasurementError: for columns that are missing, or rows that no posture reaches.
         Unidentifiable: for readings alone of a robot without redundant encoders.
     """
+    if poses is not None:
+        raise UsageError("poses of a parallel robot are not chosen here, so that nothing was predicted of its fit")
     say, settings, known = progress or (lambda words: None), settings or FitSettings(), robot.known
+    measured, validate = _paths(measured), _paths(validate)
     held = _held(known, settings, options or FitOptions())
     rows = _stacked([read_rows(path, known.robot) for path in measured], measured)
     unseen = {f"{path.name}, unseen": read_rows(path, known.robot) for path in validate}
@@ -183,6 +215,12 @@ def fit_parallel(
         proofs = _cross_validated(known, rows, held, settings.seed)
     verdict = _judge(known.robot, rows, own, proofs, settings.tolerance)
     return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, verdict, settings)
+
+
+def _paths(measured: Sequence[object]) -> tuple[Path, ...]:
+    if all(isinstance(one, (str, Path)) for one in measured):
+        return tuple(Path(str(one)) for one in measured)
+    raise UsageError("a parallel robot's measurements are CSV files (calib formats parallel), not values in memory")
 
 
 def read_rows(path: Path, robot: ParallelRobot) -> _Rows:
@@ -212,12 +250,8 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
 
 def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tuple[str, ...]:
     """Return the names of constants that stay, after refusing what only serial arms know."""
-    plain, bare = FitSettings(), FitOptions(source=options.source, fix=options.fix)
-    for key in _NOT_YET:
-        if getattr(settings, key) != getattr(plain, key):
-            raise UsageError(f"{key} '{getattr(settings, key)}' is for serial arms yet, not for parallel robots")
-    if options != bare:
-        raise UsageError(f"{options.source or 'options'}: of the options a parallel robot's fit knows fix alone yet")
+    refuse_unread(settings, FitSettings(), READ)
+    refuse_unread(options, FitOptions(), ("source", "fix"), options.source)
     names = [one.name for one in loop_parameters(known)]
     for name in options.fix:
         if name not in names:

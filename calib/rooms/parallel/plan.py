@@ -8,22 +8,27 @@ coordinates (a straight line between each two, where asked for); its timing is t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, UsageError
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
+from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.design import actuator_bounds
 from calib.rooms.parallel.excite import read_model
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, NoPosture, coordinates_of
 from calib.rooms.parallel.mechanism.distribution import distributed
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model
+from calib.rooms.parallel.results import ParallelResult, ResultFolder, write_motion
 from calib.rooms.parallel.robots import ParallelMechanism
 from trajectories.setpoints import Setpoints, joined
 from trajectories.timing.limits import TimingLimits
@@ -32,7 +37,7 @@ from trajectories.timing.path import check_within, spline, through
 from trajectories.timing.profile import track
 from trajectories.timing.time_scaling import Timing, time_optimal
 
-_NOT_YET = ("shorten", "stray", "start", "slower")
+READ = ("payloads", "lines", "rate")  # of the settings
 DENSE = 100  # places per span of the path at which the actuators are solved for
 LEVER = 0.1  # of the base's size that a radian counts as in the length of a path (our choice)
 SHARP = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
@@ -78,8 +83,8 @@ class _PlatformDynamics:
         return np.array([False] * self.model.inertial + own)
 
 
-@dataclass(frozen=True, eq=False)
-class ParallelPlan:
+@dataclass(frozen=True, eq=False, repr=False)
+class ParallelPlan(ParallelResult):
     """A planned motion of a parallel robot.
 
     Attributes:
@@ -97,11 +102,45 @@ class ParallelPlan:
     track: Setpoints
     coordinates: np.ndarray
     notes: tuple[str, ...]
+    folder: ClassVar = ResultFolder((PLANNED, coefficients.NAME), (PLANNED,), "motion")
 
     @property
     def duration(self) -> float:
         """How long the motion takes [s]."""
         return self.track.duration
+
+    def write(self, folder: Path, plots: bool) -> None:
+        """Write the motion at the controller's rate."""
+        write_motion(self.robot, self.bounds, self.track, self.coordinates, folder)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as ``metrics.json`` holds them."""
+        tau, margins = self.track.tau, [one.margins for one in self.timings]
+        return {
+            "robot": self.robot.known.robot.name,
+            "duration": self.duration,
+            "paths": [one.duration for one in self.timings],
+            "margins": {kind: np.min([own[kind] for own in margins], axis=0).tolist() for kind in margins[0]},
+            "peak_torque": None if tau is None else np.abs(tau).max(axis=0).tolist(),
+            "peak_speed": np.abs(self.track.v).max(axis=0).tolist(),
+            "limits": self.bounds.lines(),
+            "notes": list(self.notes),
+        }
+
+    def lines(self) -> list[str]:
+        """Return what the command prints."""
+        robot = self.robot.known.robot
+        lines = [f"{robot.name}: {self.duration:.4g} s through the waypoints, {len(self.track)} samples"]
+        for kind, unit in (("velocity", "of the speed limits"), ("torque", "of the torque limits")):
+            used = [one.margins[kind] for one in self.timings if kind in one.margins]
+            if used:
+                share = 1.0 - np.min(used, axis=0)
+                named = ", ".join(f"{name} {100 * x:.0f} %" for name, x in zip(robot.joint_names, share))
+                lines.append(f"most {unit} in use: {named}")
+        return [*lines, *self.bounds.lines(), *self.notes]
+
+    def __repr__(self) -> str:
+        return f"<ParallelPlan for {self.robot.known.robot.name}: {self.duration:g} s>"
 
 
 def plan_parallel(
@@ -125,9 +164,7 @@ def plan_parallel(
         NoPosture: for a path that leaves the workspace, naming the place.
     """
     say, known = progress or (lambda words: None), robot.known
-    for key in _NOT_YET:
-        if getattr(settings, key) != getattr(DEFAULT_PLAN, key):
-            raise UsageError(f"{key} is for serial arms yet, not for parallel robots")
+    refuse_unread(settings, DEFAULT_PLAN, READ)
     if limits is not None or drives is not None:
         raise UsageError("limits and drives are in a parallel robot's own file (velocity, effort) and in its model")
     law, notes = _law(robot, model, settings)
@@ -206,34 +243,3 @@ def _of_actuators(known: ClosedRobot, path: JointPath) -> JointPath:
         raise UsageError(f"the path leaves the workspace: {error}; move or add waypoints") from error
     dense = through(posture.q[:, known.robot.actuated], s)
     return JointPath(dense.derivative, path.knots)
-
-
-def plan_lines(planned: ParallelPlan) -> list[str]:
-    """Return what the command prints."""
-    robot = planned.robot.known.robot
-    lines = [f"{robot.name}: {planned.duration:.4g} s through the waypoints, {len(planned.track)} samples"]
-    for kind, unit in (("velocity", "of the speed limits"), ("torque", "of the torque limits")):
-        used = [one.margins[kind] for one in planned.timings if kind in one.margins]
-        if used:
-            share = 1.0 - np.min(used, axis=0)
-            named = ", ".join(f"{name} {100 * x:.0f} %" for name, x in zip(robot.joint_names, share))
-            lines.append(f"most {unit} in use: {named}")
-    return [*lines, *planned.bounds.lines(), *planned.notes]
-
-
-def plan_metrics(planned: ParallelPlan) -> dict[str, object]:
-    """Return the content of a plan's ``metrics.json``."""
-    robot, tau = planned.robot.known.robot, planned.track.tau
-    margins: Sequence[dict[str, np.ndarray]] = [one.margins for one in planned.timings]
-    return {
-        "robot": robot.name,
-        "duration": planned.duration,
-        "paths": [one.duration for one in planned.timings],
-        "margins": {
-            kind: np.min([own[kind] for own in margins], axis=0).tolist() for kind in (margins[0] if margins else ())
-        },
-        "peak_torque": None if tau is None else np.abs(tau).max(axis=0).tolist(),
-        "peak_speed": np.abs(planned.track.v).max(axis=0).tolist(),
-        "limits": planned.bounds.lines(),
-        "notes": list(planned.notes),
-    }
