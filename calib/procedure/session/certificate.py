@@ -29,6 +29,9 @@ ROLES = {
     "7-recorded": "recorded", "8-dynamics": "identified model", "6-export": "calibrated robot",
     "9-export": "calibrated robot",
 }  # fmt: skip
+TORQUES = {
+    "motor": "motors'", "link": "of sensors behind the gears", "both": "motors' and of sensors behind the gears",
+}  # fmt: skip
 
 
 def certify(session: Session, say: Say) -> list[str]:
@@ -36,12 +39,11 @@ def certify(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import dynamics_section, geometry_section
 
     say("drawing" if session.plots else "writing")
-    judged, setup = [], _dynamic_robot(session)
+    judged, whole = [], None
     if session.geometric:
         whole = _whole_report(session)
         section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
         judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
-        setup = _measured_setup(session, whole)
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session).notes("export")
@@ -57,11 +59,11 @@ def certify(session: Session, say: Say) -> list[str]:
         section = replace(section, verdict=own.level, reason=own.reason)
         judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
     notes = [f"{section.title.lower()} {section.verdict}: {section.reason}" for section in judged]
-    lines = _simulated(session)
+    simulated = session.path(MARK).exists()
     page = certificate.certificate(
-        f"{'Simulated calibration' if lines else 'Calibration'} of {session.settings.name}",
-        f"{'SIMULATED: ' if lines else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
-        [*lines, *setup, *_made_by(session)],
+        f"{'Simulated calibration' if simulated else 'Calibration'} of {session.settings.name}",
+        f"{'SIMULATED: ' if simulated else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
+        _setup(session, whole),
         judged,
         listed(session),
     )
@@ -98,85 +100,49 @@ def _with_arrival(section: Section, lines: list[str]) -> Section:
     return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", fresh)])
 
 
-def _simulated(session: Session) -> list[tuple[str, str]]:
-    """Return lines under Setup of a session whose files a simulated cell brought; none of a real one."""
-    return [("simulated", line) for line in read_lines(session.path(MARK)) if line.strip()]
-
-
-def _dynamic_robot(session: Session) -> list[tuple[str, str]]:
-    """Return what stands under Setup of a session that takes the geometry as it is described."""
-    chain = chain_of(session)
-    return [
-        ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"),
-        ("description", f"{session.settings.robot.given}, taken as calibrated"),
-        ("session made", session.settings.created.replace("T", " ")),
-    ]
-
-
-def _made_by(session: Session) -> list[tuple[str, str]]:
-    """Return the lines under Setup that every session has."""
-    return [
-        *_dynamic_setup(session),
-        ("seed", str(session.settings.seed)),
-        ("command", command_line("next", session.folder.name)),
-        ("toolkit", certificate.versions()),
-    ]
-
-
-def _measured_setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
-    """Return what stands under Setup on the certificate of a fit."""
-    settings, fitted = session.settings, _measured(session)
-    instrument = settings.instrument
-    stated = f", σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else ", σ estimated"
-    turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
-    return [
-        ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
-        ("description", settings.robot.given),
-        ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),
+def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str, str]]:
+    """Return what stands under Setup: labels and values, of a fit and of dynamics where there are any."""
+    settings, chain = session.settings, chain_of(session)
+    described = settings.robot.given if found else f"{settings.robot.given}, taken as calibrated"
+    rows = [*(("simulated", line) for line in read_lines(session.path(MARK)))]
+    rows += [
+        ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"), ("description", described),
         ("session made", settings.created.replace("T", " ")),
-        ("measurements", _named(fitted)),
-        ("pose plan", _session_plan(session).words),
-        *_pose_checks(session),
-        ("model", found.metrics.model),
-        ("tolerance", certificate.tolerance(settings.fit.tolerance_mm, found.metrics)),
-    ]
+    ]  # fmt: skip
+    if found:
+        plan = _session_plan(session)
+        rows += [
+            ("instrument", _instrument(session, found.metrics)),
+            ("measurements", _named(session.brought("measured", "validation"))),
+            ("pose plan", plan.words), ("poses kept", ", ".join(plan.checked)),
+            ("poses NOT checked for", ", ".join(plan.unchecked)), ("model", found.metrics.model),
+            ("tolerance", certificate.tolerance(settings.fit.tolerance_mm, found.metrics)),
+        ]  # fmt: skip
+    if session.dynamic:
+        wanted = settings.dynamics
+        allowed = wanted.tolerance_percent
+        rows += [
+            ("recordings", _named(session.brought("training", "unseen"))), ("torques", TORQUES[wanted.torques]),
+            ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none stated: pass below 10 %"),
+            ("payloads", ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())),
+        ]  # fmt: skip
+    rows += [
+        ("seed", str(settings.seed)), ("command", command_line("next", session.folder.name)),
+        ("toolkit", certificate.versions()),
+    ]  # fmt: skip
+    return [(label, value) for label, value in rows if value.strip()]
 
 
-def _used(session: Session, found: FitMetrics) -> str:
-    """Return what the instrument measures, and what of it was used where the files hold something else."""
-    said = session.settings.instrument.measures
-    turned = found.fit.calibrated.orientation_deg is not None
+def _instrument(session: Session, found: FitMetrics) -> str:
+    """Return what the instrument measures, its sigmas, and what was used where the files hold something else."""
+    instrument = session.settings.instrument
+    said, turned = instrument.measures, found.fit.calibrated.orientation_deg is not None
     used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
     other = used.get((said, turned))
-    return f"said to measure {said}; the files hold {other}, which were used" if other else f"measures {said}"
-
-
-def _dynamic_setup(session: Session) -> list[tuple[str, str]]:
-    """Return the dynamics' lines under Setup."""
-    if not session.dynamic:
-        return []
-    wanted = session.settings.dynamics
-    allowed = wanted.tolerance_percent
-    torques = {
-        "motor": "motors'",
-        "link": "of sensors behind the gears",
-        "both": "motors' and of sensors behind the gears",
-    }
-    loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())
-    rows = [
-        ("recordings", _named(_recorded(session))),
-        ("torques", torques[wanted.torques]),
-        ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none was given: pass below 10 %"),
-    ]
-    return [*rows, ("payloads", loads)] if loads else rows
-
-
-def _measured(session: Session) -> list[Path]:
-    return [*session.brought("measured"), *session.brought("validation")]
-
-
-def _recorded(session: Session) -> list[Path]:
-    return [*session.brought("training"), *session.brought("unseen")]
+    measures = f"said to measure {said}; the files hold {other}, which were used" if other else f"measures {said}"
+    stated = f"σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else "σ estimated"
+    turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
+    return f"{instrument.name}, {measures}, {stated}{turning}"
 
 
 def _named(paths: list[Path]) -> str:
@@ -208,13 +174,6 @@ def _filed(paths: list[Path]) -> list[Path]:
     return [*own, *(path / JOINTS for path in paths if path.is_dir() and (path / CORNERS).exists())]
 
 
-def _pose_checks(session: Session) -> list[tuple[str, str]]:
-    """Return lines on what the planned poses were held against, and what was not known."""
-    found = _session_plan(session)
-    rows = [("poses kept", found.checked), ("poses NOT checked for", found.unchecked)]
-    return [(words, ", ".join(names)) for words, names in rows if names]
-
-
 def listed(session: Session) -> list[FileRow]:
     """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
@@ -226,7 +185,7 @@ def listed(session: Session) -> list[FileRow]:
         *_filed(session.brought("validation")),
     ]
     if session.dynamic:
-        wanted += [path for path in _recorded(session) if path.is_file()]
+        wanted += [path for path in session.brought("training", "unseen") if path.is_file()]
         if session.settings.dynamics.plan:  # else other motions were played
             wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]

@@ -55,7 +55,7 @@ def options_of(session: Session) -> IdentifyOptions:
     known = {label: Payload(float(mass)) for label, mass in wanted.payloads.items()}
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
     own = dict(options.files)
-    for path in (*session.brought("training"), *session.brought("unseen")):
+    for path in session.brought("training", "unseen"):
         carried = tuple(label for label in known if label.lower() in path.stem.lower())
         if carried:
             own[path.name] = replace(

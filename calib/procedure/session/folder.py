@@ -120,15 +120,16 @@ class Session:
         """The robot's description."""
         return self.path(self.settings.robot.file)
 
-    def brought(self, kind: str) -> list[Path]:
+    def brought(self, *kinds: str) -> list[Path]:
         """Return the files, and folders of images or bags, that people have brought (`BROUGHT`); files come first."""
-        folder, prefix = BROUGHT[kind]
-        others = [start for where, start in BROUGHT.values() if where == folder and start and start != prefix]
-        belongs = _is_log if folder == "7-recorded" else _is_measured
-        found = [path for path in self.path(folder).glob("*") if belongs(path)]
-        named = [path for path in found if path.name.lower().startswith(prefix)]
-        mine = [path for path in named if prefix or not path.name.lower().startswith(tuple(others))]
-        return sorted(mine, key=lambda path: (path.is_dir(), path))
+        result = []
+        for folder, prefix in (BROUGHT[kind] for kind in kinds):
+            others = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
+            belongs = _is_log if folder == "7-recorded" else _is_measured
+            found = {path: path.name.lower() for path in self.path(folder).glob("*") if belongs(path)}
+            mine = [path for path, name in found.items() if name.startswith(prefix) and not name.startswith(others)]
+            result += sorted(mine, key=lambda path: (path.is_dir(), path))
+        return result
 
     def files_brought(self, kind: str) -> list[Path]:
         """Return the same file by file; the corners found in images are ours."""

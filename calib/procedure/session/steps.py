@@ -77,7 +77,7 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
         return State(step, READY, step.purpose)
     if changes := _changes(entry.inputs, _inputs(session, step)):
         kinds, used = step.kept
-        if any(map(session.brought, kinds)):
+        if session.brought(*kinds):
             return State(step, KEPT, f"{changes}; kept, since {used}")
         return State(step, STALE, changes)
     gone = [name for name in entry.outputs if not session.path(name).exists()]
