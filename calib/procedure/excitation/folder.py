@@ -19,6 +19,7 @@ from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.design import INSTANTS, Designed
 from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.planning import Planned
+from calib.records import plain
 from calib.robot.tables import dumps
 from calib.units import motion_units
 from calib.words import counted
@@ -165,7 +166,7 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
             "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
             "approach": _seconds(designed.playback.approach), "rehearsal": _seconds(designed.playback.rehearsal),
         },
-        "prediction": designed.outlook,
+        "prediction": plain(designed.outlook),
         "limits": given.limits.bounds.lines(),
         "notes": list(designed.notes),
     }  # fmt: skip
