@@ -28,7 +28,6 @@ from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.procedure.session.geometry_steps import deliver_identified
 from calib.records import read_json
-from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
@@ -39,15 +38,10 @@ SHORTER, OTHER = (
 )  # the validation motion's period over the training's, and what is added to its seed (our choice)
 
 
-def _calibrated(session: Session) -> Chain:
-    """Return the geometry that dynamics are identified on: the calibrated one, without joint corrections."""
-    return load_calibrated(session.fit.path).chain
-
-
 def options_of(session: Session) -> IdentifyOptions:
     """Return how to identify: the options file's content, or what ``session.toml`` says; payloads by file name."""
     wanted = session.settings.dynamics
-    options = read_options(session.path(wanted.options) if wanted.options else None)
+    options = read_options(session.named(wanted.options))
     settings = options.settings
     if not wanted.options:
         rows = torque_rows(wanted.torques)
@@ -75,7 +69,7 @@ def excite(session: Session, say: Say) -> list[str]:
         return ["no motion is designed: the recorded files hold others (plan = false)"]
     if session.plots:
         from calib.procedure.report.motion_figures import write_design as draw
-    limits = session.path(wanted.limits) if wanted.limits else None
+    limits = session.named(wanted.limits)
     names = ["training", "validation"] if wanted.validation else ["training"]
     for name in names:
         first = name == "training"
@@ -123,7 +117,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     Raises:
         MeasurementError: for what cannot be right: units, order of joints, another motion, reversed torques.
     """
-    chain, options = _calibrated(session), options_of(session)
+    chain, options = load_calibrated(session.fit.path).chain, options_of(session)
     own = options.file_settings(str(path))
     recording = read_recording(str(path), inputs.joints_of(chain), own.recording)
     rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)  # as identification takes it

@@ -49,6 +49,7 @@ from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.robot.calibrated import ROBOT
+from calib.robot.chain import Chain
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
@@ -114,6 +115,10 @@ class Session:
     def named(self, name: str) -> Path | None:
         """Return a file that ``session.toml`` names; None where it names none."""
         return self.path(name) if name else None
+
+    def links(self, chain: Chain) -> tuple[str | None, str | None]:
+        """Return base and tip by which the robot's file is read as this chain; None where only a URDF has links."""
+        return (chain.base, chain.tip) if self.robot_file.suffix == ".urdf" else (None, None)
 
     @property
     def robot_file(self) -> Path:

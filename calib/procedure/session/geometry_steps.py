@@ -15,7 +15,7 @@ from calib import files
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
-from calib.data.poses.plans import check_against, filled_in, read_poses, write_poses
+from calib.data.poses.plans import check_against, filled_in, read_poses
 from calib.errors import CalibError, UsageError
 from calib.folders import write_staged
 from calib.geometry.weighing import Settings
@@ -26,16 +26,14 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.measuring.image_findings import image_words
-from calib.procedure.measuring.run import write_run
-from calib.procedure.measuring.selection_prediction import SelectionPrediction, beside
+from calib.procedure.measuring.selection_prediction import beside
 from calib.procedure.measuring.selection_prediction import read as read_prediction
-from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.geometry_section import error_words, parameter_words
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, VERDICT, WAYS, Session
+from calib.procedure.session.folder import POSES, POSES_CHECKED, SUMMARY, UNSEEN, VERDICT, Session
 from calib.robot import calibrated
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
 from calib.robot.load import load_calibrated
 from calib.units import JOINT
 
@@ -51,8 +49,8 @@ def chain_of(session: Session) -> Chain:
 
 def _options_of(session: Session) -> FitOptions:
     """Return the fit options, with the instrument's sigmas where a file states none."""
-    name, instrument = session.settings.fit.options, session.settings.instrument
-    options = read_options(session.path(name) if name else None)
+    instrument = session.settings.instrument
+    options = read_options(session.named(session.settings.fit.options))
     position, turn = instrument.sigma_position, instrument.sigma_orientation
 
     def stated(each: FileOptions) -> FileOptions:
@@ -64,11 +62,6 @@ def _options_of(session: Session) -> FitOptions:
         return replace(each, sigma=sigma)
 
     return replace(options, sigma=stated(options).sigma, files={n: stated(each) for n, each in options.files.items()})
-
-
-def _tolerance_of(session: Session) -> float | None:
-    """Return the largest rms on unseen poses that is good enough [m]; None where the session states none."""
-    return 1e-3 * session.settings.fit.tolerance_mm or None
 
 
 def describe(session: Session, say: Say) -> list[str]:
@@ -92,9 +85,9 @@ def describe(session: Session, say: Say) -> list[str]:
 
 def select(session: Session, say: Say) -> list[str]:
     """Choose poses for the fit, and others at random for validation."""
-    from calib.procedure.session.pose_plan import plan
+    from calib.procedure.session.pose_plan import choose
 
-    chain, wanted = chain_of(session), session.settings.poses
+    chain = chain_of(session)
     for path in (session.path(f"2-poses/{name}") for name in (POSES, UNSEEN)):
         if path.exists() and filled_in(path, chain.n):
             raise UsageError(
@@ -102,20 +95,7 @@ def select(session: Session, say: Say) -> list[str]:
                 f"{session.path('3-measured')}, and put the plain list back or remove it"
             )
     say("choosing poses")
-    chosen = plan(session, session.robot_file, chain, say)
-    kinds = [joint.kind for joint in chain.joints]
-    names = chain.joint_names
-    write_poses(session.path(f"2-poses/{POSES}"), chosen.fit, names, unit="deg", kinds=kinds)
-    write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
-    if chosen.prediction is not None:
-        write_prediction(chosen.prediction, session.path(f"2-poses/{POSES}"))
-    notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
-    if wanted.validation:
-        write_poses(session.path(f"2-poses/{UNSEEN}"), chosen.validation, names, unit="deg", kinds=kinds)
-        notes.append(f"{len(chosen.validation)} poses for validation, at random")
-    notes += [*chosen.kept, *chosen.record["notes"]]
-    files.write_json(session.path(SELECTION), chosen.record)
-    return notes
+    return choose(session, chain, say)
 
 
 def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
@@ -123,21 +103,14 @@ def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     path = session.path(f"2-poses/{name}.csv")
     if not session.settings.poses.plan or not path.exists():
         return None
-    return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
-
-
-def _selection_prediction(session: Session) -> SelectionPrediction | None:
-    """Return what was predicted when the poses were chosen; None where they were not, or by an earlier version."""
-    path = session.path(f"2-poses/{POSES}")
-    return read_prediction(path) if session.settings.poses.plan and beside(path).exists() else None
+    return read_poses(path, chain.joint_names, kinds=joint_kinds(chain))
 
 
 def arrive(session: Session, say: Say) -> list[str]:
     """Check the files that were brought for the fit."""
     chain, notes = chain_of(session), []
-    fit = session.brought("measured")
     plan = _planned(session, chain, "poses")
-    for path in fit:
+    for path in session.brought("measured"):
         notes += check_file(session, chain, path, plan)
     notes += _drifts(session, chain)
     files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
@@ -184,7 +157,7 @@ def _fit_settings(session: Session) -> FitSettings:
     wanted = session.settings.fit
     model, loss = (None if value == "auto" else value for value in (wanted.model, wanted.loss))
     return FitSettings(
-        model=model, loss=loss, stations=wanted.stations, tolerance=_tolerance_of(session),
+        model=model, loss=loss, stations=wanted.stations, tolerance=1e-3 * wanted.tolerance_mm or None,
         refit_frames=wanted.validation_frames == "own", seed=session.settings.seed, holdout=wanted.holdout,
         deliverable=wanted.deliverable,
     )  # fmt: skip
@@ -193,16 +166,17 @@ def _fit_settings(session: Session) -> FitSettings:
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the robot with the fit's measurements, and with validation files if asked for."""
     chain = chain_of(session)
-    links = (chain.base, chain.tip) if session.robot_file.suffix == ".urdf" else (None, None)
+    base, tip = session.links(chain)
     return inputs.gather(
         session.robot_file, session.brought("measured"), validate, options=_options_of(session),
-        settings=_fit_settings(session), base=links[0], tip=links[1],
+        settings=_fit_settings(session), base=base, tip=tip,
     )  # fmt: skip
 
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
-    selection = _selection_prediction(session)
+    poses = session.path(f"2-poses/{POSES}")
+    selection = read_prediction(poses) if session.settings.poses.plan and beside(poses).exists() else None
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED, deliverables={}))
     draw = partial(certificate.write_fit, plots=session.plots, page=False)

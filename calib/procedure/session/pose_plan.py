@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,47 +11,34 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.pixels import Pixels
+from calib.data.poses.plans import write_poses
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.camera_view import BLIND
 from calib.procedure.measuring.pose_limits import read_limits
-from calib.procedure.measuring.run import Run, same_turn
-from calib.procedure.measuring.selection_prediction import SelectionPrediction
-from calib.procedure.session.folder import PREDICTED, Session
-from calib.robot.chain import Chain
+from calib.procedure.measuring.run import same_turn, write_run
+from calib.procedure.measuring.selection_prediction import write as write_prediction
+from calib.procedure.session.folder import POSES, PREDICTED, SELECTION, UNSEEN, WAYS, Session
+from calib.robot.chain import Chain, joint_kinds
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
 
 HOW = "state [camera] in the limits file: calib formats constraints"
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Poses for the fit (m, n) and for validation (v, n) [rad or m], how they came about, what they keep and tell."""
-
-    fit: np.ndarray
-    validation: np.ndarray
-    words: str
-    kept: tuple[str, ...]
-    record: dict[str, Any]
-    run: Run
-    prediction: SelectionPrediction | None
-
-
-def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], None]) -> Plan:
-    """Choose the poses that ``session.toml`` asks for."""
-    settings = session.settings
+def choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[str]:
+    """Choose and write the poses that ``session.toml`` asks for, the run through them, and what they will tell."""
+    settings, robot_file = session.settings, session.robot_file
     wanted, instrument = settings.poses, settings.instrument
-    constraints = session.path(wanted.constraints) if wanted.constraints else None
-    links = (chain.base, chain.tip) if robot_file.suffix == ".urdf" else (None, None)
-    stated = (instrument.sigma_position, instrument.sigma_orientation)
+    base, tip = session.links(chain)
+    sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
     choice = SelectionSettings(
-        kind=_seen_as(instrument.measures), tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
-        sigmas=_sigmas(*stated), seed=settings.seed,
+        kind=_seen_as(instrument.measures), tools=(instrument.tool,), index=wanted.index, method=wanted.method,
+        sigmas=sigmas if instrument.sigma_position else None, seed=settings.seed,
     )  # fmt: skip
     chosen = selection.choose(
-        robot_file, wanted.fit, choice, constraints=constraints, base=links[0], tip=links[1],
+        robot_file, wanted.fit, choice, constraints=session.named(wanted.constraints), base=base, tip=tip,
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
     said = any(words.startswith(BLIND) for words in chosen.unchecked)
@@ -65,7 +52,13 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         f"{len(q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
-    record = {"words": words, **selection.record(chosen), "seed": settings.seed}
+    unseen = _unseen(session, robot_file, chain, wanted.validation)
+    sets = {POSES: q, UNSEEN: unseen} if wanted.validation else {POSES: q}
+    for name, joints in sets.items():
+        write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, unit="deg", kinds=joint_kinds(chain))
+    write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
+    if chosen.prediction is not None:
+        write_prediction(chosen.prediction, session.path(f"2-poses/{POSES}"))
     outlook = chosen.outlook.poses
     if session.plots and np.isfinite(outlook.rms):
         from calib.procedure.report.charts import picture
@@ -73,14 +66,12 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
 
         chart = predicted_map(outlook.points, outlook.spread)
         files.write(session.path(PREDICTED), picture(chart, "").png)
-    unseen = _unseen(session, robot_file, chain, wanted.validation)
-    kept = (*chosen.kept(), *(f"{words}: {number}" for words, number in selection.predicted_rows(chosen)))
-    return Plan(q, unseen, words, kept, record, chosen.run, chosen.prediction)
-
-
-def _sigmas(position: float, orientation: float) -> tuple[float, float] | None:
-    """Return the sigmas that are stated, with our own for an orientation that is not; None where none is."""
-    return (position, orientation or SIGMA_ORIENTATION) if position else None
+    record = {"words": words, **selection.record(chosen), "seed": settings.seed}
+    files.write_json(session.path(SELECTION), record)
+    notes = [f"{len(q)} poses for the fit: {words}"]
+    notes += [f"{len(unseen)} poses for validation, at random"] if wanted.validation else []
+    numbers = (f"{words}: {number}" for words, number in selection.predicted_rows(chosen))
+    return [*notes, *chosen.kept(), *numbers, *record["notes"]]
 
 
 def _seen_as(measures: str) -> str:
@@ -92,9 +83,8 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     """Return random poses within limits and constraints (count, n), from another stream than the candidates'."""
     if not count:
         return np.zeros((0, chain.n))
-    name = session.settings.poses.constraints
     cell = targets_of(chain, [session.settings.instrument.tool])
-    limits = read_limits(session.path(name) if name else None, cell, robot_file)
+    limits = read_limits(session.named(session.settings.poses.constraints), cell, robot_file)
     jacobian = observation(cell, _seen_as(session.settings.instrument.measures))
     space = limits.space(jacobian)
     stream = np.random.default_rng([session.settings.seed, 1])
