@@ -50,10 +50,10 @@ def new_session(
     """
     stage_of(robot, "a guided session")
     known = limits if isinstance(limits, Mapping) else optional(limits)
-    wanted = commands.NewSession(
-        str(robot), instrument, poses, validation, seed, base, tip, tool, known, dynamics, motion
-    )
-    made = commands.begin(Path(folder), wanted)
+    made = commands.begin(
+        Path(folder), str(robot), instrument, poses, validation, seed, base=base, tip=tip, tool=tool, limits=known,
+        dynamics=dynamics, motion=motion,
+    )  # fmt: skip
     return made.folder
 
 

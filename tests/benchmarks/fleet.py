@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from calib.procedure.session import fleet, steps
-from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import locked
 from calib.rooms.cells import demo
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -27,7 +27,7 @@ def quiet(words: str) -> None:
 def prepare(folder: Path, number: int) -> None:
     """Make a session whose measurements are there and whose steps are all to be made."""
     robot = ROBOTS[number % len(ROBOTS)]
-    session = begin(folder, NewSession(robot, "cmm", seed=number, dynamics=False))
+    session = begin(folder, robot, "cmm", seed=number, dynamics=False)
     with locked(session, quiet):
         steps.run_next(session, quiet, quiet, "benchmark")
     demo.simulate_measurements(session, virtual_cell(robot, number), number)

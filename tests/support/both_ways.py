@@ -17,7 +17,7 @@ from without_figures import DRAWING
 from calib import cli
 from calib.errors import CalibError
 from calib.procedure.session import steps
-from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, locked, open_session
 
 COMMAND = get_command(cli.app)
@@ -80,7 +80,7 @@ def command(*words: object) -> str:
 
 def session_with(folder: Path, robot: Path, model: str, *measured: Path) -> Session:
     """Make a session, with the measured files brought to it."""
-    session = begin(folder, NewSession(str(robot), "cmm", 4, 1, dynamics=False))
+    session = begin(folder, str(robot), "cmm", 4, 1, dynamics=False)
     settings = session.path("session.toml")
     for old, new in (("plan = true", "plan = false"), ('model = "auto"', f'model = "{model}"')):
         edit(settings, old, new)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,8 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from calib.arguments import checked
-from calib.config import check_keys, parse
-from calib.errors import UsageError, command_line
+from calib.config import parse
+from calib.errors import UsageError, command_line, require
 from calib.folders import CERTIFICATE
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.limits import read_motion_limits
@@ -24,15 +23,7 @@ from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import VERDICT, Session, create, locked, open_session
 from calib.procedure.session.questions import instrument_named
-from calib.procedure.session.settings import (
-    NOTHING,
-    DynamicsSection,
-    FitSection,
-    InstrumentSection,
-    PosesSection,
-    RobotSection,
-    SessionSettings,
-)  # fmt: skip
+from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
 from calib.robot.load import load, resolve
@@ -53,12 +44,14 @@ class _Stop:
     verdict: str = ""
 
 
-@checked
-@dataclass(frozen=True)
-class NewSession:
-    """What a new session is about.
+def begin(
+    folder: Path, robot: str, instrument: str, poses: int = 40, validation: int = 20, seed: int = 0, *,
+    base: str = "", tip: str = "", tool: Sequence[float] | None = None,
+    limits: Path | Mapping[str, Any] | None = None, dynamics: bool = True, motion: Mapping[str, Any] | None = None,
+) -> Session:  # fmt: skip
+    """Make a session in the new folder `folder`, for a robot, which is read once to see that it can be.
 
-    Attributes:
+    Args:
         robot: see `calib.robot.load`.
         instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`; ``none``: the geometry is taken as it is.
         poses, validation: how many to choose.
@@ -68,42 +61,24 @@ class NewSession:
         limits: a file of limits, copied, that both poses and motions keep; or its tables.
         dynamics: identify the dynamics, too.
         motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
+
+    Raises:
+        UsageError: for a value that a key of ``session.toml`` cannot have.
     """
-
-    robot: str
-    instrument: str
-    poses: int = 40
-    validation: int = 20
-    seed: int = 0
-    base: str = ""
-    tip: str = ""
-    tool: Sequence[float] | None = None
-    limits: Path | Mapping[str, Any] | None = None
-    dynamics: bool = True
-    motion: Mapping[str, Any] = field(default_factory=dict)
-
-
-def begin(folder: Path, wanted: NewSession) -> Session:
-    """Make a session in the new folder `folder`, for a robot, which is read once to see that it can be."""
-    if wanted.poses < 1 or wanted.validation < 0:
-        words = f"poses {wanted.poses}, validation {wanted.validation}"
-        raise UsageError(f"{words}: at least one pose, and no fewer than 0")
-    check_keys(wanted.motion, [key.name for key in fields(DynamicsSection)], "keys of [dynamics]")
-    device, source = instrument_named(wanted.instrument), resolve(wanted.robot)
-    if device.measures == NOTHING and not wanted.dynamics:
-        raise UsageError("nothing is measured and no dynamics are wanted: nothing is left to be done")
-    chain = load(wanted.robot, wanted.base or None, wanted.tip or None)
-    copied, named = _limits(wanted.limits, chain, source, wanted.dynamics)
-    measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
-    if wanted.tool is not None:
-        x, y, z = (float(value) for value in wanted.tool)
-        measured = replace(measured, tool=(x, y, z))
-    settings = SessionSettings(
-        chain.name, "", wanted.seed, RobotSection("", wanted.robot, wanted.base, wanted.tip), measured,
-        PosesSection(wanted.poses, wanted.validation, constraints=named), FitSection(),
-        DynamicsSection(wanted=wanted.dynamics, limits=named, **wanted.motion),
-    )  # fmt: skip
-    return create(folder, source, settings, copied | meshes_beside(source))
+    device, source = instrument_named(instrument), resolve(robot)
+    words = "nothing is measured and no dynamics are wanted: nothing is left to be done"
+    require(dynamics or device.measures != NOTHING, words, UsageError)
+    chain = load(robot, base or None, tip or None)
+    copied, named = _limits(limits, chain, source, dynamics)
+    sigmas = {key: getattr(device, key) for key in ("measures", "sigma_position", "sigma_orientation")}
+    table = {
+        "name": chain.name, "created": "", "seed": seed, "fit": {},
+        "robot": {"file": source.name, "given": robot, "base": base, "tip": tip},
+        "instrument": {"name": device.label, **sigmas, **({} if tool is None else {"tool": [*map(float, tool)]})},
+        "poses": {"fit": poses, "validation": validation, "constraints": named},
+        "dynamics": {"wanted": dynamics, "limits": named, **(motion or {})},
+    }  # fmt: skip
+    return create(folder, source, parse(SessionSettings, table, "session.toml"), copied | meshes_beside(source))
 
 
 def _limits(

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from calib.geometry import installation_file
 from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import dynamics_steps, steps
-from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
 from calib.records import read_lines
 from calib.robot import calibrated, library
@@ -89,14 +90,14 @@ def run(
         )
         dynamics = False
     motion = MOTION if dynamics else {}
-    wanted = NewSession(robot, instrument, FIT, VALIDATION, seed, dynamics=dynamics, motion=motion)
+    begun = partial(begin, folder, robot, instrument, FIT, VALIDATION, seed, dynamics=dynamics, motion=motion)
     if instrument == "camera":
         seen = camera_files.seen_by_camera(cell)
         cell = seen.cell
         with camera_files.limits_of(seen) as limits:
-            session = begin(folder, replace(wanted, limits=limits))
+            session = begun(limits=limits)
     else:
-        session = begin(folder, wanted)
+        session = begun()
     session = replace(session, plots=plots)
     say(f"the cell: {cell.note}")
     with locked(session):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from sessions import edit, go_on
 
-from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -16,7 +16,7 @@ from calib.rooms.cells.virtual_cells import virtual_cell
 def planned_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session that waits for measurements."""
     folder = tmp_path_factory.mktemp("planned") / "cell"
-    session = begin(folder, NewSession("lwr4plus", "cmm", 20, 8, seed=1, dynamics=False))
+    session = begin(folder, "lwr4plus", "cmm", 20, 8, seed=1, dynamics=False)
     edit(folder / "session.toml", 'model = "auto"', 'model = "geometry"')
     waiting = go_on(session)
     assert waiting is not None and waiting.step.name == "measure"

@@ -16,7 +16,7 @@ from calib import cli
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
 from calib.procedure.session import commands, instructions, steps
-from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.truth import torque_errors
@@ -264,5 +264,5 @@ def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, ca
 
 
 def test_a_robot_without_masses_is_calibrated_without_dynamics(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    session = begin(tmp_path / "cell", NewSession("ur5", "cmm", 5, 0, dynamics=False))
+    session = begin(tmp_path / "cell", "ur5", "cmm", 5, 0, dynamics=False)
     assert not session.dynamic and not session.path("7-recorded").exists()

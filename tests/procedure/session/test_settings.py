@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import SessionError
+from calib.errors import SessionError, UsageError
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.session.commands import NewSession, begin
+from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.settings import (
     DynamicsSection,
@@ -143,14 +143,14 @@ def test_a_robot_whose_name_holds_quotes_and_lines_makes_a_session(tmp_path: Pat
     joint = "[[joint]]\nlower = -1\nupper = 1\n"
     text = f'name = {json.dumps(name)}\n{joint}{joint}alpha = "pi/2"\n'
     (tmp_path / "robot.toml").write_text(text)
-    made = begin(tmp_path / "cell", NewSession(str(tmp_path / "robot.toml"), "tracker", 20, 5, seed=3, dynamics=False))
+    made = begin(tmp_path / "cell", str(tmp_path / "robot.toml"), "tracker", 20, 5, seed=3, dynamics=False)
     assert (made.settings.name, made.settings.seed) == (name, 3)
     assert open_session(made.folder).settings == made.settings
 
 
 def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
-    with pytest.raises(SessionError, match=r"cell/session.toml: seed: expected a whole number, 0 or more, found -1"):
-        begin(tmp_path / "cell", NewSession("ur5", "tracker", 20, 5, seed=-1))
+    with pytest.raises(UsageError, match="seed: expected a whole number, 0 or more, found -1"):
+        begin(tmp_path / "cell", "ur5", "tracker", 20, 5, seed=-1)
     assert list(tmp_path.iterdir()) == []
 
 
