@@ -24,7 +24,7 @@ HOMES = {
         "calib.rooms.parallel.mechanism.closure_kernels",
         "calib.robot.capsule_kernels",
         "calib.simulation.loop.loop_kernels",
-        "calib.simulation.loop.tangent_kernels",
+        "calib.rooms.studies.methods.tangent_kernels",
     ],
     "yourdfpy": ["calib.robot.formats.readback"],
     "cv2": [

@@ -27,11 +27,10 @@ _TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
 RAMP = 0.1  # of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated
-_LOWER = (
+LOWER = (
     "these gains do not hold this robot at this rate; lower kp and kd (are they in the unit of the torque?), or the "
     "delay"
 )
-GROWN = 1e20  # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +61,6 @@ class Plant:
     def inertial(self) -> int:
         """Number of parameters that are the bodies'; they come first."""
         return 10 * self.bodies.count
-
-    def stepper(self, columns: np.ndarray) -> Stepper:
-        """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
-        find = np.full(len(self.parameters), -1)
-        find[np.asarray(columns, dtype=int)] = 2 * self.bodies.n + np.arange(len(columns))
-        return Stepper(_packed(self), (*_layout_of(self), find))
 
     def with_parameters(self, parameters: np.ndarray) -> Plant:
         """Return the plant with other parameters."""
@@ -166,14 +159,14 @@ def simulate(
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
     tick = sample_ticks(count, sensing.every)
     out = np.empty((5, len(tick), n))
-    model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
+    model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
-        *_packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
+        *packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
         np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
         controller.smoothing(reference.period), controller.delay, float(sensing.every), q, v, out,
     )  # fmt: skip
     if status != loop_kernels.FINE:
-        raise _failure(status, reached * reference.period)
+        raise failure(status, reached * reference.period)
     heard = drawn["sigma_tau"][tick.astype(int)] if len(drawn["sigma_tau"]) else 0.0
     whole = np.all(tick == tick.astype(int))
     t = reference.t[tick.astype(int)] if whole else reference.t[0] + tick * reference.period
@@ -215,69 +208,6 @@ def simulate_many(
         return list(pool.map(one, range(len(values))))
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivities:
-    """A simulated motion without noise, and its slopes by parameters; M samples, c parameters.
-
-    Attributes:
-        t: (M,) [s].
-        q, v, torque: (M, n) [rad or m, per s, N m or N].
-        by_q, by_v, by_torque: (M, n, c) their slopes, per unit of each parameter.
-    """
-
-    t: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    torque: np.ndarray
-    by_q: np.ndarray
-    by_v: np.ndarray
-    by_torque: np.ndarray
-
-
-def simulate_tangents(
-    plant: Plant, controller: Controller, reference: Reference, columns: np.ndarray, every: float = 1,
-    relative: np.ndarray | None = None,
-) -> Sensitivities:  # fmt: skip
-    """Let the robot follow a reference without noise, and say what each parameter changes: exactly, in one pass.
-
-    Args:
-        plant: whose friction hangs on position and velocity alone.
-        columns: (c,) indices of the parameters.
-        every: control periods per sample.
-        relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
-            (`calib.identification.loop.loop_recordings.Loop.design`); None: they stay.
-
-    Raises:
-        CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
-        NotConverged: where the loop is unstable.
-    """
-    from calib.simulation.loop import loop_kernels, tangent_kernels
-
-    for one in plant.terms:
-        if not one.form.slopes:
-            raise CalibError(
-                f"term '{one.name}' ({one.shape}): no tangents of friction that hangs on loads or the past"
-            )
-    n, count, c = plant.bodies.n, len(reference.t), len(columns)
-    find = np.full(len(plant.parameters), -1)
-    find[np.asarray(columns, dtype=int)] = np.arange(c)
-    tick = sample_ticks(count, every)
-    out, slopes = np.empty((3, len(tick), n)), np.empty((3, len(tick), n, c))
-    model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
-    scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
-    status, reached = tangent_kernels.closed_loop_tangent(
-        _packed(plant), (*_layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
-        np.empty((0, n)), reference.period, controller.smoothing(reference.period), controller.delay, float(every),
-        np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
-    )  # fmt: skip
-    if status != loop_kernels.FINE:
-        raise _failure(status, reached * reference.period)
-    if not np.abs(slopes[:, -1]).max(initial=0.0) < GROWN:  # saturated torques keep the motion finite, not its slopes
-        raise Diverged(f"the loop is unstable, its slopes grow without bounds: {_LOWER}", None)
-    t = reference.t[0] + tick * reference.period
-    return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
-
-
 def sample_ticks(count: int, every: float) -> np.ndarray:
     """Return the control periods, whole or not, at which samples of `count` periods are recorded."""
     return np.arange(int((count - 1) / every + 1e-9) + 1) * every
@@ -301,54 +231,10 @@ def forward_dynamics(
     q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
     out, count = np.empty_like(q), len(plant.parameters)
     values = np.empty((0, count)) if parameters is None else shaped(parameters, (len(q), count), "parameters")
-    layout = _layout_of(plant)
-    failed = loop_kernels.forward_dynamics(*_packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
+    layout = layout_of(plant)
+    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
     require(failed < 0, f"sample {failed}: the inertia matrix is not positive definite", CannotSimulate)
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class Stepper:
-    """A plant made ready to be advanced many times with other parameters and states, one at a time."""
-
-    parts: Packed
-    layout: Packed
-
-    def points(
-        self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return states (K, n) a period later under one torque (n,), and M⁻¹ (n, n) of the first.
-
-        Args:
-            parameters: (K, p) of each state's robot.
-
-        Raises:
-            CannotSimulate, Diverged: naming the first point that cannot be followed.
-        """
-        from calib.simulation.loop import loop_kernels
-
-        q, v, gain = np.array(q), np.array(v), np.empty((q.shape[1], q.shape[1]))
-        order, entries, shares, owners, _ = self.layout
-        where = (order, entries, shares, owners, np.ascontiguousarray(parameters), q, v, tau, period, gain)
-        status, reached = loop_kernels.advance_points(*self.parts, *where)
-        if status != loop_kernels.FINE:
-            raise _failure(status, 0.0, f"point {reached}: ")
-        return q, v, gain
-
-    def linearised(
-        self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float, columns: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, v (n,) a period later, M⁻¹ (n, n), and slopes (2 n, 2 n + columns) by q, v and parameters."""
-        from calib.simulation.loop import loop_kernels, tangent_kernels
-
-        n = len(q)
-        q, v, gain = np.array(q), np.array(v), np.empty((n, n))
-        slopes = np.empty((2, n, 2 * n + columns))
-        args = (self.parts, self.layout, np.ascontiguousarray(parameters), q, v, tau, period, gain)
-        status = tangent_kernels.advance_linearised(*args, slopes[0], slopes[1])
-        if status != loop_kernels.FINE:
-            raise _failure(status, 0.0, "")
-        return q, v, gain, slopes.reshape(2 * n, -1)
 
 
 def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:
@@ -367,8 +253,8 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     return np.ascontiguousarray(solve_banded((1, 0), bands, np.sqrt(1.0 - pole**2) * white))
 
 
-def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return where each parameter goes in what `_packed` returns: order, entries, shares, owners of `loop_kernels`."""
+def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return where each parameter goes in what `packed` returns: order, entries, shares, owners of `loop_kernels`."""
     n, first = plant.bodies.n, plant.inertial
     order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
@@ -386,7 +272,7 @@ def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     return order, np.array(entries, dtype=np.int64).reshape(-1, 3), np.array(shares), np.array(owners, dtype=np.int64)
 
 
-def _packed(plant: Plant) -> Packed:
+def packed(plant: Plant) -> Packed:
     """Return tree, body, linear, kinds and acts as the kernels lay them out."""
     bodies, n = plant.bodies.count, plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
@@ -394,11 +280,11 @@ def _packed(plant: Plant) -> Packed:
     linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
     kinds = np.array([[row, code] for row, code, *_ in acts], dtype=np.int64).reshape(-1, 2)
     values = np.array([[amount, *settings, *weights] for _, _, amount, settings, weights in acts])
-    body = _body(plant.bodies, plant.parameters[: 10 * bodies])
+    body = body_rows(plant.bodies, plant.parameters[: 10 * bodies])
     return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 8 + n)
 
 
-def _body(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
+def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return placements and parameters between frames turned so that each joint moves about or along z."""
     result = np.zeros((bodies.count + 1, 23))
     result[-1, :3] = -bodies.gravity
@@ -432,7 +318,7 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
     return linear, acts
 
 
-def _failure(status: int, time: float, where: str | None = None) -> NotConverged:
+def failure(status: int, time: float, where: str | None = None) -> NotConverged:
     """Return what went wrong at `time` [s], or `where`."""
     from calib.simulation.loop import loop_kernels
 
@@ -448,4 +334,4 @@ def _failure(status: int, time: float, where: str | None = None) -> NotConverged
             f"{loop_kernels.MOST} steps: "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
-    return Diverged(f"the loop diverged at {time:.4g} s: {_LOWER}", None)
+    return Diverged(f"the loop diverged at {time:.4g} s: {LOWER}", None)

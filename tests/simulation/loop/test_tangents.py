@@ -12,8 +12,9 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.errors import CalibError, NotConverged
 from calib.rooms.cells import known_robots
+from calib.rooms.studies.methods.tangents import simulate_tangents
 from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate, simulate_tangents
+from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
 RATE = 1000.0
 SHAPES = [

@@ -30,7 +30,8 @@ from calib.identification.methods.method import EstimateStatus, IdentificationPr
 from calib.identification.rows import segments
 from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, start_of
 from calib.rooms.studies.methods.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
-from calib.simulation.loop.closed_loop import Stepper, forward_dynamics
+from calib.rooms.studies.methods.tangents import Stepper, stepper
+from calib.simulation.loop.closed_loop import forward_dynamics
 
 FASTER = 4.0  # times the positions' cut-off: rate of the filter, at least
 WIDE = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
@@ -144,7 +145,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     if part.stop - part.start <= 2 * thin:
         return before
     columns, p = before.robot.columns, len(before.mean)
-    made = before.robot.at(before.mean, case).stepper(columns)
+    made = stepper(before.robot.at(before.mean, case), columns)
     there = before.robot.carried(case)[columns]
     seen = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
     period = thin / motion.rate

@@ -5,7 +5,7 @@
 
 q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
 Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
-∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`calib.simulation.loop.tangent_kernels`)
+∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`)
 where differences take one simulation per parameter. What is left is what noise did in the loop, correlated over time;
 the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`calib.estimation.correlated`).
 
@@ -31,7 +31,8 @@ from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import thinned
 from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, serial_arm, start_of
-from calib.simulation.loop.closed_loop import Sensing, simulate, simulate_tangents
+from calib.rooms.studies.methods.tangents import simulate_tangents
+from calib.simulation.loop.closed_loop import Sensing, simulate
 
 ROUNDS = 3  # of weighing joints by what the last estimate leaves
 LIMIT = 25  # simulations with tangents per round
