@@ -14,7 +14,7 @@ import csv
 import json
 import math
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -78,15 +78,21 @@ def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
         raise ValueError(f"{place}: {name}: {error}") from error
 
 
-def read_json(path: Path, advice: str = "make it again", kind: Any = dict) -> Any:
+def read_json(
+    path: Path, advice: str = "make it again", kind: Any = dict, current: Callable[[Any], Any] | None = None
+) -> Any:
     """Return what a JSON file of ours holds, as a value of `kind` (see `read_record`).
+
+    Args:
+        current: moves what an earlier version wrote to today's keys.
 
     Raises:
         UsageError: where the file is missing, damaged or of other content, with `advice`.
     """
     try:
-        return read_record(kind, json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return read_record(kind, content if current is None else current(content))
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise UsageError(f"{path} cannot be read ({error}); {advice}") from error
 
 
@@ -97,44 +103,53 @@ def read_lines(path: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class _Null:
-    """How pydantic reads a number or an array that JSON holds with null in place of NaN."""
+    """How pydantic reads a number, or an array of numbers, that JSON holds with null in place of `value`."""
 
+    value: float = math.nan
     array: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema
 
         if self.array:
-            return core_schema.no_info_plain_validator_function(frozen)
-        return core_schema.no_info_before_validator_function(lambda x: math.nan if x is None else x, handler(source))
+            return core_schema.no_info_plain_validator_function(self._filled)
+        return core_schema.no_info_before_validator_function(lambda x: self.value if x is None else x, handler(source))
+
+    def _filled(self, found: Any) -> np.ndarray:
+        values = np.array(found, dtype=float)
+        return frozen(np.where(np.isnan(values), self.value, values))
 
 
 Number = Annotated[float, _Null()]
 """A number of a record that may be NaN or infinite; null in JSON, and NaN when read back."""
 Array = Annotated[np.ndarray, _Null(array=True)]
 """An array of numbers of a record, any of which may be NaN; nested lists in JSON, read-only when read back."""
+Unbounded = Annotated[np.ndarray, _Null(math.inf, array=True)]
+"""An array of limits, infinite where there is none: null in JSON."""
 
 
 class stored(property):
     """A property of a record that `plain` writes beside the fields; it is not read back, but computed again."""
 
 
-def plain(value: Any) -> Any:
-    """Return a record, or anything made of records, arrays, mappings and lists, as JSON holds it."""
+def plain(value: Any, null: bool = False) -> Any:
+    """Return a record, or anything made of records, arrays, mappings and lists, as JSON holds it.
+
+    Args:
+        null: whether null stands for a number that is not finite; of an array it does.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        return {name: _or_null(getattr(value, name), null) for name, null in _keys(type(value)).items()}
+        return {name: plain(getattr(value, name), own) for name, own in _keys(type(value)).items()}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item, null) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         lost = ~np.isfinite(value) if value.dtype.kind == "f" else False
         return np.ma.masked_array(value, lost).tolist()
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
+        return [plain(item, null) for item in value]
+    if isinstance(value, float) and null and not math.isfinite(value):
+        return None
     return value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
-
-
-def _or_null(value: Any, null: bool) -> Any:
-    return None if null and isinstance(value, float) and not math.isfinite(value) else plain(value)
 
 
 @cache
@@ -142,8 +157,13 @@ def _keys(kind: type) -> dict[str, bool]:
     """Return the names of a record's fields and stored properties, and whether null stands for NaN there."""
     hints = get_type_hints(kind, include_extras=True)
     computed = [name for one in kind.__mro__ for name, item in vars(one).items() if isinstance(item, stored)]
-    numbers = {one.name: _Null() in getattr(hints[one.name], "__metadata__", ()) for one in fields(kind)}
-    return numbers | dict.fromkeys(computed, True)
+    return {one.name: _nullable(hints[one.name]) for one in fields(kind)} | dict.fromkeys(computed, True)
+
+
+def _nullable(hint: Any) -> bool:
+    return any(isinstance(one, _Null) for one in getattr(hint, "__metadata__", ())) or any(
+        _nullable(one) for one in get_args(hint)
+    )
 
 
 def read_record(kind: type[T], content: Any, place: str = "") -> T:

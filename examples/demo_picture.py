@@ -14,10 +14,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.report.style import AFTER, BEFORE, QUIET, WIDE, legend, log_axis, sheet, styled
 from calib.procedure.session.folder import Session
-from calib.records import read_record
 from calib.rooms.cells import demo
 
 PICTURE = Path(__file__).with_name("demo.png")
@@ -51,7 +49,7 @@ def run(folder: Path) -> tuple[demo.DemoResult, dict[str, float]]:
     truth = json.loads(session.path("truth.json").read_text(encoding="utf-8"))
     (unseen,) = _read(session.validation.path / "metrics.json")["validation"].values()
     arms = {name: unseen[name]["position_mm"]["rms"] for name in ("nominal", "calibrated", "urdf_alone")}
-    (torques,) = _unseen(session).proofs.values()
+    (torques,) = session.identification.unseen.read().proofs.values()
     return found, {
         **{f"{name}_mm": value for name, value in arms.items()},
         "poses": unseen["poses"],
@@ -90,7 +88,7 @@ def draw(session: Session, verdict: str, figures: dict[str, float]) -> None:
     report = _read(session.validation.path / "report.json")
     (rows,) = (one for one in report["sets"] if one["unseen"])
     before, after = (1e3 * np.sort(rows[arm]["position"]) for arm in ("nominal", "calibrated"))
-    unseen = _unseen(session)
+    unseen = session.identification.unseen.read()
     curves = unseen.curves[0]
     t, measured, predicted = (np.array(each, dtype=float).T for each in (curves.t, curves.measured, curves.predicted))
     row = int(np.argmax(np.linalg.norm(measured, axis=0)))
@@ -112,10 +110,6 @@ def draw(session: Session, verdict: str, figures: dict[str, float]) -> None:
         torque.set_title(f"Dynamics: {figures['unexplained_percent']:.1f} % of torque unexplained")
         legend(figure, torque, f"calib demo, a simulated KUKA LWR4+; verdict: {verdict}")
         figure.savefig(PICTURE, dpi=130, metadata={"figures": json.dumps(figures)})
-
-
-def _unseen(session: Session) -> UnseenReport:
-    return read_record(UnseenReport, _read(session.identification.path / "unseen/report.json"))
 
 
 def _read(path: Path) -> dict:

@@ -18,9 +18,10 @@ from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.identification.methods.method import MethodEntry
 from calib.identification.methods.registry import LISTING
-from calib.procedure.dynamic_stage import folder, identify, inputs, metric_tables
+from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.findings import Verdict
 from calib.procedure.robot_kinds import Mechanism, stage_of
+from calib.records import plain
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
@@ -71,7 +72,7 @@ class DynamicsModel:
         Raises:
             UsageError: for a model of too short a recording to learn errors from.
         """
-        expected = self.outcome.findings.errors
+        expected = self.outcome.errors
         if expected is None:
             raise UsageError("too little was recorded to say what errors the torques have: record longer")
         return expected.sigma(self.outcome.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
@@ -92,11 +93,11 @@ class DynamicsModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return metric_tables.metrics(self.outcome)
+        return plain(metrics.metrics(self.outcome))
 
     def to_dataframe(self) -> Any:
         """Return the base parameters as a pandas DataFrame: name, unit, value, sigma; NaN where a constraint holds."""
-        found, held = self.estimate, metric_tables.on_bounds(self.outcome.found)
+        found, held = self.estimate, metrics.on_bounds(self.outcome.found)
         sigma = np.where(np.isin(self.outcome.found.names, held), np.nan, found.sigma)
         rows = zip(found.names, found.units, found.values.tolist(), sigma.tolist())
         return data_frame(rows, ["name", "unit", "value", "sigma"])

@@ -12,6 +12,7 @@ from scipy.special import fdtrc
 from calib.errors import Unidentifiable, require
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles
+from calib.records import Number
 
 
 class Rule(Enum):
@@ -41,12 +42,12 @@ class EliminationStep:
     """
 
     name: str
-    rsd: float
-    ratio: float
-    f: float
-    p: float
-    f_total: float
-    p_total: float
+    rsd: Number
+    ratio: Number
+    f: Number
+    p: Number
+    f_total: Number
+    p_total: Number
     residual_std: float
     listed: bool
 

@@ -31,6 +31,7 @@ from calib.estimation.triangles import (
     retriangulate,
     solve_triangle,
 )
+from calib.records import Number, stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +70,14 @@ class ExogeneityTest:
         p: probability of a larger statistic if the claim is true.
     """
 
-    statistic: float
-    degrees: tuple[int, int]
+    statistic: Number
+    degrees: tuple[float, float]
     p: float
+
+    @stored
+    def least_squares_biased(self) -> bool:
+        """Whether least squares is refuted at the level of `biased`."""
+        return self.biased()
 
     def biased(self, level: float = 0.01) -> bool:
         """Say whether least squares is refuted at this level: use IV."""

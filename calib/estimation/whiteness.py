@@ -9,6 +9,7 @@ from scipy.special import chdtrc
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError
+from calib.records import Array, Number
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,15 +25,15 @@ class Whiteness:
         normal_p: probability under the normal law, D'Agostino & Pearson (1973); it assumes independent residuals.
     """
 
-    acf: np.ndarray
-    pacf: np.ndarray
-    bound: float
+    acf: Array
+    pacf: Array
+    bound: Number
     outside: float
-    ljung_box: float
-    ljung_box_p: float
-    skewness: float
-    kurtosis: float
-    normal_p: float
+    ljung_box: Number
+    ljung_box_p: Number
+    skewness: Number
+    kurtosis: Number
+    normal_p: Number
 
 
 def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:

@@ -25,6 +25,7 @@ from calib.arrays import frozen
 from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.rows import pool
+from calib.records import Array
 
 ROUNDS = 60
 EXACT = 1e-9  # sigma of a gain that is set, of it: rounding
@@ -67,6 +68,37 @@ class DriveGains:
             "not told" if j in self.own else "reference" if sigma[j] < EXACT * self.gains[j] else "told"
             for j in range(len(self.gains))
         )
+
+
+@dataclass(frozen=True, eq=False)
+class GainRecord:
+    """Drive gains as files store them, by joint: torque = gain · current.
+
+    Attributes:
+        values: (n,); NaN where the motion does not identify it: that joint's torque is in amperes of its own.
+        sigma: (n,); NaN of the reference and where it is not identified.
+        told: see `DriveGains.told`.
+        covariance: (n, n).
+        unit, scale: of the gains, and what fixed it.
+        not_told: joints, from 1, whose gain is not identified.
+    """
+
+    values: Array
+    sigma: Array
+    told: tuple[str, ...]
+    covariance: Array
+    unit: str
+    scale: str
+    not_told: tuple[int, ...]
+
+    @classmethod
+    def of(cls, found: DriveGains, unit: str) -> GainRecord:
+        """Return the record of gains; `unit`: of the torques."""
+        told = np.array(found.told)
+        return cls(
+            np.where(told == "not told", np.nan, found.gains), np.where(told == "told", found.sigma, np.nan),
+            found.told, found.covariance, f"{unit} per A", found.scale, tuple(joint + 1 for joint in found.own),
+        )  # fmt: skip
 
 
 def identify_gains(

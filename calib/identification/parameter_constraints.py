@@ -29,6 +29,7 @@ from calib.estimation.convex.constraint_relations import contradicting, restrict
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
 from calib.identification.body_cone import BodyCone, cone_of
+from calib.records import Number
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 LEAST = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
@@ -181,10 +182,10 @@ class Binding:
     """
 
     name: str
-    multiplier: float
-    free: float
-    sigma: float
-    bound: float
+    multiplier: Number
+    free: Number
+    sigma: Number
+    bound: Number
     equality: bool
 
 

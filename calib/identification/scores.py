@@ -11,6 +11,20 @@ from calib.data.signals.motion import moving
 from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.cases import Case
 from calib.identification.rows import segments
+from calib.records import Array, Number
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeErrors:
+    """Relative errors of predicted torques [%].
+
+    Attributes:
+        total: 100 ‖τ - τ̂‖_F / ‖τ‖_F over all rows and samples.
+        joints: (rows,) 100 ‖τ_j - τ̂_j‖ / ‖τ_j‖; NaN where nothing was measured.
+    """
+
+    total: Number
+    joints: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,43 +32,75 @@ class PredictionErrors:
     """Errors on one set of samples.
 
     Attributes:
-        total: 100 ‖τ - τ̂‖_F / ‖τ‖_F over all rows and samples [%].
-        joints: (rows,) 100 ‖τ_j - τ̂_j‖ / ‖τ_j‖ [%]; NaN where nothing was measured.
+        relative_error_percent: of all rows, and of each.
         rms: (rows,) of τ - τ̂ in the torque's unit.
         samples: how many rows it rests on, in all.
     """
 
-    total: float
-    joints: np.ndarray
-    rms: np.ndarray
+    relative_error_percent: RelativeErrors
+    rms: Array
+    samples: int = 0
+
+    @property
+    def total(self) -> float:
+        """Relative error of all rows [%]."""
+        return self.relative_error_percent.total
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Relative error of each row (rows,) [%]."""
+        return self.relative_error_percent.joints
+
+
+@dataclass(frozen=True, eq=False)
+class IntervalCoverage:
+    """Share of the errors within the 95 % intervals that a model states, and where it extrapolates.
+
+    Attributes:
+        coverage_percent, joints_percent: of all rows, and of each (rows,).
+        median: (rows,) half width of the intervals in the torque's unit.
+        samples: at which this was judged.
+        extrapolated_percent: of these samples, how many lie outside the training range.
+        extrapolates: in words how the motion leaves the training range.
+    """
+
+    coverage_percent: float
+    joints_percent: Array
+    median: Array
     samples: int
+    extrapolated_percent: float
+    extrapolates: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """One case, predicted.
+    """One case, predicted: a record of ``metrics.json``.
 
     Attributes:
         raw: against the torque as recorded, at the full rate.
         filtered: both sides low-passed to the identification band, at the full rate.
         moving, standing: rows of joints that move, or stand, against the torque as recorded.
-        above: (rows,) share of the torque that lies above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]: noise,
-            ripple, elasticity; a floor for `raw` of any model whose prediction stays in the band.
+        above_band_percent: (rows,) share of the torque above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]:
+            noise, ripple, elasticity; a floor for `raw` of any model whose prediction stays in the band.
         r_squared: (rows,) of the raw torque.
         whiteness: of the residuals below the band, per row; None for series too short to say.
         rate: of the series whose whiteness was looked at: thinned to its band [Hz].
         motion_share: part of the rows that move; where it is small, little but friction at rest was tested.
+        evidence: False for a repeat of the training motion.
+        interval95: of errors of unseen torques; None where the model states no intervals.
     """
 
     raw: PredictionErrors
     filtered: PredictionErrors
     moving: PredictionErrors
     standing: PredictionErrors
-    above: np.ndarray
-    r_squared: np.ndarray
+    above_band_percent: Array
+    r_squared: Array
     whiteness: tuple[Whiteness | None, ...]
-    rate: float
+    rate: Number
     motion_share: float
+    evidence: bool = True
+    interval95: IntervalCoverage | None = None
 
 
 def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: int = 10) -> float:
@@ -150,9 +196,8 @@ def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErr
         joints = 100.0 * np.sqrt(square / size)
         rms = np.sqrt(square / count)
         total = float(100.0 * np.sqrt(square[alike].sum() / size[alike].sum()))
-    return PredictionErrors(
-        total, np.where(size > 0.0, joints, np.nan), np.where(count > 0, rms, np.nan), int(count.sum())
-    )
+    relative = RelativeErrors(total, np.where(size > 0.0, joints, np.nan))
+    return PredictionErrors(relative, np.where(count > 0, rms, np.nan), int(count.sum()))
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:

@@ -161,7 +161,7 @@ def check_reachable(
     buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - TOUCH)))
     if not len(buried):
         return
-    shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried), 3)
+    shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)
     raise RobotError(
         f"in each of {len(distances)} random postures there is {shown}: nothing keeps clear of that. Sizes and "
         "places are in m (or say \"20 mm\"), in the arm's base frame, which may lie above the floor; an obstacle's xyz "

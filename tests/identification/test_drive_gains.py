@@ -7,8 +7,8 @@ import pytest
 
 from calib.errors import NotConverged
 from calib.identification import gains
-from calib.identification.gains import DriveGains
-from calib.procedure.dynamic_stage.metric_tables import gain_table
+from calib.identification.gains import DriveGains, GainRecord
+from calib.records import plain
 
 
 def found(values: list[float], sigma: list[float], own: tuple[int, ...] = ()) -> DriveGains:
@@ -17,8 +17,7 @@ def found(values: list[float], sigma: list[float], own: tuple[int, ...] = ()) ->
 
 
 def test_a_gain_that_is_not_told_is_empty():
-    table = gain_table(found([1.2, 1.0, 1.0], [0.1, 1e-16, 0.0], (2,)), "A of joint 2")
-    assert table is not None
+    table = plain(GainRecord.of(found([1.2, 1.0, 1.0], [0.1, 1e-16, 0.0], (2,)), "A of joint 2"))
     assert (table["values"], table["told"]) == ([1.2, 1.0, None], ["told", "reference", "not told"])
     assert (table["sigma"], table["not_told"]) == ([pytest.approx(0.1), None, None], [3])
 

@@ -28,8 +28,8 @@ def test_friction_with_memory_and_cables_of_a_simulated_arm() -> None:
     given = gather(as_calibrated(arm.chain), [log], options=parse_options({"rows": "both"}))
     found = identify(given.robot, given.cases, given.options.settings)
     steps = {step.model: step for step in found.friction.steps}
-    assert steps["+ presliding"].kept_at == tuple(range(7)) and len(steps["+ cable"].kept_at) >= 4
-    assert steps["+ cable"].cross_validated < 0.4 * steps["standard"].cross_validated
+    assert steps["+ presliding"].kept_at_joints == tuple(range(1, 8)) and len(steps["+ cable"].kept_at_joints) >= 4
+    assert steps["+ cable"].cross_validated_percent < 0.4 * steps["standard"].cross_validated_percent
     estimate, true = found.fitted.estimate, true_base(found.dynamics.model, cell, arm, 0)
     rows = zip((name.removesuffix("R") for name in found.names), estimate.values, estimate.sigma)
     apart = [(value - true[name]) / sigma for name, value, sigma in rows if name in true and sigma > 1e-9]

@@ -61,7 +61,7 @@ def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
     values = {one.name: size for one in terms}
     found = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)])
     rungs = {rung.model: rung for rung in found.friction.steps if rung.kept}
-    assert f"+ {name}" in rungs and rungs[f"+ {name}"].kept_at == (1,)
+    assert f"+ {name}" in rungs and rungs[f"+ {name}"].kept_at_joints == (2,)
     other = planted.case("b", 1, terms=terms, values=values)
     plain = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)], PLAIN)
     one, two = (score(other, predict(model.dynamics, other)).filtered.total for model in (plain, found))

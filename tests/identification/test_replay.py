@@ -79,14 +79,14 @@ def test_a_model_of_no_possible_robot_is_replayed_with_inertia_added_and_that_to
     dynamics = Dynamics(planted.model(), values)
     predicted = predict(dynamics, case)
     found = replays.replay(planted.arm(), dynamics, case, predicted, PD)
-    assert found.added[2] > 0.0
+    assert found.inertia_added[2] > 0.0
     motion = case.motion
     start = round(motion.t[0] * 1000)
     followed = references.Reference(motion.t, motion.q, motion.v, motion.a)
     true = replayed_error(plant(), PD, followed, predicted, push[start : start + len(motion)])
     np.testing.assert_allclose(found.rms[replays.IDENTIFIED], true, rtol=0.33)
     sound = replays.replay(planted.arm(), Dynamics(planted.model(), planted.truth()), case, predicted, PD)
-    assert not sound.added.any()
+    assert not sound.inertia_added.any()
 
 
 def test_the_command_reports_it(robot, tmp_path, capsys):
@@ -94,18 +94,18 @@ def test_the_command_reports_it(robot, tmp_path, capsys):
     out = tmp_path / "out"
     assert run("identify", robot, train, "--validate", other, "--out", out, "--friction", "standard") == 0
     said = json.loads((out / "metrics.json").read_text())["tracking"]["other.npz"]
-    assert said["unseen"] and not said["controller"]["stated"] and said["feedback_over_model"] > 5.0
+    assert said["unseen"] and not said["stated"] and said["feedback_over_model"] > 5.0
     assert set(said["rms"]) == {"feedback", "cad", "model", "floor"} and len(said["rms"]["model"]) == 3
     assert np.all(np.array(said["rms"]["model"]) < 0.5 * np.array(said["rms"]["cad"]))
     assert "divides the tracking error by" in capsys.readouterr().out
 
 
 def test_no_ratio_is_told_of_a_model_that_is_no_possible_robot():
-    from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
     from calib.procedure.report.dynamics_section import tracking_blocks
 
     def said(*added: float) -> str:
-        replay = ReplayMetrics({"feedback": (1e-3, 1e-3)}, 13.4, True, ReplayController(), added)
+        rms = {"feedback": np.full(2, 13.4e-3), "model": np.full(2, 1e-3)}
+        replay = replays.Replay("log", 1.0, None, False, (), np.array(added), rms, unseen=True)
         return " ".join(tracking_blocks({"log": replay})[1].lines)
 
     assert "divides the tracking error by 13.4" in said(0.0, 0.0)

@@ -29,6 +29,7 @@ from calib.identification.cases import Case
 from calib.identification.left_out.regimes import regimes
 from calib.identification.left_out.time_folds import CrossValidation
 from calib.identification.rows import ObservationRows, observe_terms, triangulate
+from calib.records import Number, stored
 
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
@@ -49,24 +50,25 @@ class FrictionTrial:
     Attributes:
         model: e.g. ``standard`` or ``+ load``.
         parameters: of the model, all joints.
-        cross_validated: relative error on unseen time, total over all rows [%].
-        joints: the same for each row [%].
-        kept_at: joints, from 0, where it stays.
+        cross_validated_percent: relative error on unseen time, total over all rows [%].
+        joints_percent: the same for each row [%].
+        kept_at_joints: joints, from 1, where it stays.
         note: in words.
         terms: names of those that stay.
     """
 
     model: str
     parameters: int
-    cross_validated: float
-    joints: tuple[float, ...]
-    kept_at: tuple[int, ...]
+    cross_validated_percent: Number
+    joints_percent: tuple[Number, ...]
+    kept_at_joints: tuple[int, ...]
     note: str = ""
     terms: tuple[str, ...] = ()
 
-    @property
+    @stored
     def kept(self) -> bool:
-        return bool(self.kept_at) or self.model == "standard"
+        """Whether it is part of the model."""
+        return bool(self.kept_at_joints) or self.model == "standard"
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +91,9 @@ class FrictionSelection:
         joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
         steps = []
         for step in self.steps:
-            left = _flat([joints[name] for name in step.terms if name in joints])
-            if step.terms and left != step.kept_at:
-                step = replace(step, kept_at=left, note="" if left else "switched off by the fit of all steps")
+            left = tuple(1 + joint for joint in _flat([joints[name] for name in step.terms if name in joints]))
+            if step.terms and left != step.kept_at_joints:
+                step = replace(step, kept_at_joints=left, note="" if left else "switched off by the fit of all steps")
             steps.append(step)
         return replace(self, steps=tuple(steps), off=off)
 
@@ -390,4 +392,5 @@ def _step(
         joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
     alike = np.setdiff1d(np.arange(len(size)), apart)
     total = float(100.0 * np.sqrt(error[:, alike].sum() / size[alike].sum()))
-    return FrictionTrial(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note, terms)
+    percent = tuple(float(x) for x in np.nan_to_num(joints))
+    return FrictionTrial(name, parameters, total, percent, tuple(1 + joint for joint in at), note, terms)

@@ -53,6 +53,23 @@ START = 0.5  # [s] left out at the beginning, where robots start
 Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
 
 
+@dataclass(frozen=True)
+class GearWave:
+    """A wave of the ripple: its order per turn of a gear, which is named by its joint, from 1."""
+
+    gear: int
+    order_per_turn: float
+
+
+@dataclass(frozen=True)
+class RippleWaves:
+    """Ripple found at a joint, from 1, and the share of the fast residual's power that it explains, held out."""
+
+    joint: int
+    waves: tuple[GearWave, ...]
+    explained_share_on_unseen_blocks: float
+
+
 @dataclass(frozen=True, eq=False)
 class Ripple:
     """The ripple in one joint's torque.
@@ -69,6 +86,11 @@ class Ripple:
     terms: tuple[DriveTerm, ...]
     values: np.ndarray
     share: float
+
+    @property
+    def found(self) -> RippleWaves:
+        """Its waves and what they explain, as a record."""
+        return RippleWaves(self.joint + 1, tuple(GearWave(j + 1, order) for j, order in self.waves), self.share)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,7 @@ from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import periods_per_sample, take
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import segments
+from calib.records import Array, stored
 from calib.robot.chain import Chain
 from calib.simulation.loop.closed_loop import Plant
 from calib.simulation.loop.controllers import Controller, pd
@@ -48,37 +49,34 @@ LONGEST = 20.0  # [s] of a recording that are replayed
 MARGIN = 0.05  # least eigenvalue of a possible robot's inertia, scaled by its diagonal
 SOFT = 0.25  # least smoothing of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MARGIN` is 0.11
 LEAST = 1e-3  # [kg m² or kg] least inertia of a joint
-FEEDBACK, CAD, IDENTIFIED, FLOOR = (
-    "feedback alone",
-    "CAD fed forward",
-    "model fed forward",
-    "measured torque fed forward",
-)
+FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """How far the simulated robot strays from a recorded motion.
+    """How far the simulated robot strays from a recorded motion; a record.
 
     Attributes:
         name: of the recording.
         seconds: that were replayed.
         controller: the feedback; `stated`: whether it is not the default.
-        left_out: terms of the model that the simulated robot does not have; what they explain is in the disturbance.
-        added: (n,) inertia that the simulated robot needed besides [kg m² or kg].
+        terms_left_out: of the model, which the simulated robot does not have; what they explain is in the disturbance.
+        inertia_added: (n,) that the simulated robot needed besides [kg m² or kg].
         rms: what is fed forward → (n,) rms of q - q_r [rad or m].
+        unseen: whether the model has not been fitted to this motion.
     """
 
     name: str
     seconds: float
-    controller: Controller
+    controller: Controller | None
     stated: bool
-    left_out: tuple[str, ...]
-    added: np.ndarray
-    rms: Mapping[str, np.ndarray]
+    terms_left_out: tuple[str, ...]
+    inertia_added: Array
+    rms: Mapping[str, Array]
+    unseen: bool = False
 
-    @property
-    def gain(self) -> float:
+    @stored
+    def feedback_over_model(self) -> float:
         """Error of feedback alone over that with the model fed forward; joints weigh by their own errors' ratio."""
         return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
 

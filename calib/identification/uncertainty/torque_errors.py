@@ -32,6 +32,7 @@ from calib.identification.identify import Identification, common_decimator
 from calib.identification.left_out import time_folds
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import pool, segmented_states, triangulate
+from calib.identification.scores import IntervalCoverage
 from calib.identification.uncertainty.torque_uncertainty import estimated_columns, parameter_variances
 
 COVERED, SIGMAS = 0.95, 1.96
@@ -163,6 +164,13 @@ class TorqueIntervals:
     def beyond(self) -> np.ndarray:
         """(M,) whether a sample extrapolates."""
         return np.asarray(self.extrapolated.any(axis=(0, 2)))
+
+    def coverage(self, joints: Sequence[str]) -> IntervalCoverage:
+        """Return the shares of errors inside, as a record; `joints`: their names."""
+        return IntervalCoverage(
+            100.0 * self.covered, 100.0 * self.joints, self.median, int(self.known.sum()),
+            100.0 * float(self.beyond.mean()), tuple(self.ways(joints)),
+        )  # fmt: skip
 
     def ways(self, joints: Sequence[str]) -> list[str]:
         """Say how the motion leaves what was learnt from: in which of q, v, a, and at which of the joints named."""

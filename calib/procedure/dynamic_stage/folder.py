@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from calib.dynamics.base import expressions
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
+from calib.identification.gains import GainRecord
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
@@ -24,14 +25,13 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import INSTRUMENTAL, write_instrumental
-from calib.procedure.dynamic_stage.metric_tables import StoredFindings, finite, gain_table, metrics, on_bounds, report
+from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
-from calib.records import read_json
+from calib.records import plain, read_json
 from calib.robot import calibrated
 from calib.units import per_ampere
 
-T = TypeVar("T")
 OURS = (
     calibrated.ROBOT, MODEL, ESTIMATE, COVARIANCE, information.INFORMATION, INSTRUMENTAL,
     METRICS, "drive_gains.csv",
@@ -42,25 +42,6 @@ OURS = (
 """Files of an earlier identification that a new one replaces."""
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
-
-
-@dataclass(frozen=True)
-class IdentificationMetrics:
-    """What ``metrics.json`` holds of the verdict; `findings` from version 0.2 on."""
-
-    verdict: str
-    reason: str
-    warnings: tuple[str, ...]
-    findings: StoredFindings | None = None
-
-
-@dataclass(frozen=True)
-class _StoredVerdict:
-    """What ``report.json`` of unseen motion says of the verdict."""
-
-    verdict: str
-    reason: str
-    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -103,22 +84,20 @@ class IdentificationFolder:
         """Read the model."""
         return read_dynamics(self.path)[1]
 
-    def metrics(self) -> IdentificationMetrics:
-        """Read the verdict and the findings."""
-        return _read(IdentificationMetrics, self.numbers)
+    def metrics(self) -> ModelMetrics:
+        """Read the record of the identification."""
+        return read_json(self.numbers, "identify again", ModelMetrics, with_current_keys)
 
     def findings(self) -> ModelFindings:
         """Read what is known of the model; an older folder says it in its warnings alone."""
         metrics = self.metrics()
-        if metrics.findings is None:
-            return ModelFindings(Resting(), metrics.warnings)
-        known, stated = metrics.findings.controller, metrics.findings.errors
+        return metrics.findings or ModelFindings(Resting(), metrics.warnings)
+
+    def errors(self) -> TorqueErrorModel | None:
+        """Read what errors the model's torques are expected to have; None where nobody could say."""
+        stated = self.findings().errors
         found = None if stated is None else read_uncertainty(self.path, self.dynamics(), ())
-        errors = stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
-        return ModelFindings(
-            metrics.findings.rests, metrics.findings.notes, known and known.controller(), errors,
-            metrics.findings.contradiction, metrics.findings.unlike,
-        )  # fmt: skip
+        return stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
 
 
 @dataclass(frozen=True)
@@ -137,15 +116,11 @@ class UnseenFolder:
         for number, case in enumerate(inputs.unseen, 1):
             predicted, expected = found.predictions[case.name], found.intervals.get(case.name)
             _write_torques(case, predicted, expected, self.path / f"torques_{number}.csv")
-        files.write_json(self.report, report(inputs, found))
+        files.write_json(self.report, UnseenReport.of(inputs, found))
 
-    def verdict(self) -> _StoredVerdict:
-        """Read what was judged."""
-        return _read(_StoredVerdict, self.report)
-
-
-def _read(kind: type[T], path: Path) -> T:
-    return read_json(path, "identify again", kind)
+    def read(self) -> UnseenReport:
+        """Read the report."""
+        return read_json(self.report, "identify again", UnseenReport, with_current_keys)
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -188,12 +163,12 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     first = (*inputs.unseen, *inputs.cases)[0]
     expected = outcome.assessment.intervals.get(first.name)
     _write_torques(first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
-    gains = gain_table(inputs.gains, inputs.unit)
+    gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
     table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gains}
     files.write_json(folder / MODEL, table)
     if gains is not None:
-        header = ("joint", f"gain [{gains['unit']}]", "sigma", "told")
-        rows = zip(inputs.chain.joint_names, gains["values"], gains["sigma"], gains["told"])
+        header = ("joint", f"gain [{gains.unit}]", "sigma", "told")
+        rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
         files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / METRICS, metrics(outcome))
 
@@ -254,8 +229,8 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
             per_ampere(unit, outcome.inputs.unit),
             float(value),
             None if name in off else float(sigma),
-            None if name in off else finite(rsd),
-            _number(essential.get(own)),
+            None if name in off else plain(float(rsd), null=True),
+            plain(essential.get(own)),
             None if name in off else float(noise),
             None if name in off else part,
         )
@@ -263,7 +238,3 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
             found.names, estimate.names, words, estimate.units, estimate.values, sigmas, relative, estimate.sigma, parts
         )
     ]
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None else float(value)

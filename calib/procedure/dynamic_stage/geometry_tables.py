@@ -17,8 +17,9 @@ Beside what every identification writes (``calib identify --out``)::
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +27,79 @@ from calib import files
 from calib.identification.uncertainty.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
 from calib.identification.uncertainty.two_geometries import GeometryComparison
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
-from calib.procedure.dynamic_stage.metrics import GeometricEffect, TwoGeometries
+from calib.records import Number
 
 EFFECTS, SENSITIVITY, GEOMETRIES = "geometry_effects.csv", "sensitivity.csv", "geometries.csv"
-LEAST = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque, that raises a σ by more than `NOTHING`
+MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque, that raises a σ by more than `NOTHING`
+
+
+@dataclass(frozen=True)
+class TiltEffect:
+    """The parameter that 1 mrad of the base's tilt moves most, and by how many of its sigmas of torque noise."""
+
+    parameter: str
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class ParameterChange:
+    """A parameter's change from the nominal to the calibrated geometry, in its total σ and in percent."""
+
+    name: str
+    sigmas: float
+    percent: Number
+
+
+@dataclass(frozen=True)
+class GeometryMetrics:
+    """What the geometry's uncertainty adds to the estimate; the entry ``geometry`` of ``metrics.json``.
+
+    Attributes:
+        propagated: whether the robot came with a covariance of its geometry.
+        summary: in a sentence.
+        changed, geometry_exceeds_torque: parameters whose σ it raises, and those where it exceeds the torques' part.
+        moved_by_1_mrad_of_tilt: what else a tilt of the base would move.
+        largest_growth_of_sigma: of any parameter, as a factor.
+        largest_changes_from_nominal: the five largest.
+    """
+
+    propagated: bool
+    summary: str
+    changed: tuple[str, ...]
+    moved_by_1_mrad_of_tilt: TiltEffect
+    geometry_exceeds_torque: tuple[str, ...] = ()
+    largest_growth_of_sigma: float = 1.0
+    largest_changes_from_nominal: tuple[ParameterChange, ...] = ()
+
+
+class TwoGeometries(NamedTuple):
+    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry."""
+
+    name: str
+    unit: str
+    nominal: float
+    sigma_nominal: float
+    calibrated: float
+    sigma_calibrated: float
+    relative_percent: float | None
+    sigma_difference: float
+    essential: str
+
+
+class GeometricEffect(NamedTuple):
+    """A row of ``geometry_effects.csv``: what one sigma of a geometric element does to the dynamics."""
+
+    rank: int
+    element: str
+    unit: str
+    sigma: float | None
+    matters: str
+    parameter: str
+    shift_sigma: float | None
+    parameters_moved: int | None
+    torque_rms: float | None
+    torque_rms_left: float | None
+    shift_sigma_per_milli: float
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
@@ -71,9 +141,9 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
         found.append(
             GeometricEffect(
                 rank, carried.elements[k], carried.units[k], float(sigma) if known else None,
-                ("yes" if shifts.max() > LEAST else "no") if known else "",
+                ("yes" if shifts.max() > MIN_SHIFT else "no") if known else "",
                 carried.names[worst] if per_unit[worst] > 0.0 else "",
-                float(shifts[worst]) if known else None, int((shifts > LEAST).sum()) if known else None,
+                float(shifts[worst]) if known else None, int((shifts > MIN_SHIFT).sum()) if known else None,
                 float(carried.felt[k] * sigma) if known else None, float(carried.left[k] * sigma) if known else None,
                 float(1e-3 * per_unit[worst]),
             )
@@ -103,21 +173,18 @@ def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
     return tuple(own[name] for name in found.elimination.essential.estimate.names)
 
 
-def metrics(carried: GeometryUncertainty | None, compared: GeometryComparison | None) -> dict[str, Any] | None:
-    """Return the entry ``geometry`` of ``metrics.json``."""
-    if carried is None:
-        return None
+def metrics(carried: GeometryUncertainty, compared: GeometryComparison | None) -> GeometryMetrics:
+    """Return the record of what the geometry's uncertainty adds to the estimate."""
     growth = carried.sigma / np.where(carried.sigma_torque > 0.0, carried.sigma_torque, 1.0)
-    return {
-        "propagated": carried.geometry is not None,
-        "summary": summary(carried),
-        "parameters": len(carried.names),
-        "changed": [name for name, yes in zip(carried.names, carried.changed) if yes],
-        "geometry_exceeds_torque": [name for name, yes in zip(carried.names, carried.dominated) if yes],
-        "moved_by_1_mrad_of_tilt": {"parameter": _tilt(carried)[0], "sigmas": _tilt(carried)[1]},
-        "largest_growth_of_sigma": float(growth.max(initial=1.0)),
-        "largest_changes_from_nominal": [] if compared is None else _largest(compared),
-    }
+    return GeometryMetrics(
+        carried.geometry is not None,
+        summary(carried),
+        tuple(name for name, yes in zip(carried.names, carried.changed) if yes),
+        _tilt(carried),
+        tuple(name for name, yes in zip(carried.names, carried.dominated) if yes),
+        float(growth.max(initial=1.0)),
+        () if compared is None else _largest(compared),
+    )
 
 
 def summary(carried: GeometryUncertainty) -> str:
@@ -136,11 +203,11 @@ def summary(carried: GeometryUncertainty) -> str:
     return f"the geometry's uncertainty raises {count} of {p} sigmas by more than {100 * NOTHING:g} %{more}{rest}"
 
 
-def _tilt(carried: GeometryUncertainty) -> tuple[str, float]:
+def _tilt(carried: GeometryUncertainty) -> TiltEffect:
     """Return which parameter 1 mrad of tilt of the base against gravity moves most, and by how many σ of torque."""
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))
-    return carried.names[worst], float(size[worst])
+    return TiltEffect(carried.names[worst], float(size[worst]))
 
 
 def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
@@ -149,14 +216,8 @@ def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
-def _largest(compared: GeometryComparison) -> list[dict[str, Any]]:
+def _largest(compared: GeometryComparison) -> tuple[ParameterChange, ...]:
     """Return the five parameters that differ most between the geometries, in their total σ, and by how much [%]."""
     size = (compared.values[0] - compared.values[1]) / np.where(compared.sigma[1] > 0.0, compared.sigma[1], np.inf)
-    return [
-        {
-            "name": compared.names[k],
-            "sigmas": float(size[k]),
-            "percent": float(compared.relative[k]) if np.isfinite(compared.relative[k]) else None,
-        }
-        for k in np.argsort(-np.abs(size))[:5]
-    ]
+    worst = np.argsort(-np.abs(size))[:5]
+    return tuple(ParameterChange(compared.names[k], float(size[k]), float(compared.relative[k])) for k in worst)

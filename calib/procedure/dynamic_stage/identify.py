@@ -13,7 +13,7 @@ from calib.identification.identify import Identification, identify
 from calib.identification.possible.contradiction import contradiction
 from calib.identification.scores import Score
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty, propagate
-from calib.identification.uncertainty.torque_errors import learn_torque_errors
+from calib.identification.uncertainty.torque_errors import TorqueErrorModel, learn_torque_errors
 from calib.identification.uncertainty.two_geometries import GeometryComparison, compare
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking
@@ -34,6 +34,7 @@ class IdentificationOutcome:
         assessment: the model beside the recordings, and the verdict.
         carried: what the geometry's uncertainty adds; None for an identification that was not asked for it.
         geometries: the estimate on the nominal geometry beside it; None where there is no other than the nominal.
+        errors: what errors the torques are expected to have; None where too little was recorded to say.
         seed: that reproduces it.
     """
 
@@ -43,6 +44,7 @@ class IdentificationOutcome:
     assessment: Assessment
     carried: GeometryUncertainty | None = None
     geometries: GeometryComparison | None = None
+    errors: TorqueErrorModel | None = None
     seed: int = 0
 
     @property
@@ -105,18 +107,20 @@ def judged(
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     loops = found.bias.loops
     say("errors on time left out")
+    errors = learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
         resting_parameters(found), model_warnings(inputs.cases, found, excitation),
-        None if loops is None else loops.controller, learn_torque_errors(found, inputs.cases, carried.covariance),
+        None if loops is None else loops.controller, errors and errors.discrepancy,
         contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.unlike,
     )  # fmt: skip
-    result = assess(inputs, found.dynamics, findings, wrong, progress=say)
-    return IdentificationOutcome(inputs, found, findings, result, carried, geometries, found.settings.seed)
+    result = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
+    return IdentificationOutcome(inputs, found, findings, result, carried, geometries, errors, found.settings.seed)
 
 
 def assessed(outcome: IdentificationOutcome, inputs: IdentificationInputs) -> IdentificationOutcome:
     """Return an outcome judged anew on the unseen recordings of `inputs`; nothing is identified."""
-    return replace(outcome, inputs=inputs, assessment=assess(inputs, outcome.found.dynamics, outcome.findings))
+    result = assess(inputs, outcome.found.dynamics, outcome.findings, outcome.errors)
+    return replace(outcome, inputs=inputs, assessment=result)
 
 
 def _carry(

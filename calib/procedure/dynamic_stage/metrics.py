@@ -1,82 +1,42 @@
-"""What ``metrics.json`` of an identification and ``unseen/report.json`` hold, as values."""
+"""The record of an identification, as console and certificate show it and ``metrics.json`` stores it (schema 3).
+
+Its fields are the keys of the file. Most are values of the mathematics, stored as they are typed. Until schema 3 the
+file had no number, and some keys another place: `with_current_keys` moves them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
-from calib.records import read_record
+import numpy as np
 
-Numbers = tuple[float | None, ...]
+from calib.data.signals.motion import Motion
+from calib.estimation.essential import EliminationStep
+from calib.identification.cases import Case
+from calib.identification.friction.friction_ladder import FrictionTrial
+from calib.identification.friction.ripple import RippleWaves
+from calib.identification.gains import GainRecord
+from calib.identification.identify import Identification
+from calib.identification.loop.replay import Replay
+from calib.identification.methods.registry import METHODS
+from calib.identification.parameter_constraints import Binding
+from calib.identification.scores import Score
+from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.loop_tables import LoopMetrics
+from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
+from calib.records import Array, Number
 
-
-@dataclass(frozen=True)
-class _RelativeErrors:
-    """100 ‖τ - τ̂‖ / ‖τ‖ over all rows, and of each [%]."""
-
-    total: float | None
-    joints: Numbers
-
-
-@dataclass(frozen=True)
-class _PredictionErrors:
-    """Errors on one set of samples; rms of each torque row in its unit."""
-
-    relative_error_percent: _RelativeErrors
-    rms: Numbers
-    samples: int = 0
-
-
-@dataclass(frozen=True)
-class _RowWhiteness:
-    """Of one row's residual: the share of its autocorrelations beyond the bounds of white noise."""
-
-    outside: float
+SCHEMA, UNSEEN_SCHEMA = 3, 2  # of metrics.json, and of unseen/report.json
+MAX_POINTS = 400  # samples per curve of the certificate (our choice)
 
 
 @dataclass(frozen=True)
-class TorqueCoverage:
-    """How many errors were within the 95 % interval that the model states, how wide that was, where it extrapolates.
-
-    Attributes:
-        coverage_percent: of all rows.
-        joints_percent, median: of each, and the half width of its interval in its unit.
-        samples: at which this was looked at.
-        extrapolated_percent: of them.
-        extrapolates: in words how the motion leaves what was learnt from.
-    """
-
-    coverage_percent: float
-    joints_percent: Numbers
-    median: Numbers
-    samples: int
-    extrapolated_percent: float
-    extrapolates: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class RecordingErrors:
-    """One recording, predicted; see `calib.identification.scores.Score`.
-
-    Attributes:
-        evidence: False for a repeat of the training motion.
-        interval95: how the errors that the model stated held here.
-    """
-
-    raw: _PredictionErrors
-    filtered: _PredictionErrors
-    moving: _PredictionErrors
-    standing: _PredictionErrors
-    above_band_percent: Numbers
-    whiteness: tuple[_RowWhiteness | None, ...]
-    evidence: bool = True
-    interval95: TorqueCoverage | None = None
-
-
-@dataclass(frozen=True)
-class _ParameterCounts:
-    """How many parameters the model has, the torques of any motion tell, and were kept."""
+class ParameterCounts:
+    """How many parameters the model has, are identifiable from any motion, and were kept."""
 
     standard: int
     base: int
@@ -84,7 +44,7 @@ class _ParameterCounts:
 
 
 @dataclass(frozen=True)
-class _ColumnCounts:
+class ColumnCounts:
     """Standard parameters without effect on any torque, and those regrouped into others."""
 
     without_effect: int
@@ -92,231 +52,213 @@ class _ColumnCounts:
 
 
 @dataclass(frozen=True)
-class _ConditionNumber:
+class ConditionNumber:
     """Of the observation matrix, in its units and with columns of unit norm."""
 
-    raw: float | None
-    normalised: float | None
+    raw: Number
+    normalised: Number
 
 
-@dataclass(frozen=True)
-class _FrictionStep:
-    """One friction model tried, with its error on time left out [%]."""
+@dataclass(frozen=True, eq=False)
+class FilterMetrics:
+    """Sampling rate, f_q and f_v by joint, identification band f_p [Hz], and the decimation to it."""
 
-    model: str
-    parameters: int
-    cross_validated_percent: float | None
-    joints_percent: Numbers
-    kept_at_joints: tuple[int, ...]
-    kept: bool
-    note: str = ""
+    rate: float
+    cutoff: Array
+    band: float
+    decimation: int
+    velocity_cutoff: Array | None = None  # of 0.1: the same
 
-
-@dataclass(frozen=True)
-class _GearWave:
-    """An order per turn of a gear's joint."""
-
-    gear: int
-    order_per_turn: float
+    @classmethod
+    def of(cls, motion: Motion) -> FilterMetrics:
+        """Return those of a motion."""
+        return cls(motion.rate, motion.cutoff, motion.band, motion.decimator.factor, motion.velocity_cutoff)
 
 
-@dataclass(frozen=True)
-class _TorqueRipple:
-    """Ripple found at a joint, counted from one."""
+@dataclass(frozen=True, eq=False)
+class ConstraintMetrics:
+    """All constraints of an estimate, those at their bounds, and in how many postures M(q) is at its bound."""
 
-    joint: int
-    waves: tuple[_GearWave, ...]
-    explained_share_on_unseen_blocks: float
-
-
-@dataclass(frozen=True)
-class _EliminatedParameter:
-    """A parameter that the data do not tell, with its RSD [%] when it went."""
-
-    name: str
-    rsd: float | None
+    names: tuple[str, ...]
+    binding: tuple[Binding, ...]
+    postures_binding: int
 
 
-@dataclass(frozen=True)
-class _DurbinWuHausman:
-    """The test of least squares against instrumental variables."""
-
-    f: float | None
-    degrees: tuple[float, ...]
-    p: float
-    least_squares_biased: bool
-
-
-@dataclass(frozen=True)
-class LoopMetrics:
-    """What instruments from a simulated loop say; see `calib.procedure.dynamic_stage.loop_tables`."""
-
-    failure: str = ""
-    notes: tuple[str, ...] = ()
-    instruments: str = ""
-    beside: bool = False
-    rounds: int = 0
-    durbin_wu_hausman: _DurbinWuHausman | None = None
-    largest_shift_sigma: float = 0.0
-    cragg_donald: float | None = None
-    instruments_weak: bool = False
-    least_partial_r2: float = 0.0
-    distance_percent: Numbers = ()
-    simulated_torque_error_percent: Numbers = ()
-    valid: bool = True
-    explains: bool = True
-
-
-@dataclass(frozen=True)
-class ReplayController:
-    """Whether the controller of a replay was stated."""
-
-    stated: bool = False
-
-
-@dataclass(frozen=True)
-class ReplayMetrics:
-    """A recording replayed by the simulated robot: rms of q - reference by what is fed forward [rad or m]."""
-
-    rms: Mapping[str, Numbers]
-    feedback_over_model: float
-    unseen: bool
-    controller: ReplayController
-    inertia_added: Numbers
-
-
-@dataclass(frozen=True)
-class _TiltEffect:
-    """The parameter that 1 mrad of the base's tilt moves most, and by how many of its sigmas of torque noise."""
-
-    parameter: str
-    sigmas: float
-
-
-@dataclass(frozen=True)
-class _GeometryMetrics:
-    """What the geometry's uncertainty adds to the estimate."""
-
-    propagated: bool
-    summary: str
-    changed: tuple[str, ...]
-    moved_by_1_mrad_of_tilt: _TiltEffect
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ModelMetrics:
-    """The content of ``metrics.json``; see `calib.procedure.dynamic_stage.folder`."""
+    """The content of ``metrics.json``; see `calib.identification.model_file`."""
 
-    identification: Mapping[str, RecordingErrors]
-    validation: Mapping[str, RecordingErrors]
-    parameters: _ParameterCounts
-    counts: _ColumnCounts
+    identification: Mapping[str, Score]
+    validation: Mapping[str, Score]
+    parameters: ParameterCounts
+    counts: ColumnCounts
     rows: tuple[str, ...]
-    condition_number: _ConditionNumber
+    condition_number: ConditionNumber
     friction: str
     method: str
     method_assumes: str
-    ladder: tuple[_FrictionStep, ...]
-    ripple: tuple[_TorqueRipple, ...]
-    elimination: tuple[_EliminatedParameter, ...]
+    ladder: tuple[FrictionTrial, ...]
+    ripple: tuple[RippleWaves, ...]
+    elimination: tuple[EliminationStep, ...]
     warnings: tuple[str, ...]
     verdict: str
     reason: str
     unit: str = "N m"
+    switched_off: tuple[str, ...] = ()
+    drive_gains: GainRecord | None = None
     loop: LoopMetrics | None = None
-    tracking: Mapping[str, ReplayMetrics] = field(default_factory=dict)
+    constraints: ConstraintMetrics | None = None
+    tracking: Mapping[str, Replay] = field(default_factory=dict)
     tracking_failure: str = ""
-    geometry: _GeometryMetrics | None = None
+    filters: Mapping[str, FilterMetrics] = field(default_factory=dict)
+    geometry: geometry_tables.GeometryMetrics | None = None
     repeated: Mapping[str, float] = field(default_factory=dict)
+    findings: ModelFindings | None = None
+    seed: int = 0
+    schema: int = SCHEMA
 
 
-def model_metrics(content: Mapping[str, Any]) -> ModelMetrics:
-    """Return the content of ``metrics.json`` as values; where tracking failed, the reason stands in its place there.
+def on_bounds(found: Identification) -> tuple[str, ...]:
+    """Return parameters that a constraint holds where they are: the data do not tell them, and have no σ of them.
 
-    Raises:
-        ValueError: where it is none.
+    The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
     """
-    tracking = content.get("tracking") or {}
-    failure = tracking.get("failure", "")
-    parts = {"tracking": {} if failure else tracking, "tracking_failure": failure}
-    return read_record(ModelMetrics, {**content, **parts})
+    if found.fitted.held is None:
+        return ()
+    free = found.fitted.held.free.estimate.sigma
+    return tuple(name for name, own, data in zip(found.names, found.fitted.estimate.sigma, free) if own <= 1e-9 * data)
 
 
-@dataclass(frozen=True)
-class _TorqueCurves:
-    """Measured and predicted torques of one recording, per row, thinned for drawing; times [s]."""
+def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
+    """Return the record of an identification."""
+    found, inputs, held = outcome.found, outcome.inputs, outcome.found.fitted.held
+    base, count = found.base, found.base.b + len(found.friction.terms)
+    return ModelMetrics(
+        outcome.fit,
+        outcome.validation,
+        ParameterCounts(
+            len(base.standard), count, count if found.elimination is None else len(found.elimination.kept)
+        ),
+        ColumnCounts(len(base.without_effect), len(base.regrouped)),
+        found.settings.torque_rows.numbered(inputs.chain.n),
+        ConditionNumber(*found.condition),
+        found.friction.chosen,
+        found.fitted.method,
+        METHODS[found.fitted.method].assumes,
+        found.friction.steps,
+        tuple(one.found for one in found.ripples),
+        () if found.elimination is None else found.elimination.steps,
+        outcome.warnings,
+        outcome.verdict.level,
+        outcome.verdict.reason,
+        inputs.unit,
+        found.friction.off,
+        inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
+        LoopMetrics.of(found.bias, found.fitted.instrumental is None),
+        held and ConstraintMetrics(held.names, held.binding, held.postures),
+        {one.name: one for one in outcome.tracking.replays},
+        outcome.tracking.failure,
+        {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
+        outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
+        outcome.repeated,
+        outcome.findings,
+        outcome.seed,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueCurves:
+    """Measured and predicted torques of one recording, (rows, K) each, thinned for drawing; times [s]."""
 
     name: str
-    t: tuple[float, ...]
-    measured: tuple[tuple[float, ...], ...]
-    predicted: tuple[tuple[float, ...], ...]
+    t: Array
+    measured: Array
+    predicted: Array
+
+    @classmethod
+    def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
+        """Return them of a case and its prediction (N, rows)."""
+        picked = np.unique(np.linspace(0, len(case.target) - 1, MAX_POINTS).astype(int))
+        shown = (np.asarray(x)[picked].T for x in (case.target, predicted))
+        return cls(case.name, np.round(case.motion.t[picked], 4), *(_five_digits(x) for x in shown))
 
 
-@dataclass(frozen=True)
-class _Autocorrelations:
-    """Of the residual of each row below the band, with the bounds of white noise; None for short ones."""
-
-    bound: Numbers
-    values: tuple[tuple[float, ...] | None, ...]
+def _five_digits(values: np.ndarray) -> np.ndarray:
+    return np.array([float(f"{x:.5g}") for x in values.ravel()]).reshape(values.shape)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UnseenReport:
-    """The content of ``unseen/report.json``; see `calib.procedure.dynamic_stage.validation`."""
+    """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.validation`."""
 
-    schema: int
     verdict: str
     reason: str
     warnings: tuple[str, ...]
     rows: tuple[str, ...]
     units: tuple[str, ...]
-    fit: Mapping[str, RecordingErrors]
-    validation: Mapping[str, RecordingErrors]
-    curves: tuple[_TorqueCurves, ...]
-    autocorrelation: Mapping[str, _Autocorrelations]
+    fit: Mapping[str, Score]
+    validation: Mapping[str, Score]
+    curves: tuple[TorqueCurves, ...]
+    tracking: Mapping[str, Replay] = field(default_factory=dict)
+    tracking_failure: str = ""
+    schema: int = UNSEEN_SCHEMA
+
+    @classmethod
+    def of(cls, inputs: IdentificationInputs, found: Assessment) -> UnseenReport:
+        """Return the report of an assessment."""
+        rows = inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
+        curves = (TorqueCurves.of(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases))
+        return cls(
+            found.verdict.level, found.verdict.reason, found.warnings, tuple(rows), tuple(inputs.row_units), found.fit,
+            found.validation, tuple(curves), {one.name: one for one in found.tracking.replays}, found.tracking.failure,
+        )  # fmt: skip
 
     @property
-    def proofs(self) -> dict[str, RecordingErrors]:
+    def proofs(self) -> dict[str, Score]:
         """Recordings that the model has not seen, by name; repeats of the training motion are none."""
         return {name: one for name, one in self.validation.items() if one.evidence}
 
 
-class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; RSD in percent; no σ where nothing was measured."""
+# ---- folders of earlier versions ------------------------------------------------------------------------------------
 
-    name: str
-    expression: str
-    unit: str
-    value: float
-    sigma: float | None
-    rsd: float | None
+_WHITENESS = ("pacf", "bound", "ljung_box", "ljung_box_p", "skewness", "kurtosis", "normal_p")
+_STEP = ("ratio", "f", "p", "f_total", "p_total")
 
 
-class TwoGeometries(NamedTuple):
-    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry."""
+def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what an earlier version's ``metrics.json`` or ``unseen/report.json`` holds, under today's keys."""
+    found = dict(content)
+    for group in ("identification", "fit", "validation"):
+        found[group] = {name: _score(one) for name, one in found.get(group, {}).items()}
+    for name, lags in found.pop("autocorrelation", {}).items():
+        for sets in (found["fit"], found["validation"]):
+            for row, white in enumerate(sets.get(name, {}).get("whiteness", ())):
+                if white is not None:
+                    white |= {"acf": lags["values"][row], "bound": lags["bound"][row]}
+    tracking = found.get("tracking") or {}
+    found["tracking_failure"] = tracking.get("failure", "")
+    found["tracking"] = {} if found["tracking_failure"] else {name: _replay(one) for name, one in tracking.items()}
+    if "elimination" in found:
+        missing = dict.fromkeys(_STEP) | {"residual_std": 0.0, "listed": False}
+        found["elimination"] = [missing | one for one in found["elimination"]]
+        if loop := found.get("loop"):
+            test = loop.get("durbin_wu_hausman")
+            test = test and test | {"statistic": test["f"]}
+            found["loop"] = loop | {"durbin_wu_hausman": test, "controller": None}
+    if held := found.get("constraints"):
+        found["constraints"] = held | {"binding": [one | {"sigma": one["free_sigma"]} for one in held["binding"]]}
+    return found
 
-    name: str
-    unit: str
-    nominal: float
-    sigma_nominal: float
-    calibrated: float
-    sigma_calibrated: float
-    relative_percent: float | None
-    sigma_difference: float
-    essential: str
+
+def _score(one: Mapping[str, Any]) -> dict[str, Any]:
+    missing = {"acf": [], **dict.fromkeys(_WHITENESS)}
+    white = [each and missing | each for each in one["whiteness"]]
+    return {"rate": None, "r_squared": [], "motion_share": 1.0} | dict(one) | {"whiteness": white}
 
 
-class GeometricEffect(NamedTuple):
-    """A row of ``geometry_effects.csv``: what one sigma of a geometric element does to the dynamics."""
-
-    rank: int
-    element: str
-    unit: str
-    sigma: float | None
-    matters: str
-    parameter: str
-    shift_sigma: float | None
-    parameters_moved: int | None
-    torque_rms: float | None
-    torque_rms_left: float | None
-    shift_sigma_per_milli: float
+def _replay(one: Mapping[str, Any]) -> dict[str, Any]:
+    control = one["controller"]
+    rows = {"share": [1.0] * len(control["kp"]), "windup": [None] * len(control["kp"])} if "kp" in control else {}
+    return {"name": "", "seconds": 0.0, "terms_left_out": []} | dict(one) | {
+        "stated": control["stated"], "controller": {**control, **rows} if rows else None,
+    }  # fmt: skip

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.errors import CalibError
-from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay, replay
+from calib.identification.loop.replay import Replay, replay
 from calib.identification.prediction import Dynamics
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.loop_tables import controller_table
 from calib.simulation.loop.controllers import Controller
 
-MOST = 3  # recordings that are replayed
-KEYS = {FEEDBACK: "feedback", CAD: "cad", IDENTIFIED: "model", FLOOR: "floor"}
+MAX_REPLAYS = 3  # recordings that are replayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +22,10 @@ class Tracking:
 
     Attributes:
         replays: one per recording.
-        unseen: whether these are motions that the fit has not seen.
         failure: why there is none.
     """
 
     replays: tuple[Replay, ...] = ()
-    unseen: bool = False
     failure: str = ""
 
 
@@ -46,34 +41,14 @@ def track(
         predictions: case name → torques by the model.
         controller: that was identified, where the loop's is not stated.
     """
-    chain, chosen = inputs.chain, list(inputs.unseen)[:MOST] or list(inputs.cases)[:1]
+    chain, chosen = inputs.chain, list(inputs.unseen)[:MAX_REPLAYS] or list(inputs.cases)[:1]
     loop = inputs.options.settings.loop if inputs.unit == "N m" else None
     read = None if loop is None else controller
     try:
         if loop is not None and loop.controller != "identify":
             read = loop.stated_controller(chain.n)
         rate = None if read is None or loop is None else loop.rate
-        replays = tuple(replay(chain, dynamics, case, predictions[case.name], read, rate) for case in chosen)
+        replays = (replay(chain, dynamics, case, predictions[case.name], read, rate) for case in chosen)
+        return Tracking(tuple(replace(one, unseen=bool(inputs.unseen)) for one in replays))
     except CalibError as error:
-        return Tracking(unseen=bool(inputs.unseen), failure=str(error))
-    return Tracking(replays, bool(inputs.unseen))
-
-
-def tracking_table(tracking: Tracking) -> dict[str, Any] | None:
-    """Return what ``metrics.json`` holds under ``tracking``; rms in rad or m."""
-    if tracking.failure:
-        return {"failure": tracking.failure}
-    if not tracking.replays:
-        return None
-    return {
-        one.name: {
-            "rms": {KEYS[name]: [float(x) for x in rms] for name, rms in one.rms.items()},
-            "feedback_over_model": one.gain,
-            "unseen": tracking.unseen,
-            "seconds": one.seconds,
-            "controller": controller_table(one.controller) | {"stated": one.stated},
-            "terms_left_out": list(one.left_out),
-            "inertia_added": [float(x) for x in one.added],
-        }
-        for one in tracking.replays
-    }
+        return Tracking(failure=str(error))

@@ -20,7 +20,12 @@ from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
-from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, intervals
+from calib.identification.uncertainty.torque_errors import (
+    TorqueDiscrepancy,
+    TorqueErrorModel,
+    TorqueIntervals,
+    intervals,
+)
 from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
@@ -43,13 +48,13 @@ REPEAT = 0.5  # share of states met in training from which on a validation file 
 
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
-    """What an identification says of its model and a verdict needs beside the recordings; kept in its folder.
+    """What an identification says of its model and a verdict needs beside the recordings; a record of its folder.
 
     Attributes:
         rests: its parameters that rest on a prior.
         notes: what a user should know of the model, whatever the unseen recordings are.
         controller: that was stated or identified; None without any.
-        errors: what errors its torques are expected to have; None where too little was recorded to say.
+        errors: what makes errors of its torques likely; None where too little was recorded to say.
         contradiction: how far it is from every possible robot; None where nobody knows.
         unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
     """
@@ -57,7 +62,7 @@ class ModelFindings:
     rests: Resting
     notes: tuple[str, ...] = ()
     controller: Controller | None = None
-    errors: TorqueErrorModel | None = None
+    errors: TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
     unlike: LoopDisagreement | None = None
 
@@ -109,6 +114,7 @@ def assess(
     inputs: IdentificationInputs,
     dynamics: Dynamics,
     findings: ModelFindings,
+    errors: TorqueErrorModel | None = None,
     wrong: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Assessment:
@@ -118,6 +124,7 @@ def assess(
         inputs: recordings to learn from (for the model's own error) and unseen ones.
         dynamics: the model.
         findings: what is known of it.
+        errors: what errors its torques are expected to have.
         wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
     """
     say = progress or (lambda words: None)
@@ -128,7 +135,7 @@ def assess(
         predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
     expected: dict[str, TorqueIntervals] = {}
-    if (errors := findings.errors) is not None:
+    if errors is not None:
         for case in inputs.unseen or inputs.cases[:1]:
             say(f"errors to expect of {case.name}")
             expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
@@ -136,7 +143,12 @@ def assess(
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     fit = {case.name: scores[case.name] for case in inputs.cases}
-    validation = {case.name: scores[case.name] for case in inputs.unseen}
+    names = inputs.chain.joint_names
+    stated = {name: one.coverage(names) for name, one in expected.items()}
+    validation = {
+        case.name: replace(scores[case.name], evidence=case.name not in repeated, interval95=stated.get(case.name))
+        for case in inputs.unseen
+    }
     proofs = {name: one for name, one in validation.items() if name not in repeated}
     settings = inputs.options.settings
     labels = settings.torque_rows.numbered(inputs.chain.n)
@@ -152,7 +164,7 @@ def assess(
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (
-        Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
+        Tracking(failure=amperes[0]) if amperes
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
     verdict = _with_replays(verdict, tracking)
@@ -170,7 +182,7 @@ def assess(
 
 def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
     """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
-    if not any(one.added.any() for one in tracking.replays):
+    if not any(one.inertia_added.any() for one in tracking.replays):
         return verdict
     words = "its inertias are not physically consistent: predict torques with it, simulate the exported robot"
     return replace(verdict, reason=f"{verdict.reason}; {words}")

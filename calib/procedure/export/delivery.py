@@ -128,7 +128,7 @@ def verdicts(folder: Path) -> Verdicts:
     validated = ValidationFolder(folder.absolute().parent / VALIDATED)
     try:
         if identified.model.is_file():
-            found = identified.unseen.verdict() if identified.unseen.report.is_file() else identified.metrics()
+            found = identified.unseen.read() if identified.unseen.report.is_file() else identified.metrics()
             return Verdicts({"dynamics": Verdict(found.verdict, found.reason)} if found.verdict else {})
         own = folder.absolute().name == IN_SESSION and validated.judged.is_file()
         judged = validated.metrics() if own else FitFolder(folder).metrics()

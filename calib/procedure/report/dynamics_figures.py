@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.shapes import Joined
+from calib.estimation.whiteness import Whiteness
 from calib.identification.cases import Case
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import uncertainty_figures
@@ -40,17 +41,15 @@ def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutco
     title = f"{case.name} ({kind}): {found.total:.3g} % of the torque unexplained"
     labels, units = _rows(outcome), outcome.inputs.row_units
     target = np.asarray(case.target)
-    return torques(case.motion.t, target, predicted, labels, units, title, found.joints.tolist())
+    return torques(case.motion.t, target, predicted, labels, units, title, found.joints)
 
 
 def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
     """Draw the autocorrelations of the residuals below the band, of the file that judges."""
     name = next(iter(outcome.validation or outcome.fit))
     found = {**outcome.fit, **outcome.validation}[name]
-    values = [None if white is None else white.acf for white in found.whiteness]
-    bounds = [None if white is None else white.bound for white in found.whiteness]
     title = f"{name}: autocorrelation of the residuals at {found.rate:.3g} Hz, dashed: white noise"
-    return autocorrelations(values, bounds, _rows(outcome), title)
+    return autocorrelations(found.whiteness, _rows(outcome), title)
 
 
 def _friction(outcome: IdentificationOutcome) -> Chart:
@@ -84,7 +83,7 @@ def _rows(outcome: IdentificationOutcome) -> tuple[str, ...]:
 
 def torques(
     t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, rows: Sequence[str], units: Sequence[str], title: str,
-    errors: Sequence[float | None] = (),
+    errors: Sequence[float] | np.ndarray = (),
 ) -> Chart:  # fmt: skip
     """Return measured and predicted torque of every row over time, and the residual.
 
@@ -98,8 +97,7 @@ def torques(
     columns = 2 if len(rows) > FEW else 1
     panels = []
     for j, (row, unit) in enumerate(zip(rows, units)):
-        share = errors[j] if j < len(errors) else None
-        left = "" if share is None or not np.isfinite(share) else f": {share:.3g} % left"
+        left = f": {errors[j]:.3g} % left" if j < len(errors) and np.isfinite(errors[j]) else ""
         lines = [
             Line(t, measured[:, j], "-", BEFORE, 1.4, label="measured"),
             Line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
@@ -111,7 +109,7 @@ def torques(
     return Chart(panels, 0.7 + 0.95 * -(-len(rows) // columns), columns, title=title)
 
 
-def errors_by_row(fitted: Sequence[float], unseen: Sequence[float], rows: Sequence[str]) -> Chart:
+def errors_by_row(fitted: np.ndarray, unseen: np.ndarray, rows: Sequence[str]) -> Chart:
     """Return the relative error of every row [%], on the training and on unseen motion."""
     bars = [
         Bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
@@ -123,31 +121,28 @@ def errors_by_row(fitted: Sequence[float], unseen: Sequence[float], rows: Sequen
 
 
 def autocorrelations(
-    values: Sequence[Sequence[float] | np.ndarray | None], bounds: Sequence[float | None], rows: Sequence[str],
-    title: str = "", width: float = WIDE,
-) -> Chart:  # fmt: skip
+    found: Sequence[Whiteness | None], rows: Sequence[str], title: str = "", width: float = WIDE
+) -> Chart:
     """Return the autocorrelation of every row's residual, with the bounds of white noise.
 
     Args:
-        values: at lags 1, 2, … of each torque row; None of rows that are too short to say.
-        bounds: of white noise, of each row.
+        found: of each torque row; None of rows that are too short to say.
         rows: names of the torque rows.
         title: of the whole.
         width: of the figure [in].
     """
-    shown = [j for j in range(len(rows)) if values[j] is not None]
+    shown = [(row, white) for row, white in zip(rows, found) if white is not None and len(white.acf)]
     columns = min(7 if len(shown) > FEW else 4 if width > HALF else 3, max(1, len(shown)))
     panels = []
-    for k, j in enumerate(shown):
-        series, bound = np.asarray(values[j], dtype=float), bounds[j] or 0.0
+    for k, (row, white) in enumerate(shown):
         inner = k + columns < len(shown)
         panels.append(
             Panel(
-                [Bars([0.0, *series], upright=True, thick=0.4), Level(bound), Level(-bound)],
-                rows[j],
+                [Bars([0.0, *white.acf], upright=True, thick=0.4), Level(white.bound), Level(-white.bound)],
+                row,
                 "" if inner else "lag [samples]",
                 ylim=(-1.0, 1.0),
-                xlim=(0.0, len(series) + 1.0),
+                xlim=(0.0, len(white.acf) + 1.0),
                 ticks=3,
                 bare="y" * (k % columns > 0) + "x" * inner,
             )

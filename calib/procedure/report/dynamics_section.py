@@ -5,34 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from calib.errors import UsageError
 from calib.estimate_files import read_estimate
-from calib.identification.loop.replay import DAMPING, FREQUENCY
+from calib.identification.loop.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay
 from calib.identification.methods.bias import SMALL
-from calib.identification.scores import relative_error_sigma
+from calib.identification.scores import Score, relative_error_sigma
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.metric_tables import UNSEEN
-from calib.procedure.dynamic_stage.metric_tables import metrics as metrics_of
-from calib.procedure.dynamic_stage.metrics import (
-    GeometricEffect,
-    IdentifiedParameter,
-    LoopMetrics,
-    ModelMetrics,
-    Numbers,
-    RecordingErrors,
-    ReplayMetrics,
-    UnseenReport,
-    model_metrics,
-)
-from calib.procedure.dynamic_stage.tracking import KEYS
+from calib.procedure.dynamic_stage.loop_tables import LoopMetrics
+from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
+from calib.procedure.dynamic_stage.metrics import metrics as record_of
 from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text, relative_sigma
-from calib.records import read_json, read_record, read_rows, typed_rows
+from calib.records import read_rows, typed_rows
 from calib.units import small
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
@@ -48,7 +38,21 @@ ERROR_NOTE = (
 EFFECTS_HEADER = (
     "geometric error", "sigma", "moves most", "by, in its sigma of torque", "parameters moved", "torque rms [N m]",
 )  # fmt: skip
-SHORT = {key: words for words, key in KEYS.items()}
+FED_FORWARD = {
+    FEEDBACK: "feedback alone", CAD: "CAD fed forward", IDENTIFIED: "model fed forward",
+    FLOOR: "measured torque fed forward",
+}  # fmt: skip
+
+
+class IdentifiedParameter(NamedTuple):
+    """A row of ``estimate.csv``; RSD in percent; no σ where nothing was measured."""
+
+    name: str
+    expression: str
+    unit: str
+    value: float
+    sigma: float | None
+    rsd: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,7 @@ class DynamicReport:
 
     metrics: ModelMetrics
     estimate: tuple[IdentifiedParameter, ...]
-    effects: tuple[GeometricEffect, ...]
+    effects: tuple[geometry_tables.GeometricEffect, ...]
     unseen: UnseenReport
 
 
@@ -77,16 +81,11 @@ def read(folder: Path) -> DynamicReport:
     effects = folder / geometry_tables.EFFECTS
     try:
         place = IdentificationFolder(folder)
-        metrics = model_metrics(read_json(place.numbers))
-        unseen = read_json(place.unseen.report)
-        if unseen.get("schema") != UNSEEN:
-            found = f"schema {unseen.get('schema')}, this version reads {UNSEEN}"
-            raise UsageError(f"{place.unseen.report}: {found}")
         return DynamicReport(
-            metrics,
+            place.metrics(),
             typed_rows(IdentifiedParameter, read_estimate(folder).rows, str(folder)),
-            read_rows(GeometricEffect, effects) if effects.exists() else (),
-            read_record(UnseenReport, unseen),
+            read_rows(geometry_tables.GeometricEffect, effects) if effects.exists() else (),
+            place.unseen.read(),
         )
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
@@ -114,7 +113,7 @@ def _plain(note: str) -> str:
 
 def outcome_section(outcome: IdentificationOutcome) -> Section:
     """Return what an identification came to as the console says it: ladder, model, errors, tracking, verdict."""
-    found = model_metrics(metrics_of(outcome))
+    found = record_of(outcome)
     chain, torques = outcome.inputs.chain, outcome.found.settings.torque_rows
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
     blocks: list[Block] = [_friction_table(found)] if found.ladder else []
@@ -160,11 +159,11 @@ def certificate_section(
     return Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))
 
 
-def proof_of(unseen: UnseenReport) -> tuple[str, RecordingErrors, str]:
+def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
     """Return name and errors of the recording that judges (the worst unseen one, else the fitted one), and on what."""
     where = "unseen motion" if unseen.proofs else "the training motion"
     sets = unseen.proofs or unseen.fit
-    name, found = max(sets.items(), key=lambda item: item[1].raw.relative_error_percent.total or 0.0)
+    name, found = max(sets.items(), key=lambda item: item[1].raw.total)
     return name, found, where
 
 
@@ -173,11 +172,12 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
-    raw, band = proof.raw.relative_error_percent, proof.filtered.relative_error_percent
+    raw, band = proof.raw, proof.filtered
     curves = next((one for one in unseen.curves if one.name == name), None)
-    sigma = np.nan if curves is None else relative_error_sigma(np.array(curves.measured), np.array(curves.predicted))
+    sigma = np.nan if curves is None else relative_error_sigma(curves.measured, curves.predicted)
     spread = f"± {sigma:.2g} %" if np.isfinite(sigma) else ""
-    worst, row = max(((x, row) for x, row in zip(band.joints, unseen.rows) if x is not None), default=(None, "torque"))
+    shares = ((x, row) for x, row in zip(band.joints, unseen.rows) if np.isfinite(x))
+    worst, row = max(shares, default=(np.nan, "torque"))
     allowed = f"{tolerance:g} %" if tolerance else ""
     return [
         KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
@@ -186,9 +186,9 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
     ]
 
 
-def percent(value: float | None) -> str:
+def percent(value: float) -> str:
     """Return a share in percent with three digits; a dash where there is none."""
-    return "–" if value is None else f"{value:.3g} %"
+    return f"{value:.3g} %" if np.isfinite(value) else "–"
 
 
 def _rsd(percent: float) -> str:
@@ -197,7 +197,7 @@ def _rsd(percent: float) -> str:
 
 
 def _error_table(
-    training: Mapping[str, RecordingErrors], unseen: Mapping[str, RecordingErrors], rows: Sequence[str],
+    training: Mapping[str, Score], unseen: Mapping[str, Score], rows: Sequence[str],
     units: Sequence[str],
 ) -> Table:  # fmt: skip
     """Return errors of the torque per row, of every recording.
@@ -214,13 +214,13 @@ def _error_table(
         parts = one.raw, one.filtered, one.moving, one.standing
         cells.append((f"{name} ({label})",))
         strong.add(len(cells))
-        cells.append(("all", *(percent(part.relative_error_percent.total) for part in parts), "", "", ""))
+        cells.append(("all", *(percent(part.total) for part in parts), "", "", ""))
         for j, row in enumerate(rows):
             rms, white = one.raw.rms[j], one.whiteness[j]
             cells.append((
-                row, *(percent(part.relative_error_percent.joints[j]) for part in parts),
+                row, *(percent(part.joints[j]) for part in parts),
                 percent(one.above_band_percent[j]),
-                "" if rms is None else f"{rms:.3g} {units[j]}",
+                f"{rms:.3g} {units[j]}" if np.isfinite(rms) else "",
                 "" if white is None else f"{100 * white.outside:.0f} %",
             ))  # fmt: skip
     header = ("torque", "error", "in band", "moving", "standing", "torque above band", "rms", "ACF outside")
@@ -228,7 +228,7 @@ def _error_table(
 
 
 def _interval_blocks(
-    unseen: Mapping[str, RecordingErrors], rows: Sequence[str], units: Sequence[str]
+    unseen: Mapping[str, Score], rows: Sequence[str], units: Sequence[str]
 ) -> list[Block]:  # fmt: skip
     """Return how many errors are within the 95 % interval that the model states, per row of unseen recordings."""
     cells: list[Sequence[str]] = []
@@ -254,8 +254,8 @@ def _friction_table(metrics: ModelMetrics) -> Table:
         if step.kept:
             strong.add(len(rows))
         at = ", ".join(map(str, step.kept_at_joints))
-        joints = ["–" if x is None else f"{x:.1f}" for x in step.joints_percent]
-        total = "–" if step.cross_validated_percent is None else f"{step.cross_validated_percent:.2f}"
+        joints = [f"{x:.1f}" if np.isfinite(x) else "–" for x in step.joints_percent]
+        total = f"{step.cross_validated_percent:.2f}" if np.isfinite(step.cross_validated_percent) else "–"
         rows.append((step.model, str(step.parameters), total, *joints, at or step.note))
     each = [str(j + 1) for j in range(max((len(step.joints_percent) for step in metrics.ladder), default=0))]
     rows = [(*row[:-1], *[""] * (len(each) + 4 - len(row)), row[-1]) for row in rows]
@@ -283,26 +283,26 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
     count, columns = metrics.parameters, metrics.counts
     base = count.standard - columns.without_effect - columns.regrouped
     raw, normalised = metrics.condition_number.raw, metrics.condition_number.normalised
-    condition = ", with unit columns ".join("infinite" if x is None else f"{x:.0f}" for x in (raw, normalised))
+    condition = ", with unit columns ".join(f"{x:.0f}" if np.isfinite(x) else "infinite" for x in (raw, normalised))
     lines.append(
         f"{count.standard} standard parameters: {columns.without_effect} without effect, {columns.regrouped} "
         f"regrouped, {base} base; {count.base - base} of richer friction; condition {condition}"
     )
     if metrics.elimination or count.essential < count.base:
         gone = ", ".join(
-            one.name if one.rsd is None else f"{one.name} ({_rsd(one.rsd)})" for one in metrics.elimination
+            f"{one.name} ({_rsd(one.rsd)})" if np.isfinite(one.rsd) else one.name for one in metrics.elimination
         )
         lines.append(f"{count.essential} essential parameters; left out, with their RSD: {gone or 'none'}")
     return lines
 
 
-def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[GeometricEffect]) -> list[Block]:
+def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[Block]:
     """Return which geometric errors matter for the dynamics: a summary, and the worst of them."""
     found = metrics.geometry
     if found is None:
         return []
     lines, tilt = [found.summary], found.moved_by_1_mrad_of_tilt
-    if found.propagated and tilt.sigmas > geometry_tables.LEAST:
+    if found.propagated and tilt.sigmas > geometry_tables.MIN_SHIFT:
         lines.append(
             f"not part of it is how level the base stands: 1 mrad against gravity would move {tilt.parameter} by "
             f"{tilt.sigmas:.2g} of its sigma of torque noise"
@@ -348,21 +348,21 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
     p = f"p = {test.p:.2g}" if test.p > 0.0 else "p < 1e-300"
     degrees = ", ".join(f"{one:g}" for one in test.degrees)
     lines.append(
-        f"Durbin-Wu-Hausman: F({degrees}) = {_number(test.f)}, {p}: {said}; largest shift "
+        f"Durbin-Wu-Hausman: F({degrees}) = {_number(test.statistic)}, {p}: {said}; largest shift "
         f"{loop.largest_shift_sigma:.3g} sigma"
     )
     return lines
 
 
-def _joints(shares: Numbers) -> str:
+def _joints(shares: np.ndarray) -> str:
     return " ".join(map(_number, shares))
 
 
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g}"
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "–"
 
 
-def tracking_blocks(replays: Mapping[str, ReplayMetrics], failure: str = "") -> list[Block]:
+def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Block]:
     """Return how far the simulated robot strays with the model fed forward, and what that means."""
     if failure:
         why = f"tracking with the model fed forward was not simulated: {failure}"
@@ -373,19 +373,19 @@ def tracking_blocks(replays: Mapping[str, ReplayMetrics], failure: str = "") -> 
     rows: list[Sequence[str]] = []
     for name, one in replays.items():
         rows.append((name,))
-        rows += [(SHORT.get(key, key), *(_number(x and 1e3 * x) for x in rms)) for key, rms in one.rms.items()]
+        rows += [(FED_FORWARD[key], *map(_number, 1e3 * rms)) for key, rms in one.rms.items()]
     joints = [str(j + 1) for j in range(len(first.inertia_added))]
     lines = []
     gain = f": feeding the model forward divides the tracking error by {first.feedback_over_model:.3g}"
-    if any(first.inertia_added):
-        shown = " ".join(f"{x:.2g}" for x in first.inertia_added if x is not None)
+    if first.inertia_added.any():
+        shown = " ".join(f"{x:.2g}" for x in first.inertia_added)
         lines.append(
             f"the identified model is no possible robot: it is simulated with motor inertia added, {shown} kg m² (kg); "
             "compare the rows, do not trust their size"
         )
         gain = ""
     default = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
-    control = "the controller of [loop]" if first.controller.stated else default
+    control = "the controller of [loop]" if first.stated else default
     motion = "motion the fit has not seen" if first.unseen else "the motion of the fit itself, which flatters"
     lines.append(
         f"the simulated robot is the identified model, disturbed by the torque it left unexplained; {control}; "

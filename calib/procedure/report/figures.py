@@ -112,11 +112,11 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
 
     _, proof, where = proof_of(unseen)
     own = next(iter(unseen.fit.values()))
-    sides = [[x or 0.0 for x in one.raw.relative_error_percent.joints] for one in (own, proof)]
-    name, white = next(iter(unseen.autocorrelation.items()))
+    sides = [np.nan_to_num(one.raw.joints) for one in (own, proof)]
+    name, looked = next(iter((unseen.validation or unseen.fit).items()))
     width = WIDE if len(unseen.rows) > dynamics_figures.FEW else HALF
     bars = dynamics_figures.errors_by_row(sides[0], sides[1], unseen.rows)
-    drawn = dynamics_figures.autocorrelations(white.values, white.bound, unseen.rows, "Residuals", width)
+    drawn = dynamics_figures.autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
     shares = f"Share of each torque that the model leaves, on the training motion and on {where}."
     rest = f"Autocorrelation of the residuals below the band on {name}; dashed: white noise."
     return [picture(bars, shares), picture(drawn, rest)]
@@ -130,12 +130,10 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
     seen = "unseen" if unseen.validation else "fitted"
     result = []
     for curves in unseen.curves:
-        t, measured, predicted = (
-            np.array(each, dtype=float).T for each in (curves.t, curves.measured, curves.predicted)
-        )
-        raw = {**unseen.fit, **unseen.validation}[curves.name].raw.relative_error_percent
+        raw = {**unseen.fit, **unseen.validation}[curves.name].raw
+        sides = curves.measured.T, curves.predicted.T
         title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
-        chart = dynamics_figures.torques(t, measured, predicted, unseen.rows, unseen.units, title, raw.joints)
+        chart = dynamics_figures.torques(curves.t, *sides, unseen.rows, unseen.units, title, raw.joints)
         result.append(picture(chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."))
     return result
 

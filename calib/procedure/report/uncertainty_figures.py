@@ -13,8 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from calib import files
-from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, LEAST
-from calib.procedure.dynamic_stage.metrics import GeometricEffect, TwoGeometries
+from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, Words, picture
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF, MARK, QUIET
@@ -106,12 +105,12 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     """Return the ranked geometric errors by the largest shift they cause."""
     size = np.array([row.shift_sigma or 0.0 for row in rows])
     layers = [
-        Bars(size, [AFTER if one > LEAST else QUIET for one in size]), Level(LEAST, upright=True),
+        Bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), Level(MIN_SHIFT, upright=True),
         *(Words(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
     ]  # fmt: skip
     labels = [f"{row.element} ({_milli(row)})" for row in rows]
-    title = f"{int((size > LEAST).sum())} of these {len(rows)} geometric errors matter"
-    limits = 0.0, 1.25 * float(size.max(initial=LEAST))
+    title = f"{int((size > MIN_SHIFT).sum())} of these {len(rows)} geometric errors matter"
+    limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))
     panel = Panel(layers, title, "shift [σ of torque noise]", xlim=limits, ynames=labels)
     return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF)
 

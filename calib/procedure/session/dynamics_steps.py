@@ -210,7 +210,7 @@ def predict(session: Session, say: Say) -> list[str]:
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     place = session.identification
-    found = assess(given, place.dynamics(), place.findings(), progress=say)
+    found = assess(given, place.dynamics(), place.findings(), place.errors(), progress=say)
     place.unseen.write(given, found)  # the export is judged by the torques written here
     found = replace(found, verdict=_as_delivered(session, found))
     place.unseen.write(given, found)

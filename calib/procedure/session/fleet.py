@@ -15,12 +15,10 @@ from rich.text import Text
 
 from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, complaint
-from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.findings import LEVELS
 from calib.procedure.report import console
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import SETTINGS, locked, open_session
-from calib.records import read_json
 from calib.workers import Workers
 
 LOG = "run.log"
@@ -131,9 +129,8 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
-        unseen = read_json(session.identification.unseen.report, "identify again", UnseenReport)
-        scores = (unseen.validation or unseen.fit).values()
-        torque = max((one.raw.relative_error_percent.total or 0.0 for one in scores), default=None)
+        unseen = session.identification.unseen.read()
+        torque = max((one.raw.total for one in (unseen.validation or unseen.fit).values()), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 

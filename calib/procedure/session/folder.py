@@ -180,7 +180,7 @@ class Session:
     def verdicts(self) -> Verdicts:
         """Return the verdict of each stage; dynamics that were not exported are good for prediction only."""
         geometry = self.validation.metrics() if self.geometric else None
-        judged = {"geometry": geometry, "dynamics": self.identification.unseen.verdict() if self.dynamic else None}
+        judged = {"geometry": geometry, "dynamics": self.identification.unseen.read() if self.dynamic else None}
         found = {stage: Verdict(one.verdict, one.reason) for stage, one in judged.items() if one}
         out = self.path(self.export)
         if self.dynamic and (out / ROBOT).exists() and not any(out.rglob(PARAMETERS)):

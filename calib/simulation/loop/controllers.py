@@ -15,6 +15,7 @@ import numpy as np
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, require
+from calib.records import Array, Unbounded
 from calib.simulation.loop.references import Reference
 
 
@@ -34,14 +35,14 @@ class Controller:
         cutoff: of the low-pass on the measured velocity [Hz]; None for none.
     """
 
-    kp: np.ndarray
-    kd: np.ndarray
-    ki: np.ndarray
-    share: np.ndarray
-    limit: np.ndarray
-    windup: np.ndarray
-    ahead: np.ndarray | None = None
-    model: np.ndarray | None = None
+    kp: Array
+    kd: Array
+    ki: Array
+    share: Array
+    limit: Unbounded
+    windup: Unbounded
+    ahead: Array | None = None
+    model: Array | None = None
     delay: int = 0
     cutoff: float | None = None
 

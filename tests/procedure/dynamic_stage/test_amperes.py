@@ -48,7 +48,7 @@ def amperes(robot: Path) -> Path:
 def test_a_model_in_amperes_says_so_in_every_file(amperes):
     metrics, dynamics = (json.loads((amperes / name).read_text()) for name in ("metrics.json", "dynamics.json"))
     assert metrics["unit"] == dynamics["unit"] and dynamics["unit"].startswith("A of joint")
-    assert "torques are in amperes, scaled to joint 2" in metrics["warnings"][0] and "failure" in metrics["tracking"]
+    assert "torques are in amperes, scaled to joint 2" in metrics["warnings"][0] and metrics["tracking_failure"]
     units = {row["unit"] for row in csv.DictReader((amperes / "estimate.csv").open())}
     assert units and all("A" in unit.split()[0] or unit.endswith("A/(N m)") for unit in units)
     assert not {"N m", "kg m²"} & {term["unit"] for term in dynamics["terms"]}
@@ -122,9 +122,9 @@ def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
 
 def test_a_step_whose_terms_the_final_fit_switched_off_is_not_kept():
     terms = tuple(drives.stribeck(joint, 0.1)[0] for joint in (0, 1))
-    step = FrictionTrial("+ stribeck", 12, 5.0, (5.0, 5.0), (0, 1), terms=("Fs1", "Fs2"))
+    step = FrictionTrial("+ stribeck", 12, 5.0, (5.0, 5.0), (1, 2), terms=("Fs1", "Fs2"))
     one = FrictionSelection(terms, (0, 1), (step,)).fitted(np.array([1e-12, 0.02]))
-    assert one.off == ("Fs1",) and one.steps[0].kept_at == (1,) and one.chosen == "standard + stribeck"
+    assert one.off == ("Fs1",) and one.steps[0].kept_at_joints == (2,) and one.chosen == "standard + stribeck"
     none = FrictionSelection(terms, (0, 1), (step,)).fitted(np.array([1e-12, 1e-12]))
     assert not none.steps[0].kept and none.steps[0].note and none.chosen == "standard"
 
@@ -137,6 +137,6 @@ def test_totals_of_the_friction_ladder_leave_out_joints_in_units_of_their_own() 
     apart = identify(planted.arm(), [large], settings).friction.steps
     mixed = identify(planted.arm(), [large], replace(settings, apart=())).friction.steps
     for own, together in zip(apart, mixed, strict=True):
-        assert own.joints == together.joints
-        assert min(own.joints[:2]) <= own.cross_validated <= max(own.joints[:2])
-        assert together.cross_validated == pytest.approx(together.joints[2], rel=0.01)
+        assert own.joints_percent == together.joints_percent
+        assert min(own.joints_percent[:2]) <= own.cross_validated_percent <= max(own.joints_percent[:2])
+        assert together.cross_validated_percent == pytest.approx(together.joints_percent[2], rel=0.01)

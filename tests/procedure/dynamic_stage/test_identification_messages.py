@@ -20,10 +20,10 @@ from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import IdentifyOptions
-from calib.identification.scores import PredictionErrors
+from calib.identification.loop.replay import Replay
+from calib.identification.scores import PredictionErrors, RelativeErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
 from calib.procedure.report import charts, console, dynamics_figures, dynamics_section
 from calib.robot.calibrated import CalibratedChain
 from calib.units import motion_units
@@ -62,8 +62,8 @@ def test_a_second_ctrl_c_ends_as_the_first_would(monkeypatch):
 
 
 def test_names_in_brackets_reach_the_console():
-    rms = {key: (1e-3,) * 3 for key in ("feedback", "cad", "model", "floor")}
-    one = ReplayMetrics(rms, 30.0, True, ReplayController(True), (0.0,) * 3)
+    rms = {key: np.full(3, 1e-3) for key in ("feedback", "cad", "model", "floor")}
+    one = Replay("log.npz", 30.0, None, True, (), np.zeros(3), rms, unseen=True)
     *_, last = console.rendered(dynamics_section.tracking_blocks({"log.npz": one}))
     assert isinstance(last, Text) and "the controller of [loop];" in last.plain
 
@@ -76,8 +76,8 @@ def test_figures_have_units_at_their_axes():
         arm, Path(), (), (), options, (), FoundGains(options, None, None, "N m", ())
     )  # fmt: skip
     outcome: Any = SimpleNamespace(
-        fit={"train": SimpleNamespace(raw=PredictionErrors(5.0, np.full(3, 5.0), np.zeros(3), 1))}, validation={},
-        repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
+        fit={"train": SimpleNamespace(raw=PredictionErrors(RelativeErrors(5.0, np.full(3, 5.0)), np.zeros(3)))},
+        validation={}, repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
         inputs=inputs,
     )  # fmt: skip
     figure = charts.figure(dynamics_figures.file_torques(one, np.asarray(one.target), outcome))

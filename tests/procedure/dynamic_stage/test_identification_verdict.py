@@ -10,7 +10,7 @@ import pytest
 
 from calib.data.signals.persistency import report_excitation
 from calib.identification.identify import identify
-from calib.identification.scores import PredictionErrors, Score
+from calib.identification.scores import PredictionErrors, RelativeErrors, Score
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage import verdict
 from calib.procedure.dynamic_stage.verdict import Resting, judge, with_prior
@@ -22,8 +22,12 @@ TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not m
 def scored(joints, moving=None, total=5.0, share=1.0) -> Score:
     """Return a score of which `joints` [%] are unexplained in the band."""
     joints = np.asarray(joints, dtype=float)
-    part = PredictionErrors(total, joints, joints * TORQUE / 100.0, 300)
-    moved = part if moving is None else replace(part, joints=np.asarray(moving, dtype=float))
+    part = PredictionErrors(RelativeErrors(total, joints), joints * TORQUE / 100.0, 300)
+    moved = (
+        part
+        if moving is None
+        else replace(part, relative_error_percent=RelativeErrors(total, np.asarray(moving, dtype=float)))
+    )
     return Score(part, part, moved, part, 0.0 * joints, 1.0 - joints / 100.0, (None,) * 3, 20.0, share)
 
 
