@@ -227,6 +227,8 @@ _STEP = ("ratio", "f", "p", "f_total", "p_total")
 
 def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return what an earlier version's ``metrics.json`` or ``unseen/report.json`` holds, under today's keys."""
+    if content.get("schema", UNSEEN_SCHEMA - 1) >= UNSEEN_SCHEMA:
+        return dict(content)
     found = dict(content)
     for group in ("identification", "fit", "validation"):
         found[group] = {name: _score(one) for name, one in found.get(group, {}).items()}
