@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
+from typing import Any
 
 from calib.config import schema
 from calib.errors import UsageError
@@ -73,6 +74,13 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     **merged("schemas"),
 }
 """Topic → module and dataclass of the TOML files that people write."""
+_KINDS = {
+    "string": "text",
+    "number": "number",
+    "integer": "whole number",
+    "boolean": "true or false",
+    "object": "table",
+}
 
 
 def overview() -> list[str]:
@@ -93,6 +101,11 @@ def describe(topic: str) -> str:
         from calib.procedure.session.settings import example
 
         parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
+    elif topic in SCHEMAS:
+        found = _schema(topic)
+        parts.append(
+            "\n".join(["Every key, what it may hold, and its default:\n", *_keys(found, found.get("$defs", {}))])
+        )
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
@@ -104,9 +117,43 @@ def json_schema(topic: str) -> str:
     """
     if topic not in SCHEMAS:
         raise UsageError(f"no JSON schema of '{topic}'; there are those of {', '.join(SCHEMAS)}")
+    return json.dumps(_schema(topic), indent=2, ensure_ascii=False) + "\n"
+
+
+def _schema(topic: str) -> dict[str, Any]:
     module, name = SCHEMAS[topic]
-    title = f"{TOPICS[topic][0]} (armature-calib)"
-    return json.dumps(schema(getattr(import_module(module), name), title), indent=2, ensure_ascii=False) + "\n"
+    return schema(getattr(import_module(module), name), f"{TOPICS[topic][0]} (armature-calib)")
+
+
+def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") -> Iterator[str]:
+    """Yield a line per key of a table of a JSON schema, keys of the tables in it included."""
+    for key, value in table.get("properties", {}).items():
+        if key == "files":  # the same keys, for one file
+            continue
+        inner = value.get("items", value.get("additionalProperties")) or value
+        named = tables.get(str(inner.get("$ref", value.get("$ref", ""))).rpartition("/")[2])
+        if named:
+            yield from _keys(named, tables, f"{place}{key}.")
+            continue
+        default = f"; default {json.dumps(value['default'])}" if "default" in value else ""
+        words = f"; {value['description']}" if "description" in value else ""
+        yield f"    {place + key:28} {_held(value)}{default}{words}"
+
+
+def _held(value: Mapping[str, Any]) -> str:
+    """Return what a key may hold, in words."""
+    if "anyOf" in value:
+        return " or ".join(dict.fromkeys(map(_held, value["anyOf"])))
+    if "enum" in value:
+        return ", ".join(value["enum"])
+    if "items" in value or "prefixItems" in value:
+        return f"list of: {_held(value.get('items') or value['prefixItems'][0])}"
+    bounds = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
+    said = [f"{word} {value[key]:g}" for key, word in bounds.items() if key in value]
+    kinds = value.get("type", "value")
+    return " ".join(
+        [" or ".join(_KINDS.get(one, one) for one in ([kinds] if isinstance(kinds, str) else kinds)), *said]
+    )
 
 
 def _plain(text: str) -> str:
