@@ -283,13 +283,13 @@ def _wrench(i, parameters, motion, wrench):
 
 
 @njit(**OPTIONS)
-def _return(links, constants, i, frames, wrench, sign, tau):
-    """Add sign times body i's share to tau (n,), then its wrench to the parent's."""
+def _return(links, constants, i, frames, wrench, tau):
+    """Add body i's share to tau (n,), then its wrench to the parent's."""
     c, p = links[i, COORDINATE], links[i, PARENT]
     fx, fy, fz = wrench[i, 0], wrench[i, 1], wrench[i, 2]
     nx, ny, nz = wrench[i, 3], wrench[i, 4], wrench[i, 5]
     if c >= 0:
-        tau[c] += sign * constants[i, SCALE] * (nz if links[i, KIND] == REVOLUTE else fz)
+        tau[c] += constants[i, SCALE] * (nz if links[i, KIND] == REVOLUTE else fz)
     if p >= 0:
         gx = frames[i, 0] * fx + frames[i, 1] * fy + frames[i, 2] * fz
         gy = frames[i, 3] * fx + frames[i, 4] * fy + frames[i, 5] * fz
@@ -324,92 +324,9 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
             advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
             _wrench(i, parameters, motion, wrench)
         for i in range(bodies - 1, -1, -1):
-            _return(links, constants, i, frames, wrench, 1.0, tau)
+            _return(links, constants, i, frames, wrench, tau)
         for j in range(tau.shape[0]):
             out[sample, j] = tau[j]
-
-
-@njit(**OPTIONS)
-def _compose(links, i, frames, composite):
-    """Add the parameters of body i, taken to its parent's frame, to the parent's (rows of `composite`, (B, 10)).
-
-    J about the parent's origin = R J Rᵀ + (2 t·h + M t·t) 1 - (h tᵀ + t hᵀ) - M t tᵀ, h in the parent's axes.
-    """
-    p = links[i, PARENT]
-    if p < 0:
-        return
-    xx, xy, xz = composite[i, 0], composite[i, 1], composite[i, 2]
-    yy, yz, zz = composite[i, 3], composite[i, 4], composite[i, 5]
-    bx, by, bz, mass = composite[i, 6], composite[i, 7], composite[i, 8], composite[i, 9]
-    t00, t01, t02 = frames[i, 0], frames[i, 1], frames[i, 2]
-    t10, t11, t12 = frames[i, 3], frames[i, 4], frames[i, 5]
-    t20, t21, t22 = frames[i, 6], frames[i, 7], frames[i, 8]
-    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
-    hx, hy, hz = t00 * bx + t01 * by + t02 * bz, t10 * bx + t11 * by + t12 * bz, t20 * bx + t21 * by + t22 * bz
-    ax, ay, az = xx * t00 + xy * t01 + xz * t02, xy * t00 + yy * t01 + yz * t02, xz * t00 + yz * t01 + zz * t02
-    cx, cy, cz = xx * t10 + xy * t11 + xz * t12, xy * t10 + yy * t11 + yz * t12, xz * t10 + yz * t11 + zz * t12
-    first = t00 * ax + t01 * ay + t02 * az
-    second = t10 * cx + t11 * cy + t12 * cz
-    hxx, hyy, hzz = (2.0 * hx + mass * x) * x, (2.0 * hy + mass * y) * y, (2.0 * hz + mass * z) * z
-    composite[p, 0] += first + hyy + hzz
-    composite[p, 1] += t10 * ax + t11 * ay + t12 * az - hx * y - hy * x - mass * x * y
-    composite[p, 2] += t20 * ax + t21 * ay + t22 * az - hx * z - hz * x - mass * x * z
-    composite[p, 3] += second + hxx + hzz
-    composite[p, 4] += t20 * cx + t21 * cy + t22 * cz - hy * z - hz * y - mass * y * z
-    composite[p, 5] += xx + yy + zz - first - second + hxx + hyy  # the trace does not turn
-    composite[p, 6] += hx + mass * x
-    composite[p, 7] += hy + mass * y
-    composite[p, 8] += hz + mass * z
-    composite[p, 9] += mass
-
-
-@njit(**OPTIONS)
-def _inertia(links, constants, frames, composite, matrix):
-    """Add the joint-space inertia to matrix (n, n) (composite rigid bodies; Walker & Orin 1982).
-
-    A unit rate of joint i gives the composite body behind it a momentum; its share in every joint before is M_ci.
-    """
-    for i in range(frames.shape[0] - 1, -1, -1):
-        _compose(links, i, frames, composite)
-        c, k, weight = links[i, COORDINATE], i, constants[i, SCALE]
-        if c < 0:
-            continue
-        if links[i, KIND] == REVOLUTE:
-            fx, fy, fz = -composite[i, 7], composite[i, 6], 0.0
-            nx, ny, nz = composite[i, 2], composite[i, 4], composite[i, 5]
-            matrix[c, c] += weight * weight * nz
-        else:
-            fx, fy, fz = 0.0, 0.0, composite[i, 9]
-            nx, ny, nz = composite[i, 7], -composite[i, 6], 0.0
-            matrix[c, c] += weight * weight * fz
-        while links[k, PARENT] >= 0:
-            gx = frames[k, 0] * fx + frames[k, 1] * fy + frames[k, 2] * fz
-            gy = frames[k, 3] * fx + frames[k, 4] * fy + frames[k, 5] * fz
-            gz = frames[k, 6] * fx + frames[k, 7] * fy + frames[k, 8] * fz
-            x, y, z = frames[k, 9], frames[k, 10], frames[k, 11]
-            mx = frames[k, 0] * nx + frames[k, 1] * ny + frames[k, 2] * nz + y * gz - z * gy
-            my = frames[k, 3] * nx + frames[k, 4] * ny + frames[k, 5] * nz + z * gx - x * gz
-            mz = frames[k, 6] * nx + frames[k, 7] * ny + frames[k, 8] * nz + x * gy - y * gx
-            fx, fy, fz, nx, ny, nz = gx, gy, gz, mx, my, mz
-            k = links[k, PARENT]
-            d = links[k, COORDINATE]
-            if d >= 0:
-                share = weight * constants[k, SCALE] * (nz if links[k, KIND] == REVOLUTE else fz)
-                matrix[c, d] += share
-                matrix[d, c] += share
-
-
-@njit(**OPTIONS)
-def mass_matrix(links, constants, parameters, amount, cosine, sine, out):
-    """Fill out (N, n, n), zero on entry, with the joint-space inertia."""
-    bodies = amount.shape[1]
-    frames, composite = np.empty((bodies, 12)), np.empty((bodies, 10))
-    for sample in range(amount.shape[0]):
-        for i in range(bodies):
-            place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
-            for k in range(10):
-                composite[i, k] = parameters[10 * i + k]
-        _inertia(links, constants, frames, composite, out[sample])
 
 
 @njit(**OPTIONS)

@@ -136,13 +136,10 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the joint-space inertia M(q) of the bodies, (N, n, n)."""
-    from calib.dynamics import kernels
-
-    (q,) = _states(bodies, q=q)
-    out = np.zeros((len(q), bodies.n, bodies.n))
-    kernels.mass_matrix(bodies.links, bodies.constants, kernel_parameters(bodies, parameters), *_placed(bodies, q), out)
-    return out
+    """Return the joint-space inertia M(q) of the bodies, (N, n, n), each column the torques of a unit acceleration."""
+    q, free = np.asarray(q, dtype=float), bodies.with_gravity(np.zeros(3))
+    units = (np.broadcast_to(one, q.shape) for one in np.eye(bodies.n))
+    return np.stack([inverse_dynamics(free, parameters, q, np.zeros_like(q), one) for one in units], axis=2)
 
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:

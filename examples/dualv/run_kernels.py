@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS, inverse_dynamics, mass_matrix
+from calib.dynamics.kernels import OPTIONS, inverse_dynamics
 from calib.rooms.parallel.mechanism.closure_kernels import SCALE, invert, one_leg
 
 
@@ -147,20 +147,20 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
         drives: (n, 5); q, rates, tau: (n,); J: (n, r) of its joints.
     """
     n, r = q.shape[0], h.shape[0]
-    rows, inertia = np.zeros((6, 1, n)), np.zeros((1, n, n))
+    rows = np.zeros((6, n + 1, n))  # of the motion, and of the same with one joint accelerating by one more
     amount, cosine, sine, v, a, need = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
     for j in range(n):
-        amount[0, j], v[0, j] = constants[j, SCALE] * q[j], rates[j]
-        cosine[0, j], sine[0, j] = np.cos(amount[0, j]), np.sin(amount[0, j])
+        amount[:, j], v[:, j] = constants[j, SCALE] * q[j], rates[j]
+        cosine[:, j], sine[:, j] = np.cos(amount[0, j]), np.sin(amount[0, j])
         for m in range(held):
             bent = -shift[m]
             for b in range(6):
                 bent += carried[m, b] * still[b]
-            a[0, j] += inverse[j, m] * bent
+            a[:, j] += inverse[j, m] * bent
+        a[j + 1, j] += 1.0
     inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, need)
-    mass_matrix(links, constants, parameters, amount, cosine, sine, inertia)
+    inertia = (need[1:] - need[0]).T + np.diag(drives[:, 0])
     for j in range(n):
-        inertia[0, j, j] += drives[j, 0]
         need[0, j] += drives[j, 0] * a[0, j] + drives[j, 1] * v[0, j] + drives[j, 3] - tau[j]
         need[0, j] += drives[j, 2] * np.tanh(v[0, j] / drives[j, 4])
     for i in range(r):
@@ -168,7 +168,7 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
             h[i] += J[j, i] * need[0, j]
             for k in range(n):
                 for m in range(r):
-                    M[i, m] += J[j, i] * inertia[0, j, k] * J[k, m]
+                    M[i, m] += J[j, i] * inertia[j, k] * J[k, m]
 
 
 @njit(**OPTIONS)
