@@ -243,24 +243,6 @@ def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], 
     return Joined(x, v, a, load, state)  # type: ignore[arg-type]
 
 
-def asymmetric(joint: int, edge: float = math.inf) -> tuple[DriveTerm, ...]:
-    """Return ``Fva``: viscous friction that differs by direction, tau += Fva abs(v).
-
-    Fv ± Fva are the coefficients of the two directions; a Coulomb torque that differs is Fc and off already.
-    """
-    return (term(f"Fva{joint + 1}", "speed", joint, edge),)
-
-
-def cubic(joint: int, edge: float = math.inf) -> tuple[DriveTerm, ...]:
-    """Return ``Fvc``: tau += Fvc v³, viscous friction that bends with speed."""
-    return (term(f"Fvc{joint + 1}", "cubic", joint, edge),)
-
-
-def root(joint: int, v0: float = V0, edge: float = math.inf) -> tuple[DriveTerm, ...]:
-    """Return ``Fvr``: tau += Fvr v / sqrt(abs(v) + v0), the root of the speed, regular at rest."""
-    return (term(f"Fvr{joint + 1}", "root", joint, edge, v0),)
-
-
 def stribeck(joint: int, vs: float, exponent: float = 1.0, v0: float = V0) -> tuple[DriveTerm, ...]:
     """Return ``Fs``: tau += Fs sign(v) exp(-(abs(v) / vs)^exponent) (Stribeck; exponents 1 and 2 are in use)."""
     return (term(f"Fs{joint + 1}", "stribeck", joint, vs, exponent, v0),)
@@ -294,12 +276,3 @@ def cable(joint: int, travel: float) -> tuple[DriveTerm, ...]:
         for k in range(1, CABLE_ORDERS + 1)
         for name, shape in (("Cs", "sine"), ("Cc", "cosine"))
     )
-
-
-def ripple(joint: int, orders: Sequence[float], speed: float = float("inf")) -> tuple[DriveTerm, ...]:
-    """Return sine and cosine of k · q per order k [per rad], ``Rs3.241 Rc3.241``, fading as 1 / (1 + (v / speed)²)."""
-    found: list[DriveTerm] = []
-    for order in orders:
-        for name, shape in (("Rs", "sine"), ("Rc", "cosine")):
-            found.append(term(f"{name}{joint + 1}.{order:g}", shape, joint, order, speed))
-    return tuple(found)

@@ -16,11 +16,11 @@ TX40 = load("tx40")
 SMOOTH = (
     drives.standard(["Ia Fv Fc off"] * 6, v0=0.5)
     + drives.coupled(4, 5, v0=0.5)
-    + drives.asymmetric(0)
-    + drives.cubic(1)
-    + drives.root(2, 0.3)
+    + (drives.term("Fva1", "speed", 0),)
+    + (drives.term("Fvc2", "cubic", 1),)
+    + (drives.term("Fvr3", "root", 2, 0.3),)
     + drives.stribeck(3, 0.4, 2.0, 0.5)
-    + drives.ripple(4, [3.0, 5.0], 0.7)
+    + tuple(drives.term(f"{shape}{k}", shape, 4, k, 0.7) for k in (3, 5) for shape in ("sine", "cosine"))
 )
 
 
@@ -131,10 +131,9 @@ def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
 
 def test_ripple_fades_with_speed():
     q, v, a = states(6)
-    model = IdentificationModel(bodies_of(TX40), drives.ripple(0, [241.0], 0.5))
-    assert model.names[-2:] == ("Rs1.241", "Rc1.241")
+    model = IdentificationModel(bodies_of(TX40), (drives.term("Rs", "sine", 0, 241.0, 0.5),))
     wanted = np.sin(241 * q[:, 0]) / (1 + (v[:, 0] / 0.5) ** 2)
-    assert np.allclose(column(model, "Rs1.241", q, v, a)[:, 0], wanted, rtol=0, atol=1e-14)
+    assert np.allclose(column(model, "Rs", q, v, a)[:, 0], wanted, rtol=0, atol=1e-14)
 
 
 def test_units_of_a_prismatic_joint():

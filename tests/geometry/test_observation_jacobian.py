@@ -68,11 +68,11 @@ def test_target_positions_and_rotations(name):
     )
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
+@pytest.mark.parametrize("effect", EFFECTS)
 @pytest.mark.parametrize("known", [True, False])
 def test_every_effect_of_the_ladder(effect, known):
     chain = load("ur5")
-    terms = effect.terms(chain, known)[:24]
+    terms = EFFECTS[effect](chain, known)[:24]
     values = 1e-3 * np.random.default_rng(0).normal(size=len(terms))
     truth = replace(cell(perturb(chain, 2), 1), deflection=Deflection(tuple(terms), values, chain))
     measured = measure(truth, "pose", 5, torque=torques)

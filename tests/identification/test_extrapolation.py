@@ -37,15 +37,17 @@ def without_friction(case: Case) -> Case:
     return replace(case, target=frozen(case.target - friction))
 
 
-@pytest.mark.parametrize("one", [drives.cubic(0, 2.0), drives.asymmetric(0, 2.0), drives.root(0, 0.01, 2.0)])
+@pytest.mark.parametrize(
+    "one", [drives.term("F", shape, 0, 2.0, *more) for shape, *more in (("cubic",), ("speed",), ("root", 0.01))]
+)
 def test_a_shape_that_bends_keeps_its_value_beyond_the_edge(one):
     def at(v: float) -> float:
         state = np.array([0.0]), np.array([v]), np.array([0.0])
-        return float(one[0].values(Joined(*state))[0])
+        return float(one.values(Joined(*state))[0])
 
     assert at(6.0) == at(2.0) != at(1.0)
     assert at(-6.0) == at(-2.0)
-    free = replace(one[0], settings=one[0].settings[1:])  # as files of before say it: no edge
+    free = replace(one, settings=one.settings[1:])  # as files of before say it: no edge
     assert free.settings[0] == np.inf
 
 

@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 
+from calib.data.poses.choices import MODELS as CHOICES
 from calib.robot.chain import Chain
 from calib.robot.deflection import Term
 
 MAX_ORDER = 60
 WOBBLE_ORDER = 2
-
-
-@dataclass(frozen=True)
-class Effect:
-    """A rung of the ladder above the geometry.
-
-    Attributes:
-        name: as ``--model`` knows it.
-        says: what it is, for people.
-        terms: chain, are gravity torques known -> terms; terms that share a key get one ridge.
-
-    """
-
-    name: str
-    says: str
-    terms: Callable[[Chain, bool], list[Term]]
 
 
 def _stiffness(chain: Chain, known: bool) -> list[Term]:
@@ -80,14 +62,9 @@ def _wobble(chain: Chain, known: bool) -> list[Term]:
     ]
 
 
-EFFECTS = (
-    Effect("stiffness", "sag of the joints about their axes", _stiffness),
-    Effect("bending", "sag across the axes: bearings and links", _bending),
-    Effect("coupling", "gear ratios and coupling of neighbouring axes", _coupling),
-    Effect("harmonics", "errors repeating with a joint's turn", _harmonics),
-    Effect("wobble", "axes that wobble as they turn", _wobble),
-)
-MODELS = ("frames", "offsets", "geometry", *(effect.name for effect in EFFECTS))
+MODELS: tuple[str, ...] = CHOICES[1:]
+# by name: from a chain, and whether gravity torques are known, to terms
+EFFECTS = dict(zip(MODELS[3:], (_stiffness, _bending, _coupling, _harmonics, _wobble), strict=True))
 
 
 def term_groups(terms: tuple[Term, ...]) -> np.ndarray:

@@ -20,7 +20,7 @@ from calib.errors import UsageError, one_of
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import FoldStatistics, blind_folds, fold_statistics
-from calib.geometry.model_choice.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
+from calib.geometry.model_choice.effects import EFFECTS, MODELS, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
 from calib.geometry.observation import prepare
 from calib.geometry.parameters import layout
@@ -134,7 +134,7 @@ def select_model(
     if settings.loss == "auto" and climber.best.outliers(GROSS):
         climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell, seed)
         climber.rigid(model)
-    if model == "auto" or model in [effect.name for effect in EFFECTS]:
+    if model == "auto" or model in EFFECTS:
         climber.effects(model)
     return climber.result()
 
@@ -212,13 +212,13 @@ class _Climber:
         """
         if self.full is None or (model != "auto" and self.chosen != "geometry"):
             return
-        offered = {effect.name: self._terms(effect) for effect in EFFECTS}
+        offered = {name: self._terms(name) for name in EFFECTS}
         everything = tuple(term for terms in offered.values() for term in terms)
         self._tick("observation matrix")
         statistics = self._statistics(self.full, everything)
         place = _places(offered)
         before = self.chosen, self.best, tuple(self.rungs)
-        names = [effect.name for effect in EFFECTS]
+        names = list(EFFECTS)
         if model == "auto":
             climbed = len(self.rungs)
             kept = self._greedy(statistics, offered, place)
@@ -309,11 +309,11 @@ class _Climber:
         found = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
         return replace(found, start=self.best.start, split=self.best.split, candidates=self.best.candidates)
 
-    def _terms(self, effect: Effect) -> list[Term]:
+    def _terms(self, effect: str) -> list[Term]:
         """Return an effect's terms, harmonics only up to what so many poses can ever tell."""
         known = self.torques is not None and all(torque is not None for torque in self.torques)
         highest = sum(len(block) for block in self.measured) // POSES_PER_ORDER
-        terms = effect.terms(self.nominal.cell.chain, known)
+        terms = EFFECTS[effect](self.nominal.cell.chain, known)
         return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
 
     def _statistics(self, found: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:

@@ -37,8 +37,31 @@ WINS = 0.6  # and on this share of the blocks
 SAMPLES = 3000  # of the rows that couplings are sought in, about
 SWITCHED_OFF = 1e-9  # σ of a term below which its ridge holds it at zero
 MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
-STEPS = ("coupling", "load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
-NAMES = ("auto", "standard", *STEPS, "ripple")
+
+
+@dataclass(frozen=True)
+class _JointRange:
+    """What a joint did: smoothing of its sign, speed that it hardly passes, fastest speed [rad/s], travel [rad]."""
+
+    v0: float
+    peak: float
+    edge: float
+    travel: float
+
+
+STEPS: dict[str, Callable[[int, _JointRange], Sequence[DriveTerm]]] = {
+    "load": lambda j, seen: drives.load_dependent(j, seen.v0, viscous=True, edge=seen.edge),
+    "presliding": lambda j, seen: drives.presliding(j, [seen.travel * x for x in WIDTHS], seen.v0),
+    "cable": lambda j, seen: drives.cable(j, seen.travel),
+    "stribeck": lambda j, seen: (
+        drives.term(f"Fs{j + 1}", "stribeck", j, 0.05 * seen.peak, 1.0, seen.v0),
+        drives.term(f"Fs{j + 1}.2", "stribeck", j, 0.2 * seen.peak, 1.0, seen.v0),
+    ),
+    "asymmetric": lambda j, seen: (drives.term(f"Fva{j + 1}", "speed", j, seen.edge),),
+    "root": lambda j, seen: (drives.term(f"Fvr{j + 1}", "root", j, seen.edge, seen.v0),),
+    "cubic": lambda j, seen: (drives.term(f"Fvc{j + 1}", "cubic", j, seen.edge),),
+}
+NAMES = ("auto", "standard", "coupling", *STEPS, "ripple")
 
 Progress = Callable[[str], None]
 
@@ -151,7 +174,7 @@ def select_friction(
     one_of(wanted, NAMES, "friction", UsageError)
     say("friction: columns")
     sensed = candidates.torque_rows.sensed
-    steps_tried = [name for name in STEPS if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
+    steps_tried = [name for name in NAMES[2:-1] if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
     offered = {name: _terms(candidates, name) for name in steps_tried}
     offered = {name: terms for name, terms in offered.items() if terms or name == wanted}
     every = [one for terms in offered.values() for one in terms]
@@ -266,24 +289,10 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
         return _couplings(candidates)
     for j in range(candidates.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
-        peak, edge = float(np.quantile(v, 0.98)), float(v.max())
-        if peak <= 0.0:
-            continue
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
-        v0 = float(candidates.v0[j])
-        terms = {
-            "load": lambda: drives.load_dependent(j, v0, viscous=True, edge=edge),  # noqa: B023
-            "cable": lambda: drives.cable(j, travel),  # noqa: B023
-            "presliding": lambda: drives.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
-            "stribeck": lambda: (
-                *drives.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
-                replace(drives.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
-            ),
-            "asymmetric": lambda: drives.asymmetric(j, edge),  # noqa: B023
-            "root": lambda: drives.root(j, v0, edge),  # noqa: B023
-            "cubic": lambda: drives.cubic(j, edge),  # noqa: B023
-        }[name]()
-        found += [replace(one, linear=bool(candidates.linear[j])) for one in terms]
+        seen = _JointRange(float(candidates.v0[j]), float(np.quantile(v, 0.98)), float(v.max()), travel)
+        if seen.peak > 0.0:
+            found += [replace(one, linear=bool(candidates.linear[j])) for one in STEPS[name](j, seen)]
     return found
 
 

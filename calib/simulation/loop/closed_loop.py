@@ -174,40 +174,6 @@ def simulate(
     return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
 
 
-def simulate_many(
-    plant: Plant, controller: Controller, reference: Reference, parameters: np.ndarray,
-    sensing: Sensing | None = None, seeds: Sequence[int] | None = None, threads: int | None = None,
-) -> list[SimulatedRun | NotConverged]:  # fmt: skip
-    """Let robots with these parameters follow one reference, each with noise of its own, side by side in threads.
-
-    The compiled loop holds no lock of the interpreter.
-
-    Args:
-        parameters: (K, p) of the plant.
-        seeds: K; None: 0 for all.
-        threads: None: as many as numba may use.
-
-    Returns:
-        K runs; in place of one that cannot be followed to its end the failure, `CannotSimulate` or `Diverged`.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    from calib.simulation.loop.loop_kernels import threads_allowed
-
-    values = shaped(parameters, (None, len(plant.parameters)), "parameters")
-    own = [0] * len(values) if seeds is None else list(seeds)
-    require(len(own) == len(values), f"{len(own)} seeds for {len(values)} parameter vectors")
-
-    def one(k: int) -> SimulatedRun | NotConverged:
-        try:
-            return simulate(replace(plant, parameters=values[k]), controller, reference, sensing, own[k])
-        except NotConverged as error:
-            return error
-
-    with ThreadPoolExecutor(threads or threads_allowed()) as pool:
-        return list(pool.map(one, range(len(values))))
-
-
 def sample_ticks(count: int, every: float) -> np.ndarray:
     """Return the control periods, whole or not, at which samples of `count` periods are recorded."""
     return np.arange(int((count - 1) / every + 1e-9) + 1) * every

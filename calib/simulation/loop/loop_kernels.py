@@ -25,7 +25,7 @@ from __future__ import annotations
 from math import cos, sin, sqrt
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import njit
 
 from calib.dynamics.kernels import OPTIONS
 from calib.dynamics.shape_kernels import (
@@ -45,11 +45,6 @@ MOST = 64  # steps that friction may ask for in one period
 BRISK = 1.5  # reciprocals of friction's fastest decay in a step of the midpoint rule, which is stable up to 2
 REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: one period away at most 6 v0
 FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
-
-
-def threads_allowed() -> int:
-    """Return how many threads numba may use here: workers are given fewer than the machine has."""
-    return int(get_num_threads())
 
 
 @njit(**JOINED)

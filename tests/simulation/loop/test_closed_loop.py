@@ -11,12 +11,12 @@ from scipy.interpolate import CubicSpline
 
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
-from calib.errors import CalibError, CannotSimulate, NotConverged
+from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, forward_dynamics, simulate, simulate_many
+from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
 from calib.simulation.loop.references import Reference
 from calib.transforms import displace
 
@@ -269,16 +269,3 @@ def test_the_better_model_tracks_better():
     rough = replace(plant, parameters=1.2 * plant.parameters)
     none, poor, good = (tracking_error(plant, one, controller, reference) for one in (None, rough, plant))
     assert np.all(good < poor) and np.all(poor < none)
-
-
-def test_many_robots_run_side_by_side_and_one_that_cannot_ends_nothing():
-    plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion(duration=0.2)
-    sensing = Sensing(1e-6, sigma_tau=0.1, every=5)
-    values = np.array([plant.parameters, -plant.parameters, 1.1 * plant.parameters])
-    first, second, third = simulate_many(plant, controller, reference, values, sensing, [4, 5, 6], threads=2)
-    assert isinstance(second, CannotSimulate) and "not positive definite" in str(second)
-    for run, row, seed in ((first, 0, 4), (third, 2, 6)):
-        alone = simulate(replace(plant, parameters=values[row]), controller, reference, sensing, seed)
-        assert isinstance(run, SimulatedRun) and np.array_equal(run.q, alone.q) and np.array_equal(run.tau, alone.tau)
-    with pytest.raises(CalibError, match="seeds"):
-        simulate_many(plant, controller, reference, values, seeds=[1])
