@@ -256,7 +256,7 @@ def test_counts_do_not_depend_on_the_frames():
 
 def test_richer_friction_has_columns_of_its_own():
     chain = load("ur5")
-    rich = friction.asymmetric(1) + friction.load_dependent(1) + friction.presliding(1, [0.01, 0.05])
+    rich = (friction.term("Fva2", "speed", 1), *friction.load_dependent(1), *friction.presliding(1, [0.01, 0.05]))
     plain = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * 6))
     full = IdentificationModel(bodies_of(chain), plain.terms + rich)
     assert base.find(full).b == base.find(plain).b + 4

@@ -54,7 +54,7 @@ def test_nothing_is_added_to_a_plain_robot():
     [
         ("load", friction.load_dependent(1), 0.1),
         pytest.param("presliding", friction.presliding(1, [0.02]), 2.0, marks=pytest.mark.slow),
-        pytest.param("asymmetric", friction.asymmetric(1), 0.5, marks=pytest.mark.slow),
+        pytest.param("asymmetric", (friction.term("Fva2", "speed", 1),), 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calib.data.poses.choices import MODELS as CHOICES
@@ -62,9 +64,10 @@ def _wobble(chain: Chain, known: bool) -> list[Term]:
     ]
 
 
-MODELS: tuple[str, ...] = CHOICES[1:]
+MODELS = CHOICES[1:]
+FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
 # by name: from a chain, and whether gravity torques are known, to terms
-EFFECTS = dict(zip(MODELS[3:], (_stiffness, _bending, _coupling, _harmonics, _wobble), strict=True))
+EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
 
 
 def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
