@@ -6,7 +6,7 @@ Each is written whole, beside its place, then moved there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ REHEARSAL = "rehearsal.csv"
 FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
 ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, prediction.NAME, "front.csv", "approach.csv", REHEARSAL, *FIGURES)
 """Files of an earlier run that a new one replaces."""
+KINDS = ("position", "velocity", "acceleration", "torque")  # of limits, as `motion_units` has them
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
 
 
@@ -138,38 +139,27 @@ def _periodic(designed: Designed) -> Periodic:
 def design_metrics(designed: Designed) -> dict[str, Any]:
     """Return the content of ``metrics.json`` of a designed motion."""
     found, given, settings, family = designed.found, designed.inputs, designed.settings, designed.family
-    return {
-        "condition_number": designed.condition.table(),
-        "objective": found.merit,
-        "feasible": designed.proof.feasible,
-        "margins": {
-            name: {
-                "margin": one.margin, "unit": one.unit, "at": one.label, "time": one.time, "share": one.share,
-                "allowance": one.allowance, "proved": one.proved,
-            }
-            for name, one in designed.proof.worst.items()
-        },
-        "seconds": found.seconds,
-        "evaluations": found.evaluations,
-        "feasible_evaluations": found.feasible,
-        "history": list(found.history),
+    played = designed.playback
+    return plain({
+        "condition_number": designed.condition.table(), "objective": found.merit, "feasible": designed.proof.feasible,
+        "margins": {name: plain(one) | {"at": one.label} for name, one in designed.proof.worst.items()},
+        "seconds": found.seconds, "evaluations": found.evaluations, "feasible_evaluations": found.feasible,
+        "history": found.history,
         "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
         "setting": {
             "robot": given.chain.name, "family": settings.family, "period": designed.period,
-            "harmonics": list(getattr(family, "harmonics", getattr(family, "counts", ()))),
-            "columns": list(given.columns.names), "samples": designed.problem.samples,
+            "harmonics": getattr(family, "harmonics", getattr(family, "counts", ())),
+            "columns": given.columns.names, "samples": designed.problem.samples,
             "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": settings.rate,
             "interrupted": found.interrupted, "held": designed.locked,
         },
-        "existing": None if given.prior is None else {"names": list(given.prior.names), "seconds": given.prior.seconds},
+        "existing": None if given.prior is None else {"names": given.prior.names, "seconds": given.prior.seconds},
         "playback": {
-            "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
-            "approach": _seconds(designed.playback.approach), "rehearsal": _seconds(designed.playback.rehearsal),
+            "repeat": played.repeat, "seconds": played.run.duration, "approach": _seconds(played.approach),
+            "rehearsal": _seconds(played.rehearsal),
         },
-        "prediction": plain(designed.outlook),
-        "limits": given.limits.bounds.lines(),
-        "notes": list(designed.notes),
-    }  # fmt: skip
+        "prediction": designed.outlook, "limits": given.limits.bounds.lines(), "notes": designed.notes,
+    })  # fmt: skip
 
 
 def _seconds(track: Setpoints | None) -> float | None:
@@ -215,37 +205,24 @@ def _together(designed: Designed) -> list[str]:
 
 
 def plan_metrics(planned: Planned) -> dict[str, Any]:
-    """Return the content of ``metrics.json``."""
-    seconds = np.array([one.duration for one in planned.timings])
-    shaped = planned.shaped
-    return {
-        "feasible": True,
-        "duration": planned.track.duration,
-        "margins": {name: asdict(one) for name, one in _margins(planned).items()},
-        "active_share": _active_share(planned),
-        "active_within": ACTIVE,
+    """Return the content of ``metrics.json`` of a planned motion."""
+    shaped, deviation = planned.shaped, planned.deviation
+    return plain({
+        "feasible": True, "duration": planned.track.duration, "margins": _margins(planned),
+        "active_share": _active_share(planned), "active_within": ACTIVE,
         "iterations": sum(one.iterations for one in planned.timings),
         "tightened": max(one.tightened for one in planned.timings),
-        "history": [list(one.history) for one in planned.timings],
-        "segments": seconds.tolist(),
-        "rate": planned.track.rate,
-        "samples": len(planned.track),
-        "samples_verified": _verified(planned),
-        "line_deviation": None
-        if planned.deviation is None
-        else {"position": float(planned.deviation[0]), "orientation": float(planned.deviation[1])},
-        "shortened": None
-        if shaped is None
-        else {
+        "history": [one.history for one in planned.timings],
+        "segments": [one.duration for one in planned.timings], "rate": planned.track.rate,
+        "samples": len(planned.track), "samples_verified": _verified(planned),
+        "line_deviation": None if deviation is None else dict(zip(("position", "orientation"), deviation.tolist())),
+        "shortened": None if shaped is None else {
             "before": shaped.before, "after": shaped.after, "evaluations": shaped.evaluations,
-            "refused": shaped.refused, "parameters": shaped.phi.tolist(),
+            "refused": shaped.refused, "parameters": shaped.phi,
         },
-        "torque_sigma": None if planned.sigma is None else planned.sigma.tolist(),
-        "torque_limits": [float(x) if np.isfinite(x) else None for x in planned.limits.torque],
-        "approach": _seconds(planned.approach),
-        "limits": planned.bounds.lines(),
-        "notes": list(planned.notes),
-    }  # fmt: skip
+        "torque_sigma": planned.sigma, "torque_limits": planned.limits.torque,
+        "approach": _seconds(planned.approach), "limits": planned.bounds.lines(), "notes": planned.notes,
+    })  # fmt: skip
 
 
 def plan_lines(planned: Planned) -> list[str]:
@@ -280,8 +257,9 @@ class _PlanMargin:
 
 
 def _active_share(planned: Planned) -> float:
-    seconds = np.array([one.duration for one in planned.timings])
-    return float(seconds @ [one.active_share for one in planned.timings] / seconds.sum())
+    """Return the share of the time for which a limit is all but reached."""
+    seconds = [one.duration for one in planned.timings]
+    return float(np.average([one.active_share for one in planned.timings], weights=seconds))
 
 
 def _verified(planned: Planned) -> int:
@@ -291,20 +269,13 @@ def _verified(planned: Planned) -> int:
 def _margins(planned: Planned) -> dict[str, _PlanMargin]:
     """Return the smallest margin of every limit, by name."""
     used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
-    return {"position": _nearest(planned)} | {name: _margin(planned, name, x) for name, x in used.items()}
-
-
-def _margin(planned: Planned, name: str, used: np.ndarray) -> _PlanMargin:
-    size = getattr(planned.limits, name)
-    share = 1.0 - used.max(axis=0)
-    j = int(np.argmin(share))
-    joint = planned.chain.joints[j]
-    unit = motion_units([joint.kind])[("position", "velocity", "acceleration", "torque").index(name)]
-    return _PlanMargin(float(share[j] * size[j]), unit, joint.name, float(share[j]), share.tolist())
-
-
-def _nearest(planned: Planned) -> _PlanMargin:
-    j = int(np.argmin(planned.margins))
-    joint = planned.chain.joints[j]
-    share = float(planned.margins[j] / (planned.upper[j] - planned.lower[j]))
-    return _PlanMargin(float(planned.margins[j]), joint.unit, joint.name, share, planned.margins.tolist())
+    left = {name: 1.0 - shares.max(axis=0) for name, shares in used.items()}  # shares of the limits
+    result = {}
+    for name, joints in ({"position": planned.margins} | left).items():
+        j = int(np.argmin(joints))
+        joint, size = planned.chain.joints[j], planned.upper - planned.lower
+        share = joints[j] / size[j] if name == "position" else joints[j]
+        margin = joints[j] if name == "position" else joints[j] * getattr(planned.limits, name)[j]
+        unit = motion_units([joint.kind])[KINDS.index(name)]
+        result[name] = _PlanMargin(float(margin), unit, joint.name, float(share), joints.tolist())
+    return result

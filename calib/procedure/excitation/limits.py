@@ -184,12 +184,12 @@ def read_motion_limits(
     boxes = box_limits(found.lower, found.upper, velocity, bounds.acceleration, jerk, linear=linear)
     constraints: list[MotionConstraint] = [*boxes]
     constraints += _places(stated, found, points)
-    if found.collision is not None:
-        constraints.append(_clearance(found))
     notes = list(found.notes)
     if found.collision is None:
         notes.append(_unchecked(path))
     else:
+        names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
+        constraints.append(Clearance(found.collision.distances, found.collision.gradients, names, found.clearance))
         sets = (("kept", found.checked), ("NOT checked", found.unchecked))
         notes += [f"{words}: {', '.join(names)}" for words, names in sets if names]
     return MotionLimits(
@@ -276,24 +276,11 @@ class _PoseLimit:
     """A constraint of pose selection, kept along a motion."""
 
     of: PoseConstraint
-    count: int
+    name: str
+    labels: tuple[str, ...]
+    scale: np.ndarray
+    groups: np.ndarray
     unit: str = ""
-
-    @property
-    def name(self) -> str:
-        return self.of.name
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"{self.of.name} {k + 1}" for k in range(self.count))
-
-    @property
-    def scale(self) -> np.ndarray:
-        return np.ones(self.count)
-
-    @property
-    def groups(self) -> np.ndarray:
-        return np.arange(self.count)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         return np.asarray(self.of.function(motion.q), dtype=float)
@@ -315,12 +302,11 @@ def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionCon
         result.append(Workspace(points, points.product, names, radius, lowest, highest))
     others = [one for one in found.constraints if one.name not in ("height", "distance from the axis")]
     still = np.zeros((1, len(found.lower)))
-    return result + [_PoseLimit(one, np.asarray(one.function(still)).shape[1]) for one in others]
-
-
-def _clearance(found: Limits) -> Clearance:
-    names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
-    return Clearance(found.collision.distances, found.collision.gradients, names, found.clearance)
+    for one in others:
+        k = np.asarray(one.function(still)).shape[1]
+        labels = tuple(f"{one.name} {j + 1}" for j in range(k))
+        result.append(_PoseLimit(one, one.name, labels, np.ones(k), np.arange(k)))
+    return result
 
 
 def _per_joint(
