@@ -1,4 +1,4 @@
-"""What is left of an error that nobody foresaw: one message, and a file that can be sent to whoever mends it.
+"""What is left of an internal error: one message, and a file that can be sent to whoever mends it.
 
 The file holds the command, versions, and where the program stood; of a person's data only what the error's own message
 quotes.
@@ -19,7 +19,7 @@ from calib import files
 from calib.errors import CalibError, brief
 
 CODE = 4
-"""Exit code of an error that nobody foresaw."""
+"""Exit code of an internal error."""
 PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "clarabel")
 
 

@@ -1,4 +1,4 @@
-"""Errors that nobody foresaw: one message, a code of their own, and a file for whoever mends them."""
+"""Internal errors: one message, a code of their own, and a file for whoever mends them."""
 
 from __future__ import annotations
 

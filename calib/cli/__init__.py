@@ -1,5 +1,5 @@
 """The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done
-but the verdict is fail, 2 input or usage, 3 not identifiable or not converged, 4 an error that nobody foresaw (what is
+but the verdict is fail, 2 input or usage, 3 not identifiable or not converged, 4 an internal error (what is
 needed to mend it stands in a file, see `calib.bug_reports`), 130 interrupted."""
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ GARBAGE = (20_000, 10, 10)
 
 EXIT_CODES = (
     "Exit codes: 0 done (the verdict is pass or marginal), 1 the verdict is fail, 2 input or usage, 3 not identifiable "
-    "or not converged, 4 an error that nobody foresaw: calib-bug-….txt says where."
+    "or not converged, 4 an internal error: calib-bug-….txt says where."
 )
 INTERRUPTED = "interrupted; nothing was left half-written"
 RESUMED = ("next", "redo", "demo", "study")  # keep what they have done; every other command starts over

@@ -44,7 +44,7 @@ def fit(
     """Fit the geometry of ROBOT to measured poses, and judge it.
 
     Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged, 4 an
-    error that nobody foresaw.
+    internal error.
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
 

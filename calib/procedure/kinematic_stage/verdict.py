@@ -175,10 +175,9 @@ def _turned(sets: Mapping[str, Comparison]) -> Verdict | None:
         if angles is not None and (size := float(np.degrees(_rms(angles)))) > TURNED:
             return Verdict(
                 "fail",
-                f"on {name} the calibrated arm's orientations are off by {size:.0f}° rms, as no calibrated arm's: is "
-                "the quaternion's order x y z w, is it the target's orientation seen from the instrument and not the "
-                "reverse, and did the target keep its orientation in the hand? Without qx qy qz qw the positions alone "
-                "are fitted",
+                f"on {name} the arm's orientations are off by {size:.0f}° rms: are quaternions x y z w, do angles mean "
+                "what euler says, is it the target's orientation seen from the instrument and not the reverse, did the "
+                "target turn in the hand? kind = 'position' in the options fits positions alone",
             )
     return None
 

@@ -135,7 +135,7 @@ def compare_methods(
             failed.append(ComparedMethod(name, " ".join(str(error).split())))
             each(failed[-1])
         except Exception as error:  # of one method: the others' results are not lost by it
-            failed.append(ComparedMethod(name, f"an error that nobody foresaw: {type(error).__name__}: {error}"))
+            failed.append(ComparedMethod(name, f"internal error: {type(error).__name__}: {error}"))
             each(failed[-1])
     ranked = _ranked(done, alike)
     return [
