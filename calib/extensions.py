@@ -1,14 +1,15 @@
 """What the rooms of `calib.rooms` add to the core, which imports none of them: found by folder, loaded at first use.
 
 A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and where, as ``module:name`` below the room
-(``:name`` for the package itself). The core asks for
+(``:name`` for the package itself, ``module:`` for a module). The core asks for
 
     commands               typer apps of `calib`
     topics, schemas        of `calib formats`: see `calib.procedure.formats`
     methods                of identification: tuples of `calib.identification.methods.method.MethodEntry`
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
-    detect_boards, estimate_lens   of images: see `calib.rooms.camera`
+    image_folders          a module: `read_images` reads a folder of images as a block of measurements
+    camera_guess           a module: cameras and boards placed by images, lenses completed
     recordings             functions: a session's folder → the name of the recording written there
 
 A room that is deleted takes its commands, methods and robots along; the rest works without.
@@ -60,4 +61,5 @@ def _offers() -> dict[str, dict[str, str]]:
 
 def _loaded(room: str, place: str) -> Any:
     module, _, name = place.rpartition(":")
-    return getattr(import_module(f"{room}.{module}" if module else room), name)
+    found = import_module(f"{room}.{module}" if module else room)
+    return getattr(found, name) if name else found

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = [name for name in ("calib", "poses", "trajectories") if (ROOT / name).is_dir()]
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -121,6 +123,41 @@ def test_the_walker_sees_every_form_of_import():
         "calib.robot.chain",
         "calib.estimation.columns",
     } <= names
+
+
+CORE = 39_000
+"""Code lines of all packages but the rooms: a newcomer reads the core alone. It may fall; growth needs a reason."""
+
+
+def test_the_core_can_be_read_alone():
+    """Code lines without blanks, comments and docstrings; no module of the core so much as names a room."""
+    core = {path: path.read_text(encoding="utf-8") for path in SOURCES if path.parts[len(ROOT.parts) + 1] != "rooms"}
+    named = [str(path) for path, text in core.items() if "import calib.rooms" in text or "from calib.rooms" in text]
+    assert named == [] and sum(map(code_lines, core.values())) <= CORE
+
+
+def code_lines(source: str) -> int:
+    tree, docs = ast.parse(source), set[int]()
+    for node in ast.walk(tree):
+        kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+        if isinstance(node, kinds) and ast.get_docstring(node) is not None:
+            docs |= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+    lines = enumerate(source.split("\n"), 1)
+    return sum(1 for k, line in lines if k not in docs and line.strip() and not line.strip().startswith("#"))
+
+
+def test_the_rooms_can_be_shut(monkeypatch):
+    """Without any room the core's commands, methods and formats are there; what a room offers is asked for by name."""
+    from calib import extensions
+    from calib.errors import UsageError
+
+    monkeypatch.setattr(extensions, "_offers", dict)
+    assert extensions.offered("commands") == [] and extensions.merged("stages") == {}
+    with pytest.raises(UsageError):
+        extensions.needed("camera_guess")
+    code = "import sys; sys.modules['calib.rooms'] = None; import calib; from calib.cli import run; "
+    code += "assert calib.load('tx40').chain.n == 6; sys.exit(run(['formats', 'mdh']))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True).returncode == 0
 
 
 def test_every_folder_with_modules_is_a_package():

@@ -18,7 +18,6 @@ from strategies import damaged
 
 from calib.data.camera.board import Board, read_board, write_board
 from calib.data.camera.camera_info import read_lens, write_lens
-from calib.data.camera.corner_file import Found, read_corners, write_corners
 from calib.data.camera.lens import pinhole
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.plans import read_poses
@@ -48,6 +47,7 @@ from calib.robot import description
 from calib.robot.formats import urdf_write
 from calib.robot.load import load
 from calib.rooms.camera.board_print import raster
+from calib.rooms.camera.corner_file import Found, read_corners, write_corners
 from calib.rooms.camera.detection import detect
 from calib.rooms.camera.images import decode as read_image_of
 from calib.rooms.camera.images import read_image

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.data.poses.pixels import Pixels
 from calib.errors import MeasurementError
-from calib.geometry.images.camera_guess import place_camera, seen_target
+from calib.extensions import needed
 from calib.geometry.images.hand_eye import average_pose, chordal_turns, place_pose
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
@@ -184,13 +184,7 @@ def _guess_from_poses(
 def _guess_from_images(
     block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    found = place_camera(block, arm)
-    if station is None and tool is None:
-        return found.placed.station, found.placed.tool
-    seen, own = seen_target(block.mounting, found.poses), arm[found.rows]
-    if station is not None:
-        return station, average_pose(invert(own) @ invert(station) @ seen)
-    return average_pose(seen @ invert(own @ tool)), np.asarray(tool)
+    return needed("camera_guess").guess_frames(block, arm, station, tool)
 
 
 def _optics(measured: Sequence[PoseMeasurements]) -> Optics:

@@ -33,14 +33,14 @@ import numpy as np
 
 from calib import files
 from calib.data.camera.lens import Lens
-from calib.data.poses.image_folders import find_corners, read_images
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit
-from calib.geometry.images.camera_guess import complete_camera, pnp_poses
 from calib.geometry.parameters import layout
 from calib.robot.chain import random_joints
+from calib.rooms.camera.camera_guess import complete_camera, pnp_poses
+from calib.rooms.camera.image_folders import find_corners, read_images
 from calib.rooms.cells.camera_cell import (
     FIVE_MEGAPIXEL,
     CameraCell,

@@ -11,14 +11,12 @@ from differences import check
 from planted import perturb
 from scipy.spatial.transform import Rotation
 
-from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens
 from calib.data.poses.measurements import Positions, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, placed_on
-from calib.geometry.images.camera_guess import complete_camera
 from calib.geometry.images.hand_eye import place_robustly
 from calib.geometry.images.optics import BoardShape
 from calib.geometry.installation import see
@@ -27,6 +25,8 @@ from calib.geometry.parameters import layout, step
 from calib.geometry.weighing import Settings
 from calib.robot.deflection import Deflection
 from calib.robot.load import load
+from calib.rooms.camera.board_pose import board_poses
+from calib.rooms.camera.camera_guess import complete_camera
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
 from calib.rooms.cells.truth import position_errors

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from calib.data.camera.board import Board
+from calib.data.camera.board import FILE, Board
 from calib.data.camera.lens import Lens
 from calib.data.poses.measurements import PoseMeasurements
 
 IN_HAND, TO_HAND = "in hand", "to hand"
+JOINTS, CORNERS = "joints.csv", "corners.csv"  # of a folder of images: joint values, and the corners found
+
+
+def is_image_folder(path: Path) -> bool:
+    """Say whether a path is a folder of images (or of the corners found in them) beside joint values."""
+    return path.is_dir() and ((path / JOINTS).exists() or (path / FILE).exists())
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
-from calib.data.poses.image_folders import JOINTS, is_image_folder, read_images
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.data.poses.pixels import IN_HAND, Pixels
+from calib.data.poses.pixels import IN_HAND, JOINTS, Pixels, is_image_folder
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError
+from calib.extensions import needed
 from calib.geometry.checks.copied_rows import repeated
 from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
 from calib.geometry.first_guess import check_scale
-from calib.geometry.images.camera_guess import complete_camera
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
@@ -222,7 +221,9 @@ def read_file(
     """
     limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
     if is_image_folder(path):
-        images = read_images(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
+        images = needed("image_folders").read_images(
+            path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits
+        )
         return _checked([images], chain, like)
     return _checked(
         read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits), chain
@@ -246,7 +247,10 @@ def _path(each: Path | PoseMeasurements) -> Path:
 def _checked(
     blocks: list[PoseMeasurements], chain: Chain, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
-    blocks = [complete_camera(chain, each, like) if isinstance(each, Pixels) else each for each in blocks]
+    blocks = [
+        needed("camera_guess").complete_camera(chain, each, like) if isinstance(each, Pixels) else each
+        for each in blocks
+    ]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)

@@ -24,10 +24,10 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import Pixels
+from calib.extensions import needed
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.instrument_scale import Scale, length_factor, mirrored_rms, scale_of
 from calib.geometry.checks.joint_signs import reversed_joints
-from calib.geometry.images.camera_guess import pnp_poses
 from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit
 from calib.procedure.findings import SpelledFinding as Finding
@@ -80,7 +80,10 @@ def _as_positions(
     for block, torque in zip(blocks, torques):
         if isinstance(block, Pixels):
             rows = np.unique(np.linspace(0, len(block) - 1, LOOKED_AT).astype(int))
-            block, torque = pnp_poses(take(block, rows)), None if torque is None else torque[rows]
+            block, torque = (
+                needed("camera_guess").pnp_poses(take(block, rows)),
+                None if torque is None else torque[rows],
+            )
         shown.append((block, torque))
     return [block for block, _ in shown], [torque for _, torque in shown]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib import files
-from calib.data.camera.corner_file import FILE as CORNERS
-from calib.data.poses.image_folders import JOINTS
+from calib.data.poses.pixels import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import offered
 from calib.folders import CERTIFICATE

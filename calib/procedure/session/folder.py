@@ -39,8 +39,7 @@ from typing import Any
 from calib import files
 from calib.config import parse
 from calib.config_types import Text
-from calib.data.camera.corner_file import FILE as CORNERS
-from calib.data.poses.image_folders import is_image_folder
+from calib.data.poses.pixels import CORNERS, is_image_folder
 from calib.errors import CalibError, SessionError, command_line
 from calib.folders import CERTIFICATE, METRICS, PARAMETERS
 from calib.folders import SESSION as SETTINGS

@@ -3,17 +3,17 @@
 OFFERS = {
     "commands": "commands:app",
     "topics": ":TOPICS",
-    "detect_boards": "detection:detected",
-    "estimate_lens": "intrinsics:estimate_lens",
+    "image_folders": "image_folders:",
+    "camera_guess": "camera_guess:",
 }
 TOPICS = {
     "images": (
         "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
         (
-            "calib.data.poses.image_folders",
+            "calib.rooms.camera.image_folders",
             "calib.data.camera.board",
             "calib.data.camera.camera_info",
-            "calib.data.camera.corner_file",
+            "calib.rooms.camera.corner_file",
             "calib.rooms.camera.image_bags",
         ),
     )

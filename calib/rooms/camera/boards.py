@@ -11,10 +11,11 @@ import numpy as np
 from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import KINDS, Board
-from calib.data.camera.corner_file import Found
-from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
+from calib.data.poses.pixels import JOINTS
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.procedure.measuring.image_findings import coverage_words
+from calib.rooms.camera.corner_file import Found
+from calib.rooms.camera.image_folders import find_corners, joint_table, problem_words, read_own_board
 
 Show = Callable[[str], None]
 USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}

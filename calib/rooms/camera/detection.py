@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from calib.data.camera.board import DICTIONARIES, Board, corners
-from calib.data.camera.corner_file import Detection, Found
 from calib.errors import MeasurementError
 from calib.rooms.camera.board_print import charuco, dictionary
+from calib.rooms.camera.corner_file import Detection, Found
 from calib.rooms.camera.images import quiet, read_image
 
 LOOKED_INTO = 3  # useless images that are looked into for the reason, unless it is found

@@ -17,11 +17,11 @@ import numpy as np
 
 from calib import files
 from calib.data.camera import board as boards
-from calib.data.camera import corner_file
 from calib.data.camera.board import Board
-from calib.data.camera.corner_file import Found
-from calib.data.poses.image_folders import JOINTS
+from calib.data.poses.pixels import CORNERS, JOINTS
 from calib.errors import MeasurementError, require, suggestion
+from calib.rooms.camera import corner_file
+from calib.rooms.camera.corner_file import Found
 from calib.rooms.camera.detection import detected
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
@@ -186,9 +186,9 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
 
 
 def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
-    """Write what a bag came to as a folder that `calib.data.poses.image_folders` reads."""
+    """Write what a bag came to as a folder that `calib.rooms.camera.image_folders` reads."""
     boards.write_board(board, folder / boards.FILE)
     rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
     files.write_table(folder / JOINTS, ["image", *found.joint_names], rows)
-    corner_file.write_corners(folder / corner_file.FILE, found.corners)
+    corner_file.write_corners(folder / CORNERS, found.corners)
     return folder

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.camera.board import Board, corners
-from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens
 from calib.errors import CalibError, MeasurementError
+from calib.rooms.camera.board_pose import board_poses
 from calib.words import counted
 
 MOST = 30  # images that a first lens is found from (our choice)

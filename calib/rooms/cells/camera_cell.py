@@ -18,8 +18,7 @@ from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import Board, corners
 from calib.data.camera.lens import Lens
-from calib.data.poses.image_folders import JOINTS
-from calib.data.poses.pixels import IN_HAND, Pixels
+from calib.data.poses.pixels import IN_HAND, JOINTS, Pixels
 from calib.errors import CannotSimulate
 from calib.geometry.images.optics import BoardShape, Optics, shaped_points
 from calib.geometry.installation import Installation

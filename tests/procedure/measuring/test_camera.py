@@ -12,7 +12,6 @@ import pytest
 
 from calib.cli import run
 from calib.data.camera.board import read_board
-from calib.data.camera.corner_file import Detection, Found
 from calib.data.poses.measurements import Distances
 from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
@@ -27,6 +26,7 @@ from calib.procedure.session.folder import open_session
 from calib.robot.deflection import Deflection
 from calib.robot.load import load
 from calib.rooms.camera.boards import make
+from calib.rooms.camera.corner_file import Detection, Found
 from calib.rooms.camera.image_bags import ImageBag, write_image_folder
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells import camera_files
@@ -183,11 +183,11 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
-    from calib.geometry.images.camera_guess import complete_camera
     from calib.geometry.parameters import layout
     from calib.geometry.uncertainty.spread import pose_sigmas
     from calib.procedure.measuring.prediction import predicted as foretold
     from calib.robot.chain import random_joints
+    from calib.rooms.camera.camera_guess import complete_camera
 
     with camera_files.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
@@ -206,12 +206,12 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
 @pytest.mark.slow
 def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is_drawn(cell, tmp_path):
     """A tracker's reflector in the same hand, and distances of pairs of it; no option names the tools."""
-    from calib.geometry.images.camera_guess import complete_camera
     from calib.procedure.kinematic_stage.fit import run as fitted
     from calib.procedure.kinematic_stage.inputs import gather
     from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.report import figures, fit_report
     from calib.robot.chain import random_joints
+    from calib.rooms.camera.camera_guess import complete_camera
     from calib.rooms.cells.cell import measure, true_poses
 
     arm, reflector = cell.cell.nominal, pose(None, [0.1, 0.0, 0.1])

@@ -1,6 +1,6 @@
 """What images do not say of themselves: the lens, whether the arm carries camera or board, and their first placement.
 
-Every image gives the board's pose by its corners alone (`calib.data.camera.board_pose`); the arm's poses beside them
+Every image gives the board's pose by its corners alone (`calib.rooms.camera.board_pose`); the arm's poses beside them
 place camera and board in closed form (`calib.geometry.images.hand_eye`). Both ways of mounting are tried.
 """
 
@@ -13,15 +13,14 @@ from itertools import product
 import numpy as np
 
 from calib.data.camera.board import corners
-from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
-from calib.extensions import needed
-from calib.geometry.images.hand_eye import Placement, misfit, place_robustly
+from calib.geometry.images.hand_eye import Placement, average_pose, misfit, place_robustly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
+from calib.rooms.camera.board_pose import board_poses
 from calib.transforms import invert, pose, to_quaternion
 from calib.words import counted, listing
 
@@ -74,9 +73,11 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
         if block.lens is None and isinstance(other, Pixels) and other.size == block.size and other.lens is not None:
             block = replace(block, lens=other.lens, mounting=block.mounting or other.mounting, free=())
     if block.lens is None:
+        from calib.rooms.camera.intrinsics import estimate_lens  # loads OpenCV
+
         if not block.size[0]:
             raise MeasurementError("neither the images' size nor a lens (camera.yaml) is known", block.file)
-        guess = needed("estimate_lens")(block.board, block.pixel, block.size, block.model, block.file)
+        guess = estimate_lens(block.board, block.pixel, block.size, block.model, block.file)
         block = replace(block, lens=guess.lens)
     arm = forward(chain, block.q)
     found = place_camera(block, arm)
@@ -264,3 +265,16 @@ def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement) -> Non
             f"board.toml says {stated:.2f}: measure the print and put its size in (was it printed at 100 %?)",
             block.file,
         )
+
+
+def guess_frames(
+    block: Pixels, arm: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return station and tool (4, 4) of a block of images from the arm's poses (m, 4, 4); one of them may be known."""
+    found = place_camera(block, arm)
+    if station is None and tool is None:
+        return found.placed.station, found.placed.tool
+    seen, own = seen_target(block.mounting, found.poses), arm[found.rows]
+    if station is not None:
+        return station, average_pose(invert(own) @ invert(station) @ seen)
+    return average_pose(seen @ invert(own @ tool)), np.asarray(tool)

@@ -16,7 +16,6 @@ from calib import files
 from calib.data.camera.board import Board, corners
 from calib.errors import MeasurementError
 
-FILE = "corners.csv"
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
 USUAL = 0.1  # sigma where a file states none [px]; our choice
 

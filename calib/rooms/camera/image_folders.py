@@ -25,30 +25,24 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.camera import board as boards
-from calib.data.camera import camera_info, corner_file
+from calib.data.camera import camera_info
 from calib.data.camera.board import Board
-from calib.data.camera.corner_file import Found
 from calib.data.camera.lens import Lens
 from calib.data.csv_table import Table, read_table
 from calib.data.poses import plausible
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.pixels import Pixels
+from calib.data.poses.pixels import CORNERS, JOINTS, Pixels
 from calib.data.poses.plausible import Limits
 from calib.errors import CalibError, MeasurementError
-from calib.extensions import needed
+from calib.rooms.camera import corner_file
+from calib.rooms.camera.corner_file import Found
 from calib.words import counted, listing
 
-JOINTS = "joints.csv"
 LEAST = 3  # usable images below which a folder is refused
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]
-
-
-def is_image_folder(path: Path) -> bool:
-    """Say whether a path is a folder of images (or of the corners found in them) beside joint values."""
-    return path.is_dir() and ((path / JOINTS).exists() or (path / boards.FILE).exists())
 
 
 def read_images(
@@ -129,7 +123,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
         names: of the images.
         progress: called with (done, total, image).
     """
-    stored = path / corner_file.FILE
+    stored = path / CORNERS
     images = [path / name for name in names if (path / name).is_file()]
     if stored.is_file():
         newest = max((each.stat().st_mtime for each in (*images, path / boards.FILE)), default=0.0)
@@ -139,7 +133,9 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     if not images:
         missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
         raise MeasurementError(f"none of the images that {JOINTS} names is there ({missing})", path)
-    found = needed("detect_boards")(((each.name, each) for each in images), board, len(images), progress)
+    from calib.rooms.camera.detection import detected  # loads OpenCV: only where images are looked at
+
+    found = detected(((each.name, each) for each in images), board, len(images), progress)
     with suppress(CalibError):  # a folder that cannot be written into is read all the same
         corner_file.write_corners(stored, found)
     return found
