@@ -24,8 +24,8 @@ from calib.procedure.kinematic_stage import compensation, compensation_file, fit
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import selection_prediction
 from calib.procedure.measuring.run import write_run
-from calib.procedure.report.fit_report import fit_metrics
 from calib.procedure.robot_kinds import Mechanism, stage_of
+from calib.records import plain
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import joint_kinds
 from calib.workers.threads import one_blas_thread
@@ -177,7 +177,7 @@ class GeometryFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return folder.metrics(self.outcome)
+        return plain(folder.metrics(self.outcome))
 
     def to_dataframe(self) -> Any:
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
@@ -191,7 +191,7 @@ class GeometryFit:
         """Yield what ``print`` shows, for a rich console."""
         from calib.procedure.report import console, geometry_section
 
-        yield from console.section(geometry_section.outcome_section(fit_metrics(self.outcome)))
+        yield from console.section(geometry_section.outcome_section(folder.metrics(self.outcome)))
 
     def __repr__(self) -> str:
         return f"<GeometryFit of {self.robot.chain.name}: model {self.outcome.selection.chosen}, {self.verdict.level}>"
@@ -306,7 +306,7 @@ def fit_geometry(
         validate: unseen poses, like `measured`.
         options: what the files' headers do not say, priors, fixed parameters (``calib formats options``).
         poses: what was measured, as `select_poses` returned it, the CSV that it was saved as, or its folder: the
-            sigmas that it predicted are held against those that the fit states (``outcome.predicted_sigmas``).
+            σ that it predicted are compared with the fit's (finding ``sigma-ratio``).
         on_read: called with what was read, before the fit begins.
         progress: called with a few words now and then.
 

@@ -37,6 +37,30 @@ Torques = Sequence[np.ndarray | None] | None
 _NONE = np.array([], dtype=int)
 
 
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Sizes of errors in mm or deg."""
+
+    mean: float
+    rms: float
+    p95: float
+    max: float
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """Errors of one arm by nature; None where nothing of the kind was measured."""
+
+    position_mm: ErrorStatistics | None = None
+    orientation_deg: ErrorStatistics | None = None
+    distance_mm: ErrorStatistics | None = None
+
+    @property
+    def main(self) -> ErrorStatistics | None:
+        """What is judged by: positions, or distances where there are no positions [mm]."""
+        return self.position_mm or self.distance_mm
+
+
 @dataclass(frozen=True, eq=False)
 class Errors:
     """Sizes of errors, one per measured row (or pair); None where nothing of the kind was measured.
@@ -57,18 +81,10 @@ class Errors:
         chosen = self.position if self.position is not None else self.distance
         return np.zeros(0) if chosen is None else chosen
 
-    def summary(self) -> dict[str, dict[str, float] | None]:
-        """Return ``position_mm``, ``orientation_deg`` and, where distances are measured, ``distance_mm``.
-
-        Each holds mean, rms, p95 and max; None where nothing of the kind was measured.
-        """
-        result: dict[str, dict[str, float] | None] = {
-            "position_mm": statistics(self.position, ERRORS["position"][0]),
-            "orientation_deg": statistics(self.orientation, ERRORS["orientation"][0]),
-        }
-        if self.distance is not None:
-            result["distance_mm"] = statistics(self.distance, 1e3)
-        return result
+    def summary(self) -> ArmErrors:
+        """Return statistics of each nature, in the units they are printed in."""
+        sizes = (getattr(self, nature) for nature in ERRORS)
+        return ArmErrors(*(statistics(size, factor) for size, (factor, _) in zip(sizes, ERRORS.values())))
 
 
 def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None) -> Errors:
@@ -89,17 +105,13 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: To
     return Errors(**{name: sizes if len(sizes) else None for name, sizes in joined.items()})
 
 
-def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> dict[str, float] | None:
+def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
     """Return mean, rms, 95 % quantile and maximum of sizes times `factor`; None for None."""
     if sizes is None:
         return None
     scaled = factor * sizes
-    return {
-        "mean": float(scaled.mean()),
-        "rms": float(np.sqrt(np.mean(scaled**2))),
-        "p95": float(np.percentile(scaled, 95)),
-        "max": float(scaled.max()),
-    }
+    rms = float(np.sqrt(np.mean(scaled**2)))
+    return ErrorStatistics(float(scaled.mean()), rms, float(np.percentile(scaled, 95)), float(scaled.max()))
 
 
 def rms_sigma(sizes: np.ndarray) -> float:

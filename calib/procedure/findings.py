@@ -23,8 +23,8 @@ from string import Formatter
 from typing import Any
 
 from calib.errors import Finding, UsageError, suggestion
-from calib.records import read_record
 from calib.units import DEG
+from calib.words import listing
 
 RANKS = ("", "note", "marginal", "fail")
 UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}  # SI -> as printed; others as they are
@@ -35,11 +35,12 @@ LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
 
 @dataclass(frozen=True)
 class Verdict:
-    """One of `LEVELS`, why, in one sentence, and the code of the finding that decided; empty for a pass."""
+    """One of `LEVELS`, why, in one sentence, the code of the finding that decided, and what to do."""
 
     level: str
     reason: str
     code: str = ""
+    advice: str = ""
 
     def __str__(self) -> str:
         return f"verdict {self.level}: {self.reason}"
@@ -50,7 +51,8 @@ class Verdict:
         worst = max(findings, key=lambda one: RANKS.index(level_of(one)), default=None)
         if worst is None or level_of(worst) in ("", "note"):
             return cls("pass", figures)
-        return cls(level_of(worst), "; ".join(filter(None, [figures, sentence(worst)])), worst.code)
+        reason, advice = "; ".join(filter(None, [figures, sentence(worst)])), catalogue()[worst.code].advice
+        return cls(level_of(worst), reason, worst.code, _filled(advice, worst.values))
 
     def for_prediction(self, why: str) -> Verdict:
         """Return the verdict of a model that cannot be exported, and `why`: a pass is one for prediction only."""
@@ -159,7 +161,7 @@ class Entry:
 def catalogue() -> Mapping[str, Entry]:
     """Return the catalogue, code -> entry."""
     text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    return {code: read_record(Entry, entry, code) for code, entry in tomllib.loads(text).items()}
+    return {code: Entry(**entry) for code, entry in tomllib.loads(text).items()}
 
 
 def level_of(one: Finding) -> str:
@@ -243,7 +245,6 @@ class _Printer(Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         number, _, unit = format_spec.partition(" ")
         if isinstance(value, list | tuple):
-            shown, more = value[: int(number or MAX_NAMES)], len(value) - int(number or MAX_NAMES)
-            return ", ".join(map(str, shown)) + (f" and {more} more" if more > 0 else "")
+            return listing(value, int(number or MAX_NAMES))
         printed = format(value * UNITS.get(unit, 1.0) if unit else value, number)
         return printed + ("" if unit in ("", "°") else " ") + unit

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -282,9 +282,9 @@ def run(seed: int, quick: bool, seeds: int = 3, seconds: float = 3.0, workers: i
         },
         "table_3": {
             "paper": lwr4plus.TABLE_3,
-            "nominal": {name: errors(one, [validation]).summary() for name, one in readings.items()},
-            "calibrated, unseen poses": errors(found.cell, [validation]).summary(),
-            "calibrated, the 17 fitted poses": errors(found.cell, [measured]).summary(),
+            "nominal": {name: asdict(errors(one, [validation]).summary()) for name, one in readings.items()},
+            "calibrated, unseen poses": asdict(errors(found.cell, [validation]).summary()),
+            "calibrated, the 17 fitted poses": asdict(errors(found.cell, [measured]).summary()),
             "unseen_poses": len(unseen),
             "remark": "the paper does not say whose frames its nominal row uses, nor on which poses its rows rest",
         },

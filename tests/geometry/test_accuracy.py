@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data.poses.measurements import KINDS, PoseMeasurements, Sockets
-from calib.geometry.accuracy import errors, pair_errors, statistics
+from calib.geometry.accuracy import ErrorStatistics, errors, pair_errors, statistics
 from calib.geometry.installation import Installation, see
 from calib.robot.load import load
 from calib.transforms import from_xyz_rpy, to_quaternion
@@ -32,28 +32,28 @@ def test_position_and_orientation_are_lengths_of_vectors():
     turned = EXACT @ from_xyz_rpy([0, 0, 0], [np.radians(2.0), 0, 0])
     found = errors(CELL, [block("pose", position=EXACT[:, :3, 3] + shift, quaternion=to_quaternion(turned))]).summary()
     for name in ("mean", "rms", "p95", "max"):
-        assert found["position_mm"][name] == pytest.approx(5.0)
-        assert found["orientation_deg"][name] == pytest.approx(2.0)
-    assert "distance_mm" not in found
+        assert getattr(found.position_mm, name) == pytest.approx(5.0)
+        assert getattr(found.orientation_deg, name) == pytest.approx(2.0)
+    assert found.distance_mm is None
 
 
 def test_rms_is_that_of_the_norm():
     found = statistics(np.array([3.0, 4.0]))
-    assert found == pytest.approx({"mean": 3.5, "rms": np.sqrt(12.5), "p95": 3.95, "max": 4.0})
+    assert found == ErrorStatistics(3.5, np.sqrt(12.5), pytest.approx(3.95), 4.0)
     assert statistics(None) is None
 
 
 def test_positions_alone_have_no_orientation():
     found = errors(CELL, [block("position", position=EXACT[:, :3, 3])]).summary()
-    assert found["orientation_deg"] is None
-    assert found["position_mm"]["max"] < 1e-9
+    assert found.orientation_deg is None
+    assert found.position_mm.max < 1e-9
 
 
 def test_distances_have_no_position():
     known = np.linalg.norm(IN_BASE[0::2] - IN_BASE[1::2], axis=1) + 2e-3
     found = errors(CELL, [block("distance", distance=np.repeat(known, 2), group=np.repeat(np.arange(12), 2))]).summary()
-    assert found["position_mm"] is None
-    assert found["distance_mm"]["mean"] == pytest.approx(2.0)
+    assert found.position_mm is None
+    assert found.distance_mm.mean == pytest.approx(2.0)
 
 
 def test_sockets_scatter_about_their_mean():

@@ -2,66 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from calib.errors import Finding, finding
 from calib.geometry.observation import Block
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit
 
-FEWEST = 30  # rows below which no pattern is looked for (our choice)
-WORSE = 1.6  # a set-up's errors over the rest's from which on it is worth a word (our choice)
+MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
+MIN_RATIO = 1.6  # a set-up's errors over the rest's from which on it is worth a word (our choice)
+UNLIKE = 5.0  # times a stated uncertainty, or a fraction, that residuals are remarked on from (our choice)
 CHANCE = 1e-3  # probability that the same rows in another order show such a change (our choice)
 
 
-@dataclass(frozen=True)
-class SetUpChange:
-    """Rows `first` to `last` of a file that fit worse than the rest, as if of another set-up; rms of both [m]."""
-
-    file: str
-    first: int
-    last: int
-    worse: float
-    rest: float
-
-
-@dataclass(frozen=True)
-class SystematicResidual:
-    """A file's residual rms [m], of which neighbouring poses differ by `neighbours` [m] only."""
-
-    file: str
-    rms: float
-    neighbours: float
-
-
-@dataclass(frozen=True)
-class BeyondStated:
-    """A file's residual rms [m] far above the uncertainty that was stated [m]."""
-
-    file: str
-    rms: float
-    stated: float
-
-
-@dataclass(frozen=True)
-class BelowStated:
-    """A file's residual rms [m] far below the uncertainty that was stated [m]."""
-
-    file: str
-    rms: float
-    stated: float
-
-
-Diagnosis = SetUpChange | SystematicResidual | BeyondStated | BelowStated
-
-
-def diagnose(found: GeometricFit) -> list[Diagnosis]:
+def diagnose(found: GeometricFit) -> list[Finding]:
     """Return findings on each block: rows that look like another set-up, and residuals that are not noise."""
-    result = []
+    result: list[Finding] = []
     for block, part in _lengths(found):
-        if part.value.shape[1] >= FEWEST:  # pairs of rows count once
+        if part.value.shape[1] >= MIN_ROWS:  # pairs of rows count once
             result += [*_setup_change(block, part), *_systematic(block, part)]
     return result
 
@@ -72,7 +33,7 @@ def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 
-def _setup_change(block: Block, part: Part) -> list[SetUpChange]:
+def _setup_change(block: Block, part: Part) -> list[Finding]:
     """Compare the rows before and after every cut, by size and by ranks (Mann–Whitney): a worse run is a set-up."""
     size = np.linalg.norm(part.value, axis=0)
     size = np.minimum(size, 4.0 * np.median(size))  # a few gross rows are not a set-up
@@ -85,7 +46,7 @@ def _setup_change(block: Block, part: Part) -> list[SetUpChange]:
     weight = np.minimum(cuts, m - cuts)
     best = int(np.argmax((ratio - 1.0) * np.sqrt(weight)))
     cut, first_worse = int(cuts[best]), before[best] > after[best]
-    if ratio[best] < WORSE:
+    if ratio[best] < MIN_RATIO:
         return []
     from scipy.stats import mannwhitneyu  # slow to load, and seldom needed
 
@@ -94,21 +55,25 @@ def _setup_change(block: Block, part: Part) -> list[SetUpChange]:
     rows = block.measured.rows[part.index]
     bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
     worse, rest = (before[best], after[best]) if first_worse else (after[best], before[best])
-    return [SetUpChange(str(block.measured.file), int(bad[0]), int(bad[1]), float(worse), float(rest))]
+    return [finding("set-up-changed", file=_name(block), first=bad[0], last=bad[1], worse=worse, rest=rest)]
 
 
-def _systematic(block: Block, part: Part) -> list[Diagnosis]:
+def _systematic(block: Block, part: Part) -> list[Finding]:
     """Compare residuals of neighbouring poses: noise differs between neighbours, a missing effect does not."""
     floor, rms = neighbour_floor(block.measured.q, part), float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
     stated = None if part.sigma is None else float(np.sqrt(np.mean(np.sum(part.sigma**2, axis=0))))
-    result: list[Diagnosis] = []
+    result = []
     if floor is not None and floor < 0.6 * rms:
-        result.append(SystematicResidual(str(block.measured.file), rms, floor))
-    if stated is not None and rms > 5.0 * stated:
-        result.append(BeyondStated(str(block.measured.file), rms, stated))
-    if stated is not None and stated > 5.0 * rms:
-        result.append(BelowStated(str(block.measured.file), rms, stated))
+        result.append(finding("systematic-residual", file=_name(block), rms=rms, neighbours=floor))
+    if stated is not None and not stated / UNLIKE <= rms <= UNLIKE * stated:
+        code = "sigma-too-small" if rms > stated else "sigma-too-large"
+        times = max(rms, stated) / max(min(rms, stated), 1e-300)
+        result.append(finding(code, file=_name(block), rms=rms, stated=stated, times=times))
     return result
+
+
+def _name(block: Block) -> str:
+    return Path(block.measured.file).name or "measurements"
 
 
 def neighbour_floor(q: np.ndarray, part: Part) -> float | None:
@@ -124,7 +89,7 @@ def neighbour_floor(q: np.ndarray, part: Part) -> float | None:
     scaled = q[:, moving] / spread[moving]
     distance, index = KDTree(scaled).query(scaled, k=2)
     near = distance[:, 1] < np.sqrt(moving.sum()) / 3.0
-    if near.sum() < FEWEST:
+    if near.sum() < MIN_ROWS:
         return None
     change = part.value[:, near] - part.value[:, np.asarray(index)[near, 1]]
     return float(np.sqrt(np.mean(np.sum(change**2, axis=0)) / 2.0))

@@ -27,6 +27,8 @@ from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
+from calib.procedure.findings import sentence
+from calib.procedure.measuring.selection_prediction import sigma_ratio
 from calib.records import Array, read_json, read_rows
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
@@ -245,17 +247,10 @@ def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, residual: f
     noise = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction.noise_share
     stated = dict(zip(names, sigmas.tolist()))
     try:
-        rows = [row for row in read_rows(PredictedSigma, folder / NAME) if stated.get(row.name, 0.0) > 0.0]
+        predicted = {row.name: row.sigma for row in read_rows(PredictedSigma, folder / NAME)}
     except ValueError as error:
         raise UsageError(f"{error}; give the folder that calib excite wrote") from error
-    if not rows:
+    found = sigma_ratio(predicted, stated, residual=residual, assumed=noise)
+    if found is None:
         raise UsageError(f"{folder} predicts none of the {len(stated)} parameters identified: it is of another robot")
-    low, middle, high = np.quantile([stated[row.name] / row.sigma for row in rows], [0.1, 0.5, 0.9])
-    why = (
-        ""
-        if residual is None
-        else f"; torque residual {100 * residual:.2g} % of the limits, {100 * noise:.2g} % assumed"
-    )
-    return (
-        f"estimated σ / predicted σ ({len(rows)} parameters): median {middle:.2g} (10–90 %: {low:.2g}–{high:.2g}){why}"
-    )
+    return sentence(found)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,13 +10,20 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics
-from calib.geometry.checks.repeatability import SAME, Repeats, repeats
+from calib.geometry.checks.repeatability import Repeats, repeats
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
-from calib.procedure.kinematic_stage.metrics import RepeatedPoses
+from calib.procedure.kinematic_stage.metrics import (
+    BothArms,
+    ComparedRows,
+    IntervalCoverage,
+    MeanAndMax,
+    RepeatedPose,
+    RepeatedPoses,
+)
 from calib.procedure.measuring.image_findings import reprojection
 from calib.robot.chain import Chain
 
@@ -49,16 +56,17 @@ class Intervals:
         """Share of the errors found that are within their radius."""
         return float(np.mean(self.size <= self.radius))
 
-    def table(self) -> dict[str, object]:
-        """Return coverage, median radius and rows that extrapolate as ``metrics.json`` holds them."""
-        return {
-            "coverage_percent": 100.0 * self.covered,
-            "median_mm": 1e3 * float(np.median(self.radius)),
-            "sigma_rms_mm": 1e3 * float(np.sqrt(np.mean(self.sigma**2))),
-            "rows": len(self.size),
-            "rows_beyond_learnt_range": int(self.beyond.sum()),
-            "joints_beyond_learnt_range": list(self.joints),
-        }
+    @property
+    def record(self) -> IntervalCoverage:
+        """Coverage, median radius and rows that extrapolate."""
+        return IntervalCoverage(
+            coverage_percent=100.0 * self.covered,
+            median_mm=1e3 * float(np.median(self.radius)),
+            sigma_rms_mm=1e3 * float(np.sqrt(np.mean(self.sigma**2))),
+            rows=len(self.size),
+            rows_beyond_learnt_range=int(self.beyond.sum()),
+            joints_beyond_learnt_range=self.joints,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +104,7 @@ class Comparison:
     proves: bool = True
     alone: Errors | None = None
     shares_frames: bool = False
-    repeated: Mapping[str, Any] | None = None
+    repeated: RepeatedPoses | None = None
     reprojection: tuple[float, float] | None = None
     settled: bool = True
     placed_by: tuple[int, int] | None = None
@@ -107,22 +115,22 @@ class Comparison:
         """The nominal arm beside what a URDF holds: no corrections, nor the errors that were expected with them."""
         return self if self.alone is None else replace(self, errors=(self.errors[0], self.alone), intervals=None)
 
-    def table(self) -> dict[str, object]:
-        """Return the comparison as ``metrics.json`` holds it."""
-        arms = ("nominal", "calibrated")
-        result: dict[str, object] = {"poses": self.poses, "frames": self.frames, "unseen": self.proves}
-        result |= {arm: found.summary() for arm, found in zip(arms, self.errors)}
-        if self.alone is not None:
-            result["urdf_alone"] = self.alone.summary()
-        if len(self.pairs[0]):
-            result["pair_distance_mm"] = {arm: statistics(sizes, 1e3) for arm, sizes in zip(arms, self.pairs)}
-        if self.reprojection is not None:
-            result["reprojection_px"] = dict(zip(arms, self.reprojection))
-        if self.repeated is not None:
-            result["iso9283"] = self.repeated
-        if self.intervals is not None:
-            result["interval95"] = self.intervals.table()
-        return result
+    def record(self, parameters: int = 0) -> ComparedRows:
+        """Return the comparison as ``metrics.json`` holds it; `parameters` were fitted to its rows."""
+        pairs = self.pairs if len(self.pairs[0]) else ()
+        return ComparedRows(
+            poses=self.poses,
+            frames=self.frames,
+            nominal=self.errors[0].summary(),
+            calibrated=self.errors[1].summary(),
+            urdf_alone=None if self.alone is None else self.alone.summary(),
+            pair_distance_mm={arm: statistics(sizes, 1e3) for arm, sizes in zip(ARMS, pairs)},
+            iso9283=self.repeated,
+            unseen=self.proves,
+            parameters=parameters,
+            interval95=None if self.intervals is None else self.intervals.record,
+            reprojection_px=dict(zip(ARMS, self.reprojection or ())),
+        )
 
 
 def compare(
@@ -145,7 +153,7 @@ def compare(
     corners: Any = tuple(reprojection(cell, blocks, torques) for cell in cells)
     return Comparison(
         tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, _repeated_table(cells, blocks, torques), None if None in corners else corners,
+        shares_frames, _repeated_poses(cells, blocks, torques), None if None in corners else corners,
     )  # fmt: skip
 
 
@@ -218,60 +226,58 @@ POSES, CYCLES, ENOUGH = 5, 30, 100  # what the norm asks for; how many poses mak
 ARMS = ("nominal", "calibrated")
 
 
-def _repeated_table(
+def _repeated_poses(
     cells: tuple[Installation, Installation], blocks: Sequence[PoseMeasurements], torques: Torques
-) -> dict[str, Any] | None:
-    """Return what ``metrics.json`` holds of repeated poses under ``iso9283``; None where there are none.
+) -> RepeatedPoses | None:
+    """Return accuracy and repeatability of repeated poses for both arms; None where there are none.
 
     Args:
         cells: nominal and calibrated arm.
         blocks: the rows.
         torques: gravity torques (m, n) per block [N m].
     """
-    found = [repeats(cell, blocks, torques) for cell in cells]
-    one, two = found
+    one, two = (repeats(cell, blocks, torques) for cell in cells)
     if one is None or two is None:
         return None
-    result: dict[str, Any] = {
-        "poses": len(one.cycles),
-        "cycles": [int(one.cycles.min()), int(one.cycles.max())],
-        "same_joints_within": SAME,
-        "repeatability_mm": _sizes(1e3 * one.repeatability),
-        "accuracy_mm": {
-            arm: _sizes(1e3 * np.linalg.norm(each.accuracy, axis=1)) for arm, each in zip(ARMS, (one, two))
-        },
-    }
-    if one.turn_repeatability is not None and one.turn_accuracy is not None and two.turn_accuracy is not None:
-        degrees = np.degrees(1.0)
-        result["orientation_repeatability_deg"] = _sizes(degrees * one.turn_repeatability.max(axis=1))
-        result["orientation_accuracy_deg"] = {
-            arm: _sizes(degrees * np.linalg.norm(turn, axis=1))
-            for arm, turn in zip(ARMS, (one.turn_accuracy, two.turn_accuracy))
-        }
     several = one.variation[~np.isnan(one.variation)]
-    if len(several):
-        result["multidirectional_mm"] = _sizes(1e3 * several) | {"poses": len(several)}
-    result["each"] = [_pose(k, one, two) for k in range(len(one.cycles))]
-    return result
+    spread, turns = one.turn_repeatability, [each.turn_accuracy for each in (one, two)]
+    turned = [_sizes(np.degrees(np.linalg.norm(turn, axis=1))) for turn in turns if turn is not None]
+    return RepeatedPoses(
+        poses=len(one.cycles),
+        cycles=(int(one.cycles.min()), int(one.cycles.max())),
+        repeatability_mm=_sizes(1e3 * one.repeatability),
+        accuracy_mm=BothArms(*(_sizes(1e3 * np.linalg.norm(each.accuracy, axis=1)) for each in (one, two))),
+        each=tuple(_pose(k, one, two) for k in range(len(one.cycles))),
+        orientation_repeatability_deg=None if spread is None else _sizes(np.degrees(spread).max(axis=1)),
+        orientation_accuracy_deg=BothArms(*turned) if turned else None,
+        multidirectional_mm=_sizes(1e3 * several) if len(several) else None,
+    )
 
 
-def _sizes(values: np.ndarray) -> dict[str, float]:
-    return {"mean": float(values.mean()), "max": float(values.max())}
+def _sizes(values: np.ndarray) -> MeanAndMax:
+    return MeanAndMax(float(values.mean()), float(values.max()))
 
 
-def _pose(k: int, one: Repeats, two: Repeats) -> dict[str, Any]:
+def _pose(k: int, one: Repeats, two: Repeats) -> RepeatedPose:
     """Return one pose: its rows, AP of both arms per axis, RP, and vAP where there is one."""
-    entry: dict[str, Any] = {"rows": [int(row) for row in one.rows[k]], "repeatability_mm": 1e3 * one.repeatability[k]}
-    entry |= {f"{arm}_mm": (1e3 * each.accuracy[k]).tolist() for arm, each in zip(ARMS, (one, two))}
-    if one.turn_accuracy is not None and two.turn_accuracy is not None and one.turn_repeatability is not None:
-        turns = zip(ARMS, (one.turn_accuracy, two.turn_accuracy))
-        entry |= {f"{arm}_deg": np.degrees(turn[k]).tolist() for arm, turn in turns}
-        entry["repeatability_deg"] = np.degrees(one.turn_repeatability[k]).tolist()
-    return entry if np.isnan(one.variation[k]) else entry | {"multidirectional_mm": 1e3 * one.variation[k]}
+
+    def degrees(turn: np.ndarray | None) -> tuple[float, ...]:
+        return () if turn is None else tuple(np.degrees(turn[k]).tolist())
+
+    return RepeatedPose(
+        rows=tuple(int(row) for row in one.rows[k]),
+        repeatability_mm=1e3 * float(one.repeatability[k]),
+        nominal_mm=tuple((1e3 * one.accuracy[k]).tolist()),
+        calibrated_mm=tuple((1e3 * two.accuracy[k]).tolist()),
+        repeatability_deg=degrees(one.turn_repeatability),
+        multidirectional_mm=None if np.isnan(one.variation[k]) else 1e3 * float(one.variation[k]),
+        nominal_deg=degrees(one.turn_accuracy),
+        calibrated_deg=degrees(two.turn_accuracy),
+    )
 
 
 def iso9283_sentence(found: RepeatedPoses) -> str:
-    """Return in a iso9283_sentence what repeated poses tell."""
+    """Return RP and AP of repeated poses as a sentence."""
     least, most = found.cycles
     cycles = f"{least}" if least == most else f"{least} to {most}"
     accuracy, repeatability = found.accuracy_mm, found.repeatability_mm

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import NotConverged
+from calib.errors import Finding, NotConverged, finding
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.unidentified import unidentified
@@ -23,17 +23,16 @@ from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
 from calib.geometry.weighing import Settings
-from calib.procedure.findings import Verdict, settled
+from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import Comparison, gravity_of
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
-from calib.procedure.kinematic_stage.remarks import Outlier, gross_rows, named_outliers, plateau, remains, remark
+from calib.procedure.kinematic_stage.remarks import Outlier, gross_rows, misfit, named_outliers
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.image_findings import image_notes
 from calib.procedure.measuring.selection_prediction import SelectionPrediction, compared_with_fit
-from calib.procedure.sigma_comparison import SigmaComparison
 from calib.robot.calibrated import CalibratedChain
 
 Progress = Callable[[str], None]
@@ -50,24 +49,22 @@ class Outcome:
         selection: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
         rigid: the best fit without joint corrections: the geometry that a URDF holds and dynamics is identified on.
         outliers: rows of the fit that do not fit, worst first.
-        unclear: what the data cannot tell, in words.
+        unclear: what is not identifiable from the poses.
         findings: what the fit says of itself.
         assessment: both arms on fitted and on unseen rows, and the verdict.
         wanted: how it was fitted and judged.
         expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
-        predicted_sigmas: sigmas that were predicted when the poses were chosen, beside those that this fit states.
     """
 
     inputs: Inputs
     selection: ModelSelection
     rigid: GeometricFit
     outliers: Sequence[Outlier]
-    unclear: tuple[str, ...]
+    unclear: tuple[Finding, ...]
     findings: Findings
     assessment: Assessment
     wanted: FitSettings = field(default_factory=FitSettings)
     expected: ErrorModel | None = None
-    predicted_sigmas: tuple[SigmaComparison, ...] = ()
 
     @property
     def calibrated(self) -> CalibratedChain:
@@ -138,41 +135,32 @@ def run(
     status = found.fit.solution.status
     if not status.good:
         odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, None, long)
-        why = [one.words for one in settled(odd, options.accept) if one.allows == "fail"]
+        why = [sentence(one) for one in settle(odd, options.accept) if level_of(one) == "fail"]
         words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
         raise NotConverged("; ".join([words, *why]), found.fit)
-    said = plateau(found, long)
-    if said and settings.loss in HEEDS_ALL:
-        said = gross_rows(found, climb("geometry", settings=replace(settings, loss="cauchy")), long) or said
+    rigid_misfit = misfit(found, long)
+    if rigid_misfit and settings.loss in HEEDS_ALL:
+        robust = climb("geometry", settings=replace(settings, loss="cauchy"))
+        rigid_misfit = gross_rows(found, robust, long) or rigid_misfit
     say("comparing on unseen poses")
     settings = settings.combine(loss=found.loss)
     rigid = found.rigid_fit(inputs.fit, settings)
     named = named_outliers(found.fit)
-    told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)
-    notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *told
-    findings = _found_of(inputs, found, named, said, notes, torques, options.accept)
+    notes = [
+        *([rigid_misfit] if rigid_misfit else []),
+        *_moved_between(found.nominal.cell, inputs.fit, settings),
+        *diagnose(found.fit),
+        *image_notes(found.fit),
+    ]
+    if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
+        notes.append(ratio)
+    findings = _found_of(inputs, found, named, notes, torques, options.accept)
     say("learning what errors to expect")
     expected = learn_errors(found, inputs.fit, torques, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
     result = assess(arms, inputs, findings, settings, replace(wanted, model=asked))
-    return Outcome(
-        inputs,
-        found,
-        rigid,
-        named,
-        tuple(map(remark, unidentified(found.fit))),
-        findings,
-        result,
-        wanted,
-        expected,
-        () if selection is None else _compared(selection, found.fit),
-    )
-
-
-def _compared(selection: SelectionPrediction, found: GeometricFit) -> tuple[SigmaComparison, ...]:
-    typical = PoseMeasurements(np.array(selection.typical), selection.joints)
-    return compared_with_fit(selection, found, gravity_of(found.cell.chain, typical))
+    return Outcome(inputs, found, rigid, named, tuple(unidentified(found.fit)), findings, result, wanted, expected)
 
 
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:
@@ -185,38 +173,25 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
 
 
 def _found_of(
-    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], said: str, notes: Sequence[str],
+    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding],
     torques: Sequence[np.ndarray | None], accepted: Sequence[str],
 ) -> Findings:  # fmt: skip
-    """Return what a fit says of itself, whatever rows it has not seen.
-
-    `said` is what keeps rigid geometries from explaining the rows, `notes` are those of moved instruments etc.
-    """
+    """Return what a fit says of itself, whatever rows it has not seen; `notes` are findings on its residuals."""
     long = inputs.chain.stretched_length()
     left = _cross_validated(found)
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
+    blind = [finding("transfer-by-regions", stations=found.folds.blind)] if found.folds.blind else []
     return Findings(
         model=found.chosen,
         loss=found.loss,
-        cross_validated=_cross_validated(found),
+        cross_validated=left,
         nominal_cross_validated=next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        unexplained=said if remains(found, long) else "",
         reach=long,
-        notes=(*((said,) if said else ()), *notes, *_blind_note(found.folds.blind)),
+        noticed=settle([*odd, *notes, *blind], accepted),
         blind=found.folds.blind,
-        odd=settled(odd, accepted),
         rigid_cross_validated=found.rigid_cross_validated,
     )
-
-
-def _blind_note(blind: Sequence[str]) -> list[str]:
-    if not blind:
-        return []
-    return [
-        f"{', '.join(blind)}: left out by regions, not as a whole, since the rows of the other stations do not tell "
-        "where the tool would be there; what transfers from station to station is not judged by these"
-    ]
 
 
 def _cross_validated(found: ModelSelection) -> float:
@@ -224,7 +199,7 @@ def _cross_validated(found: ModelSelection) -> float:
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 
 
-def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:
+def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
     """Say that several files share one station where stations of their own explain them far better."""
     own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
@@ -236,11 +211,7 @@ def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], se
     after = _rms(placed, apart, torques)
     if before < MOVED * after:
         return []
-    return [
-        f"with one station for all {len(own)} files the nominal arm is off by {1e3 * before:.3g} mm rms, with one for "
-        f"each by {1e3 * after:.3g} mm: the instrument seems to have been moved; fit them with "
-        "stations 'each' (--stations each; in a session: stations in session.toml)"
-    ]
+    return [finding("instrument-moved", before=before, after=after, files=len(own))]
 
 
 def _rms(cell: Installation, blocks: Sequence[PoseMeasurements], torques: list[np.ndarray | None]) -> float:

@@ -6,8 +6,8 @@ A fit's folder is written whole, beside its place, then moved there. Nothing els
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,12 +21,22 @@ from calib.geometry import installation_file
 from calib.geometry.installation import Installation
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
+from calib.procedure.findings import lines_of
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
+from calib.procedure.kinematic_stage.metrics import (
+    JUDGED,
+    SCHEMA,
+    Findings,
+    FitMetrics,
+    LadderStep,
+    OutlierRow,
+    ValidationMetrics,
+)
+from calib.procedure.kinematic_stage.remarks import Outlier
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
-from calib.records import read_json, shielded
+from calib.records import read_json, read_record, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
 from calib.robot.chain import Joint
@@ -46,7 +56,6 @@ OURS = (
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces."""
 
-SCHEMA = 2  # of metrics.json; 1 had no findings, and in a session's 5-validation not the notes of the fit
 IN_SESSION, VALIDATED = "4-fit", "5-validation"  # what these folders are called in a session
 
 CORRECTIONS = """Joint corrections that a URDF cannot hold.
@@ -111,7 +120,8 @@ class FitFolder:
         metrics = self.metrics()
         if metrics.findings is not None:
             return metrics.findings
-        return replace(_read(_EarlyReport, self.report).judged, notes=metrics.warnings)
+        early = read_json(self.report, "fit again")["judged"]
+        return read_record(Findings, _of_today(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
@@ -135,20 +145,6 @@ class FitFolder:
         with self.residuals.open(encoding="utf-8", newline="") as file:
             rows = [[float(row[name]) for name in names] for row in csv.DictReader(file) if row["set"] == "fit"]
         return np.array(rows).reshape(-1, len(names)) if rows else None
-
-
-@dataclass(frozen=True)
-class _Schema:
-    """By which version a JSON file was written."""
-
-    schema: int = 1
-
-
-@dataclass(frozen=True)
-class _EarlyReport:
-    """What ``report.json`` of schema 1 holds of the findings."""
-
-    judged: Findings
 
 
 @dataclass(frozen=True)
@@ -177,12 +173,12 @@ class ValidationFolder:
         """What a certificate is printed from."""
         return self.path / REPORT
 
-    def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Mapping[str, Any]]) -> ValidationMetrics:
+    def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return these."""
         write_errors(self.errors, inputs.chain, found.validation)
         files.write_json(self.rows, rows)
-        files.write_json(self.judged, found.table() | {"schema": SCHEMA})
-        return self.metrics()
+        files.write_json(self.judged, found.record)
+        return found.record
 
     def metrics(self) -> ValidationMetrics:
         """Read numbers and verdict; of schema 1 the warnings are without the fit's."""
@@ -190,10 +186,27 @@ class ValidationFolder:
 
 
 def _read(kind: type[T], path: Path) -> T:
-    schema = read_json(path, "fit again", _Schema).schema
-    if schema > SCHEMA:
-        raise UsageError(f"{path}: schema {schema} of a later version, this one reads up to {SCHEMA}")
-    return read_json(path, "fit again", kind)
+    content = read_json(path, "fit again")
+    if content.get("schema", 1) > SCHEMA:
+        raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
+    if content.get("findings"):
+        content["findings"] = _of_today(content["findings"])
+    try:
+        return read_record(kind, content | {"schema": content.get("schema", 1)})
+    except ValueError as error:
+        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
+
+
+def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
+    """Return findings of schema 1 or 2, which kept sentences, as those of today."""
+    if "odd" not in findings and "notes" not in findings:
+        return findings
+    levels = {"fail": "earlier-fail", "marginal": "earlier-misfit"}
+    said = [(one["words"], levels.get(one["level"], "earlier"), one["accepted"]) for one in findings.get("odd", ())]
+    said += [(findings["unexplained"], "earlier-misfit", False)] if findings.get("unexplained") else []
+    said += [(words, "earlier", False) for words in findings.get("notes", ()) if words != findings.get("unexplained")]
+    noticed = [{"code": code, "values": {"words": words}, "accepted": accepted} for words, code, accepted in said]
+    return findings | {"noticed": noticed}
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -236,42 +249,31 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     files.write_json(folder / METRICS, metrics(outcome))
 
 
-def metrics(outcome: Outcome) -> dict[str, object]:
+def metrics(outcome: Outcome) -> FitMetrics:
     """Return the content of ``metrics.json``."""
-    return {
-        "schema": SCHEMA,
-        "fit": {"parameters": len(outcome.selection.fit.free), **outcome.fit.table()},
-        **outcome.assessment.table(),
-        "model": outcome.selection.chosen,
-        "ladder": [
-            {
-                "model": rung.model,
-                "parameters": rung.parameters,
-                "cross_validated_mm": 1e3 * rung.cross_validated,
-                "kept": rung.kept,
-                "note": rung.note,
-                "corrections": rung.corrections,
-            }
-            for rung in outcome.selection.rungs
-        ],
-        "seed": outcome.wanted.seed,
-        "status": outcome.selection.fit.solution.status.name.lower(),
-        "tolerance_mm": None if outcome.wanted.tolerance is None else 1e3 * outcome.wanted.tolerance,
-        "not_identifiable": list(outcome.unclear),
-        "outliers": [
-            {
-                "file": each.file,
-                "row": each.row,
-                "nature": each.nature,
-                "sigmas": each.sigmas,
-                "size_deg" if each.nature == "orientation" else "size_mm": each.size
-                * (np.degrees(1.0) if each.nature == "orientation" else 1e3),
-            }
-            for each in outcome.outliers
-        ],
-        "findings": asdict(outcome.findings),
-        "predicted_sigmas": [asdict(each) for each in outcome.predicted_sigmas],
-    }
+    judged, tolerance = outcome.assessment.record, outcome.wanted.tolerance
+    return FitMetrics(
+        fit=outcome.fit.record(len(outcome.selection.fit.free)),
+        model=outcome.selection.chosen,
+        ladder=tuple(
+            LadderStep(r.model, r.parameters, 1e3 * r.cross_validated, r.kept, r.note, r.corrections)
+            for r in outcome.selection.rungs
+        ),
+        seed=outcome.wanted.seed,
+        status=outcome.selection.fit.solution.status.name.lower(),
+        tolerance_mm=None if tolerance is None else 1e3 * tolerance,
+        not_identifiable=tuple(lines_of(outcome.unclear)),
+        outliers=tuple(map(_outlier_row, outcome.outliers)),
+        findings=outcome.findings,
+        **{name: getattr(judged, name) for name in JUDGED},
+    )
+
+
+def _outlier_row(one: Outlier) -> OutlierRow:
+    row = OutlierRow(one.file, one.row, one.nature, one.sigmas)
+    if one.nature == "orientation":
+        return replace(row, size_deg=float(np.degrees(one.size)))
+    return replace(row, size_mm=1e3 * one.size)
 
 
 def _record(outcome: Outcome) -> dict[str, object]:

@@ -5,38 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from calib.errors import Finding
+from calib.geometry.accuracy import ArmErrors, ErrorStatistics
 from calib.geometry.uncertainty.error_model import Discrepancy
-from calib.procedure.findings import SpelledFinding as Finding
 from calib.procedure.findings import Verdict
-from calib.procedure.sigma_comparison import SigmaComparison
+
+JUDGED = ("validation", "verdict", "reason", "code", "advice", "warnings", "noticed", "deliverables", "deliverable")
+"""What `FitMetrics` and `ValidationMetrics` have in common."""
+SCHEMA = 3  # of metrics.json; 1 had no findings, 2 kept sentences in place of codes
 
 
 @dataclass(frozen=True)
-class ErrorStatistics:
-    """Sizes of errors in mm or deg."""
-
-    mean: float
-    rms: float
-    p95: float
-    max: float
-
-
-@dataclass(frozen=True)
-class _ArmErrors:
-    """Errors of one arm by nature; None where nothing of the kind was measured."""
-
-    position_mm: ErrorStatistics | None = None
-    orientation_deg: ErrorStatistics | None = None
-    distance_mm: ErrorStatistics | None = None
-
-    @property
-    def main(self) -> ErrorStatistics | None:
-        """What is judged by: positions, or distances where there are no positions [mm]."""
-        return self.position_mm or self.distance_mm
-
-
-@dataclass(frozen=True)
-class _MeanAndMax:
+class MeanAndMax:
     """Of some sizes."""
 
     mean: float
@@ -44,11 +24,11 @@ class _MeanAndMax:
 
 
 @dataclass(frozen=True)
-class _BothArms:
+class BothArms:
     """The same of the nominal and of the calibrated arm."""
 
-    nominal: _MeanAndMax
-    calibrated: _MeanAndMax
+    nominal: MeanAndMax
+    calibrated: MeanAndMax
 
 
 @dataclass(frozen=True)
@@ -61,6 +41,8 @@ class RepeatedPose:
     calibrated_mm: tuple[float, ...]
     repeatability_deg: tuple[float, ...] = ()
     multidirectional_mm: float | None = None
+    nominal_deg: tuple[float, ...] = ()
+    calibrated_deg: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -69,14 +51,17 @@ class RepeatedPoses:
 
     poses: int
     cycles: tuple[int, int]
-    repeatability_mm: _MeanAndMax
-    accuracy_mm: _BothArms
+    repeatability_mm: MeanAndMax
+    accuracy_mm: BothArms
     each: tuple[RepeatedPose, ...] = ()
+    orientation_repeatability_deg: MeanAndMax | None = None
+    orientation_accuracy_deg: BothArms | None = None
+    multidirectional_mm: MeanAndMax | None = None
 
 
 @dataclass(frozen=True)
-class _IntervalCoverage:
-    """How many errors were within the 95 % interval that the fit states, how wide that was, where it extrapolated."""
+class IntervalCoverage:
+    """Share of errors within the 95 % interval that the fit states, its width, and where the model extrapolates."""
 
     coverage_percent: float
     median_mm: float
@@ -100,20 +85,22 @@ class ComparedRows:
         unseen: False where rows are none that the fit had not seen.
         parameters: how many were fitted, on the fit's own rows.
         interval95: how the errors that the fit stated held here.
+        reprojection_px: arm -> rms distance of seen from predicted corners.
     """
 
     poses: int
     frames: str
-    nominal: _ArmErrors
-    calibrated: _ArmErrors
-    urdf_alone: _ArmErrors | None = None
-    pair_distance_mm: Mapping[str, ErrorStatistics] = field(default_factory=dict)
+    nominal: ArmErrors
+    calibrated: ArmErrors
+    urdf_alone: ArmErrors | None = None
+    pair_distance_mm: Mapping[str, ErrorStatistics | None] = field(default_factory=dict)
     iso9283: RepeatedPoses | None = None
     unseen: bool = True
     parameters: int = 0
-    interval95: _IntervalCoverage | None = None
+    interval95: IntervalCoverage | None = None
+    reprojection_px: Mapping[str, float] = field(default_factory=dict)
 
-    def judged(self, deliverable: str) -> _ArmErrors:
+    def judged(self, deliverable: str) -> ArmErrors:
         """Return the errors of what is to be delivered."""
         return self.calibrated if deliverable != "urdf" or self.urdf_alone is None else self.urdf_alone
 
@@ -144,33 +131,29 @@ class OutlierRow:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a fit says of itself and a verdict needs beside the errors on rows; kept in the fit's folder.
+    """What a verdict needs of a fit besides the errors on rows; kept in the fit's folder.
 
     Attributes:
         model: the one chosen.
-        cross_validated, nominal_cross_validated: errors of the chosen model and of the nominal arm on rows left out
-            [m]; None where they were not computed.
+        cross_validated, nominal_cross_validated: errors of the chosen model and of the nominal arm [m]; None where they
+            were not computed.
         outlier_share: of the fit's rows.
-        unexplained: that no rigid geometry explains the measurements, in words, where that decides; else empty.
         reach: of the arm [m].
         loss: that was used; empty where it is not known.
-        notes: what a user should know of the fit, whatever the unseen rows are.
-        blind: stations whose rows were left out by regions only, since the others do not tell where their tool is.
+        noticed: findings on the fit, worst first, whatever the unseen rows are.
+        blind: stations cross-validated by regions only, since their tool is not identifiable from the others.
         rigid_cross_validated: the error of the best model without joint corrections [m].
-        discrepancy: what makes an error at a pose likely, learnt on rows left out; None where nothing was.
-        odd: what cannot be of this arm, see `calib.procedure.kinematic_stage.plausibility`.
+        discrepancy: what makes an error at a pose likely, learnt by cross-validation; None where nothing was.
     """
 
     model: str
     cross_validated: float | None
     nominal_cross_validated: float | None
     outlier_share: float
-    unexplained: str
     reach: float
     loss: str = ""
-    notes: tuple[str, ...] = ()
+    noticed: tuple[Finding, ...] = ()
     blind: tuple[str, ...] = ()
-    odd: tuple[Finding, ...] = ()
     discrepancy: Discrepancy | None = None
     rigid_cross_validated: float | None = None
 
@@ -182,13 +165,18 @@ class ValidationMetrics:
     Attributes:
         deliverables: the verdict on each of `calib.procedure.kinematic_stage.settings.DELIVERABLES` that there is.
         deliverable: which of them `verdict` and `reason` are about; empty in files of earlier versions.
+        noticed: the findings behind the warnings; what the reading of files noticed is text only.
+        code, advice: of the finding that decided the verdict; empty for a pass.
     """
 
     validation: Mapping[str, ComparedRows]
     verdict: str
     reason: str
     warnings: tuple[str, ...]
-    schema: int = 1
+    noticed: tuple[Finding, ...] = ()
+    code: str = ""
+    advice: str = ""
+    schema: int = SCHEMA
     deliverables: Mapping[str, Verdict] = field(default_factory=dict)
     deliverable: str = ""
 
@@ -209,8 +197,11 @@ class FitMetrics:
     not_identifiable: tuple[str, ...]
     outliers: tuple[OutlierRow, ...]
     findings: Findings | None = None
-    predicted_sigmas: tuple[SigmaComparison, ...] = ()
-    schema: int = 1
+    noticed: tuple[Finding, ...] = ()
+    code: str = ""
+    advice: str = ""
+    schema: int = SCHEMA
+    status: str = ""
     deliverables: Mapping[str, Verdict] = field(default_factory=dict)
     deliverable: str = ""
 

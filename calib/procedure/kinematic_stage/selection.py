@@ -17,7 +17,7 @@ from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-from calib.procedure.measuring.camera_view import ASSUMED, ImageObservation, image_observation
+from calib.procedure.measuring.camera_view import ASSUMED, image_observation
 from calib.procedure.measuring.drivable import Drivable, Exchange, drivable
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, Seen, by_count
@@ -25,7 +25,7 @@ from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
 from calib.procedure.measuring.run import Run, RunSettings
 from calib.procedure.measuring.run import lines as ways
-from calib.procedure.measuring.selection_prediction import NOISES, SelectionPrediction, beside
+from calib.procedure.measuring.selection_prediction import SelectionPrediction, beside
 from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
@@ -232,14 +232,7 @@ def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
     own = outlook.poses
     if not np.isfinite(own.rms):
         return None
-    noise = dict[str, float]()
-    if not isinstance(seen, ImageObservation):
-        noise = dict(zip(list(NOISES)[: 1 + seen.full], seen.sigmas))
-    return SelectionPrediction(
-        seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()),
-        tuple(map(tuple, outlook.typical.tolist())), tuple(own.spread.tolist()), noise,
-        isinstance(seen, ImageObservation),
-    )  # fmt: skip
+    return SelectionPrediction(seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()))
 
 
 def _typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:

@@ -6,15 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib import files
 from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.errors import Finding, finding
 from calib.geometry.accuracy import Errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames, without_corrections
@@ -22,7 +22,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
-from calib.procedure.findings import Verdict
+from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.kinematic_stage.comparison import (
     INTERVAL,
     MARGIN,
@@ -33,9 +33,9 @@ from calib.procedure.kinematic_stage.comparison import (
     interval_cells,
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.metrics import Findings
+from calib.procedure.kinematic_stage.metrics import Findings, ValidationMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, judge
+from calib.procedure.kinematic_stage.verdict import judge
 from calib.robot.chain import Chain
 from calib.transforms import invert
 
@@ -70,7 +70,8 @@ class Assessment:
         fit: on the fit's rows.
         validation: on unseen rows, by file name.
         verdict: on what is to be delivered, with its reason.
-        warnings: what a user should know, of the inputs, the fit and the unseen rows.
+        noticed: findings on the fit and on the unseen rows, worst first.
+        notes: what the reading of the files noticed, as text.
         deliverables: the verdict on each deliverable that there is (`DELIVERABLES`).
         deliverable: which of them `verdict` is about.
     """
@@ -78,20 +79,30 @@ class Assessment:
     fit: Comparison
     validation: Mapping[str, Comparison]
     verdict: Verdict
-    warnings: tuple[str, ...]
+    noticed: tuple[Finding, ...]
+    notes: tuple[str, ...]
     deliverables: Mapping[str, Verdict]
     deliverable: str
 
-    def table(self) -> dict[str, Any]:
-        """Return the unseen rows, the verdict and the warnings as ``metrics.json`` holds them."""
-        return {
-            "validation": {name: comparison.table() for name, comparison in self.validation.items()},
-            "verdict": self.verdict.level,
-            "reason": self.verdict.reason,
-            "warnings": list(self.warnings),
-            "deliverables": {name: asdict(one) for name, one in self.deliverables.items()},
-            "deliverable": self.deliverable,
-        }
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know, worst first."""
+        return tuple(dict.fromkeys((*lines_of(self.noticed), *self.notes)))
+
+    @property
+    def record(self) -> ValidationMetrics:
+        """The unseen rows, the verdict and the warnings as ``metrics.json`` holds them."""
+        return ValidationMetrics(
+            validation={name: comparison.record() for name, comparison in self.validation.items()},
+            verdict=self.verdict.level,
+            reason=self.verdict.reason,
+            code=self.verdict.code,
+            advice=self.verdict.advice,
+            warnings=self.warnings,
+            noticed=self.noticed,
+            deliverables=self.deliverables,
+            deliverable=self.deliverable,
+        )
 
 
 def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, wanted: FitSettings) -> Assessment:
@@ -115,41 +126,33 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
         for name, unseen in inputs.unseen.items()
     }
     judged = judge_deliverables(fitted, validation, findings, wanted)
-    if copies := _copies(inputs):
-        seen = f"not unseen: {', '.join(copies)}"
-        judged = {name: replace(one, reason=f"{seen}; {one.reason}") for name, one in judged.items()}
     chosen = wanted.deliverable if wanted.deliverable in judged else "urdf"
-    verdict = judged[chosen]
-    for other in judged.keys() - {chosen}:
-        said = f"{ARM[other]} {1e3 * _worst(validation, findings, other):.3f} mm: {judged[other].level}"
-        verdict = replace(verdict, reason=f"{verdict.reason}; {said}")
-    blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
-    warnings = (
-        *(one.told for one in findings.odd),
-        *inputs.notes, *(note for block in blocks for note in block.notes), *_elsewhere(fitted, validation),
-        *findings.notes, *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
+    others = [
+        finding("other-deliverable", arm=ARM[other], rms=_worst(validation, findings, other), level=judged[other].level)
+        for other in judged.keys() - {chosen}
+    ]
+    copies = _copies(inputs)
+    noticed = (
+        *others, *findings.noticed, *([finding("not-unseen", files=copies)] if copies else []),
+        *_elsewhere(fitted, validation), *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
     )  # fmt: skip
-    return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)), judged, chosen)
+    blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
+    notes = (*inputs.notes, *(note for block in blocks for note in block.notes))
+    return Assessment(fitted, validation, judged[chosen], noticed, notes, judged, chosen)
 
 
 def judge_deliverables(
     fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, wanted: FitSettings
 ) -> dict[str, Verdict]:
     """Return the verdict on each deliverable: on robot.urdf alone and, where there are any, with joint corrections."""
-    common = partial(
-        judge, model=findings.model, asked=wanted.model or "auto", outlier_share=findings.outlier_share,
-        unexplained=findings.unexplained, tolerance=wanted.tolerance, reach=findings.reach, blind=findings.blind,
-        nominal_cross_validated=findings.nominal_cross_validated,
-    )  # fmt: skip
+    common = partial(judge, findings=findings, asked=wanted.model or "auto", tolerance=wanted.tolerance)
     if fit.alone is None:
-        found = {"urdf": common(fit, validation, cross_validated=findings.cross_validated)}
-    else:
-        bare = {name: each.of_urdf for name, each in validation.items()}
-        found = {
-            "urdf": common(fit.of_urdf, bare, cross_validated=findings.rigid_cross_validated, arm=ARM["urdf"]),
-            "corrections": common(fit, validation, cross_validated=findings.cross_validated, arm=ARM["corrections"]),
-        }
-    return {name: one.held_by(findings.odd) for name, one in found.items()}
+        return {"urdf": common(fit, validation, cross_validated=findings.cross_validated)}
+    bare = {name: each.of_urdf for name, each in validation.items()}
+    return {
+        "urdf": common(fit.of_urdf, bare, cross_validated=findings.rigid_cross_validated, arm=ARM["urdf"]),
+        "corrections": common(fit, validation, cross_validated=findings.cross_validated, arm=ARM["corrections"]),
+    }
 
 
 def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
@@ -181,71 +184,61 @@ def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
     return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings, torques).cell
 
 
-def _elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:
-    """Name validation files whose errors look like another placement of the instrument, not like an arm's."""
+def _elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[Finding]:
+    """Return validation files whose errors look like another placement of the instrument, not like an arm's."""
     usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
+    sizes = {name: float(np.median(found.errors[0].main)) for name, found in validation.items()}
     return [
-        f"{name}: nominal errors of {1e3 * np.median(found.errors[0].main):.3g} mm look like an instrument (or "
-        f"tool) that stood elsewhere; {OWN_FRAMES}"
-        for name, found in validation.items()
-        if np.median(found.errors[0].main) > ELSEWHERE * usual
+        finding("validation-elsewhere", file=name, rms=size) for name, size in sizes.items() if size > ELSEWHERE * usual
     ]
 
 
-def _doubtful(validation: Mapping[str, Comparison]) -> list[str]:
-    """Name unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
+def _doubtful(validation: Mapping[str, Comparison]) -> list[Finding]:
+    """Return unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
     result = []
     for name, each in validation.items():
         sizes, numbers = each.errors[1].main, [row for block in each.blocks for row in _numbers(block)]
         far = np.flatnonzero(sizes > GROSS * np.median(sizes)) if len(sizes) == len(numbers) else []
-        if len(far):
-            rows = ", ".join(f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far[:5])
-            rest = np.delete(sizes, far)
-            without = 1e3 * float(np.sqrt(np.mean(rest**2)))
-            beyond = None if each.intervals is None else each.intervals.beyond
-            outside = 0 if beyond is None or len(beyond) != len(sizes) else int(np.count_nonzero(beyond[far]))
-            why = "measured wrongly?"
-            if outside > len(far) / 2:
-                why = f"{outside} of these {len(far)} are outside the range learnt from: the model extrapolates."
-            result.append(
-                f"{name}: {rows} far off the median of {1e3 * np.median(sizes):.3g} mm; {why} They count, "
-                f"for the verdict too; without them the rms is {without:.3f} mm"
+        if not len(far):
+            continue
+        rest = np.delete(sizes, far)
+        beyond = None if each.intervals is None else each.intervals.beyond
+        outside = 0 if beyond is None or len(beyond) != len(sizes) else int(np.count_nonzero(beyond[far]))
+        result.append(
+            finding(
+                "doubtful-rows", file=name, rows=[f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far],
+                median=np.median(sizes), without=float(np.sqrt(np.mean(rest**2))), outside=outside,
             )
+        )  # fmt: skip
     return result
 
 
-def _interval_notes(validation: Mapping[str, Comparison]) -> list[str]:
-    """Say how many errors on unseen rows are within the interval that the fit states, and where it extrapolates."""
+def _interval_notes(validation: Mapping[str, Comparison]) -> list[Finding]:
+    """Return how many errors on unseen rows are within the 95 % interval, and where the model extrapolates."""
     result = []
     for name, each in validation.items():
         if (found := each.intervals) is None or not each.settled or each.placed_by is not None:
             continue
-        result.append(
-            f"{name}: {100 * found.covered:.1f} % of {len(found.size)} errors are within the 95 % interval "
-            f"that the fit states (median ± {1e3 * np.median(found.radius):.3f} mm)"
-        )
-        if found.beyond.any():
-            result.append(
-                f"{name}: {int(found.beyond.sum())} of {len(found.size)} poses have {', '.join(found.joints)} outside "
-                "the range that was learnt from: there the model extrapolates"
-            )
+        count = len(found.size)
+        values = {"covered": found.covered, "errors": count, "median": np.median(found.radius)}
+        result.append(finding("interval-coverage", file=name, **values))
+        if beyond := int(found.beyond.sum()):
+            result.append(finding("outside-fitted-range", file=name, beyond=beyond, poses=count, joints=found.joints))
     return result
 
 
-def _unsettled(validation: Mapping[str, Comparison]) -> list[str]:
-    """Name unseen files on which the placement of base and tool did not settle, or took up most of the errors."""
-    thin = {name: each.placed_by for name, each in validation.items() if each.settled and each.placed_by is not None}
-    few = [
-        f"{name} is not scored: base and tool placement take {fitted} parameters of its {measured} measured numbers, "
-        f"which leaves too few to judge by; measure {MARGIN * fitted} numbers or more, or from a station of the fit"
-        for name, (measured, fitted) in thin.items()
-    ]
-    return few + [
-        f"{name} is not scored: base and tool placement did not settle on its rows, which hardly tell both; measure it "
-        "from a station of the fit, or let it hold poses that turn about more than one axis"
-        for name, each in validation.items()
-        if not each.settled
-    ]
+def _unsettled(validation: Mapping[str, Comparison]) -> list[Finding]:
+    """Return unseen files on which the placement of base and tool did not settle, or took up most of the errors."""
+    result = []
+    for name, each in validation.items():
+        if not each.settled:
+            result.append(finding("placement-unsettled", file=name))
+        elif each.placed_by is not None:
+            measured, fitted = each.placed_by
+            result.append(
+                finding("placement-takes-all", file=name, measured=measured, fitted=fitted, wanted=MARGIN * fitted)
+            )
+    return result
 
 
 def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pixels import IN_HAND, Pixels
+from calib.errors import Finding, finding
 from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
@@ -17,7 +18,7 @@ from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.result import GeometricFit
 
 GRID = (12, 9)  # cells of the image that coverage counts (our choice)
-LOOSE = 4.0  # times their stated sigmas that corners lie off within an image, from which on it is worth a word
+MAX_NOISE = 4.0  # corner noise over its stated sigma from which on it is remarked on (our choice)
 
 
 @dataclass(frozen=True)
@@ -73,36 +74,25 @@ def image_words(block: Pixels) -> str:
     return f"{seen}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
 
 
-def image_notes(found: GeometricFit) -> list[str]:
-    """Return what is to be said of a fit's images; nothing where there are none."""
-    lines, others = [], [block.measured for block in found.blocks if not isinstance(block.measured, Pixels)]
+def image_notes(found: GeometricFit) -> list[Finding]:
+    """Return findings on a fit's images; nothing where there are none."""
+    result: list[Finding] = []
+    others = [Path(block.measured.file).name for block in found.blocks if not isinstance(block.measured, Pixels)]
     for piece in found.pieces:
         block, part = found.blocks[piece.block].measured, piece.part
         if not isinstance(block, Pixels) or not isinstance(part, PixelPart) or part.noise is None:
             continue
         name, noise = Path(block.file).name, part.noise
-        rms = float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
-        own = float(np.sqrt(np.mean(np.sum(part.within(piece.sigma) ** 2, axis=0))))
-        lines.append(
-            f"{name}: reprojection error {rms:.3f} px rms, {own:.3f} px where each image has a pose of its own; the "
-            f"rest, {1e3 * noise.displacement:.3f} mm and {1e3 * noise.turn:.3f} mrad per axis and image, is what "
-            "the arm does not repeat or the model does not explain"
-        )
-        if noise.factor > LOOSE and block.sigma is not None:
-            lines.append(
-                f"{name}: within an image corners lie {noise.factor:.1f} times as far off as their detection explains: "
-                "is the board flat, and does the lens fit (model, camera.yaml)? Options: [camera] board = ['bend'] "
-                "fits a bent board, intrinsics = 'fit' the lens"
-            )
-        pixels = block.pixel[block.seen]
-        lines.append(f"{name}: {coverage_words(pixels, block.size)}")
+        rms, image = (float(np.sqrt(np.mean(np.sum(v**2, axis=0)))) for v in (part.value, part.within(piece.sigma)))
+        values = {"rms": rms, "image": image, "shift": noise.displacement, "turn": noise.turn}
+        result.append(finding("reprojection", file=name, **values))
+        if noise.factor > MAX_NOISE and block.sigma is not None:
+            result.append(finding("corners-off", file=name, times=noise.factor))
+        words = coverage_words(block.pixel[block.seen], block.size)
+        result.append(finding("image-coverage", file=name, coverage=words))
         if "scale" not in block.free:
-            lines.append(
-                f"{name}: the board gives the scale ({1e3 * block.board.square:g} mm a square): an error of 0.1 % "
-                "there is one of 0.1 % in every length of the robot"
-                + (", against which the other instruments' measurements stand" if others else "")
-            )
-    return lines
+            result.append(finding("board-scale", file=name, square=block.board.square, others=others))
+    return result
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
@@ -112,8 +102,7 @@ def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | No
 
 
 def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
-    """Return how much of the image the corners cover, with a word where that is little."""
+    """Return how much of the image the corners cover, with advice where that is little."""
     share = float(np.mean(coverage(pixels, size) > 0))
-    words = f"corners lie in {share:.0%} of the image"
-    few = ": bring the board (or the camera) nearer, and into the image's corners, or the lens is not told there"
-    return words + (few if share < 0.6 else "")
+    few = ": bring the board nearer and into the image's corners, else the lens is not identifiable there"
+    return f"corners lie in {share:.0%} of the image{few if share < 0.6 else ''}"

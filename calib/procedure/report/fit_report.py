@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,10 +18,10 @@ from calib.geometry.parameters import layout
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
-from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
+from calib.procedure.kinematic_stage.metrics import JUDGED, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
 from calib.procedure.measuring.image_findings import ImageCoverage, image_coverage
-from calib.records import read_json, read_record
+from calib.records import read_json
 from calib.transforms import invert
 
 SCHEMA = 2
@@ -118,22 +118,9 @@ class Report:
 
     def with_unseen(self, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
         """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
-        metrics = replace(
-            self.metrics,
-            validation=found.validation,
-            verdict=found.verdict,
-            reason=found.reason,
-            warnings=found.warnings,
-            deliverables=found.deliverables,
-            deliverable=found.deliverable,
-        )
+        metrics = replace(self.metrics, **{name: getattr(found, name) for name in JUDGED})
         fresh = {one.name for one in sets}
         return replace(self, metrics=metrics, sets=(*(one for one in self.sets if one.name not in fresh), *sets))
-
-
-def fit_metrics(outcome: Outcome) -> FitMetrics:
-    """Return the metrics of a fit as values."""
-    return read_record(FitMetrics, metrics(outcome), "metrics")
 
 
 def collect(outcome: Outcome) -> Report:
@@ -152,7 +139,7 @@ def collect(outcome: Outcome) -> Report:
         tip=chain.tip,
         joints=tuple(chain.joint_names),
         prismatic=tuple(joint.kind == "prismatic" for joint in chain.joints),
-        metrics=fit_metrics(outcome),
+        metrics=metrics(outcome),
         parameters=tuple(_FittedParameter(*row, groups[row[0]]) for row in table.rows()),
         kept=tuple(name for name in chain.names if name not in fitted),
         correlations=tuple(_CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(0.9)),
@@ -218,7 +205,7 @@ def _plain(values: np.ndarray) -> tuple[Any, ...]:
 
 def write(report: Report, path: Path) -> None:
     """Write a report as JSON."""
-    files.write_json(path, asdict(report))
+    files.write_json(path, report)
 
 
 def read(path: Path) -> Report:

@@ -45,10 +45,6 @@ ALONE_NOTE = (
     "A URDF cannot hold the joint corrections of the chosen model: robot.urdf is the best geometry without them, and "
     "its errors stand beside; robot_for_corrections.urdf with joint_corrections.csv has those of the calibrated arm."
 )
-PREDICTION_NOTE = (
-    "Medians, of the tool's position the rms. The fit weighs by its own noise, adds effects, and may have seen other "
-    "poses, too: each moves the ratio."
-)
 
 
 def read_blocks(inputs: Inputs) -> list[Block]:
@@ -70,8 +66,9 @@ def outcome_section(metrics: FitMetrics) -> Section:
     """Return what a fit came to as the console says it: ladder, errors, repeated poses, what to know, verdict."""
     blocks: list[Block] = [_ladder_table(metrics), _error_table(metrics)]
     blocks += [Text("", _repeated_sentences(metrics)), Text("", metrics.not_identifiable, "identifiability")]
-    blocks += _sigma_tables(metrics)
     blocks += [Text("", metrics.warnings, "note"), Text("", _outlier_sentences(metrics), "outliers")]
+    if metrics.advice and not any(metrics.advice in line for line in metrics.warnings):
+        blocks.append(Text("", [metrics.advice], "what to do"))
     return Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
@@ -90,7 +87,7 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
     blocks.append(Text("What the poses can tell", _identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
-    blocks += [_parameter_table(report), *_sigma_tables(metrics)]
+    blocks.append(_parameter_table(report))
     if metrics.outliers:
         blocks.append(_outlier_table(metrics))
     blocks.append(Text("Notes", metrics.warnings))
@@ -187,8 +184,8 @@ def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistic
             if (numbers := _errors(found, arm, key)) is not None:
                 yield f"{words} [{unit}]", arm, numbers
     for arm in ARMS:
-        if arm in found.pair_distance_mm:
-            yield "distance of pairs [mm]", arm, found.pair_distance_mm[arm]
+        if numbers := found.pair_distance_mm.get(arm):
+            yield "distance of pairs [mm]", arm, numbers
 
 
 def _ladder_table(metrics: FitMetrics) -> Table:
@@ -241,20 +238,6 @@ def _parameter_table(report: Report) -> Table:
         note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
     header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
     return Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
-
-
-def _sigma_tables(metrics: FitMetrics) -> list[Table]:
-    """Return what was predicted when the poses were chosen beside what the fit states; nothing without a prediction."""
-    if not metrics.predicted_sigmas:
-        return []
-    rows = [
-        (row.kind, row.unit, str(row.count), f"{row.predicted:.3g}", f"{row.stated:.3g}", f"{row.ratio:.2f}",
-         f"{row.low:.2f} to {row.high:.2f}" if row.count > 1 else "")
-        for row in metrics.predicted_sigmas
-    ]  # fmt: skip
-    header = ("σ of", "unit", "how many", "predicted", "stated", "ratio", "eight in ten")
-    return [Table("Predicted when the poses were chosen, and stated by the fit", header, rows, PREDICTION_NOTE,
-                  numbers=range(2, 7))]  # fmt: skip
 
 
 def _outlier_sentences(metrics: FitMetrics) -> list[str]:

@@ -183,11 +183,6 @@ def fit(session: Session, say: Say) -> list[str]:
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
     metrics = session.fit.metrics()
     notes = [f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}", *outcome.warnings]
-    notes += [
-        f"σ of {row.kind}: {row.predicted:.3g} {row.unit} predicted when the poses were chosen, {row.stated:.3g} "
-        f"{row.unit} stated"
-        for row in outcome.predicted_sigmas
-    ]
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])
         advice = (
@@ -213,7 +208,7 @@ def validate(session: Session, say: Say) -> list[str]:
     asked = replace(wanted, model=wanted.model or options.model)
     found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
-    written = out.write(found, given, [asdict(each) for each in rows])
+    written = out.write(found, given, rows)
     fit_report.write(report.with_unseen(written, rows), out.report)
     fresh = [words for words in found.warnings if words not in before.warnings]
     return [*notes, str(found.verdict), *fresh]

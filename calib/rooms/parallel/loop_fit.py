@@ -24,9 +24,8 @@ from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError, MeasurementError, UsageError, suggestion
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
-from calib.procedure.findings import Verdict
+from calib.procedure.findings import Verdict, limit
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.verdict import GAIN, TRANSFER, WORSE
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, NoPosture
@@ -331,12 +330,16 @@ def _judge(
             both = f"{kind}rms on {where} rows: {factor * before:.3g} {unit} nominal, {factor * after:.3g} calibrated"
             if tolerance is not None and kind == "position " and after > tolerance:
                 return Verdict("fail", f"{both}, above the tolerance of {1e3 * tolerance:g} mm")
-            if after > WORSE * before:
+            if after > limit("worse-than-nominal", "times") * before:
                 return Verdict("fail", f"the calibrated robot is worse than the nominal one: {both}")
             told.append(both)
-            small += [both] if after > (1.0 - GAIN) * before else []
+            small += [both] if after > limit("small-gain", "left", "marginal") * before else []
             fitted = _rms(own[1][:, columns])
-            far += [f"{both}, {after / fitted:.1f} times the fit's own"] if after > TRANSFER * fitted else []
+            far += (
+                [f"{both}, {after / fitted:.1f} times the fit's own"]
+                if after > limit("no-transfer", "times", "marginal") * fitted
+                else []
+            )
     if not told:
         return Verdict("marginal", "there are no unseen rows, and too few to leave some out: measure more poses")
     if rows.coordinates is None:

@@ -216,7 +216,5 @@ def test_what_was_not_checked_and_what_was_predicted_is_repeated(finished: Sessi
     page = (finished.folder / "certificate.html").read_text()
     assert "poses NOT checked for" in page and "obstacles (not known)" in page and "self-collision (capsules" in page
     notes = json.loads((finished.folder / "state.json").read_text())["steps"]["fit"]["notes"]
-    told = next(note for note in notes if note.startswith("σ of tool's position"))
-    promised, stated = (float(part.split(" mm")[0].split()[-1]) for part in told.split(" predicted when"))
-    assert 0 < promised < 10 * stated < 1000 * promised
+    assert any(note.startswith("estimated σ / predicted σ") for note in notes)
     assert (finished.folder / "2-poses/poses_run.csv").read_text().startswith("t,pose,")

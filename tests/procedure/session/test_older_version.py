@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,9 +64,9 @@ def test_validating_an_older_fit_again_gives_its_verdict_and_figures(cell: Path)
     old = json.loads((cell / "5-validation/metrics.json").read_text())
     _redone(cell, "validate")
     new = json.loads((cell / "5-validation/metrics.json").read_text())
-    assert (new["verdict"], new["reason"]) == (old["verdict"], old["reason"])
+    assert new["verdict"] == old["verdict"]
     errors = old["validation"]["validation.csv"]
-    same(errors, {key: new["validation"]["validation.csv"][key] for key in errors})
+    same(errors, _narrowed(new["validation"]["validation.csv"], errors))
 
 
 def test_an_older_fit_is_exported_and_compensates_as_it_did(cell: Path, tmp_path: Path) -> None:
@@ -93,6 +94,11 @@ def test_dynamics_identified_on_an_older_fit_are_those_it_gave(cell: Path, tmp_p
     assert errors["total"] == pytest.approx(old["unseen_percent"]["total"], rel=0.02)
     values, sigma = (_column(EXPECTED / "estimate.csv", name) for name in ("value", "sigma"))
     assert (np.abs(_column(found / "estimate.csv", "value") - values) < 0.1 * sigma).all()
+
+
+def _narrowed(new: Any, old: Any) -> Any:
+    """Return of `new` what `old` has: a version may write more."""
+    return {key: _narrowed(new[key], old[key]) for key in old} if isinstance(old, dict) else new
 
 
 def _column(path: Path, name: str) -> np.ndarray:
