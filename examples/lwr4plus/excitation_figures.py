@@ -8,7 +8,7 @@ import numpy as np
 from dynamics import TABLE_4
 from matplotlib.figure import Figure
 
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, label_ticks, log_axis, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, log_axis, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.simulation.loop.references import Reference
@@ -46,7 +46,7 @@ def estimates(found: dict[str, Any]) -> Figure:
         for axis, words in ((first, "error of the estimate [%]"), (second, "|CAD - ID| / |ID| [%]")):
             axis.set_ylabel(words)
             log_axis(axis.yaxis, 0.0015, 300.0)
-            label_ticks(axis.xaxis, place, TABLE_4, 6, rotation=90)
+            axis.set_xticks(place, TABLE_4, fontsize=6, rotation=90)
             axis.set_xlim(-1.0, len(place))
         first.legend(ncols=4, fontsize=7, loc="lower left", bbox_to_anchor=(0.0, 0.98, 1.0, 0.1), mode="expand")
         figure.text(

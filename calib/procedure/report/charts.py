@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from calib import files
 from calib.procedure.report import style
 from calib.procedure.report.page import Picture
-from calib.procedure.report.style import AFTER, INK, MARK, QUIET, WIDE, label_ticks, log_axis
+from calib.procedure.report.style import AFTER, INK, MARK, QUIET, WIDE, log_axis
 
 SIZE = 16.0  # of a coloured dot [pt²]
 
@@ -262,7 +262,8 @@ class Panel:
                 axes.set(**{f"{axis.axis_name}lim": limits})
             if names is not None:
                 turned = axis is axes.xaxis and not any("\n" in name for name in names)
-                label_ticks(axis, range(len(names)), names, 5.0 if len(names) > 60 else 6.5, 90 * turned)
+                small = 5.0 if len(names) > 60 else 6.5
+                axis.set_ticks(range(len(names)), names, fontsize=small, rotation=90 * turned)
                 axes.set(**{f"{axis.axis_name}lim": (-0.6, len(names) - 0.4)})
             elif axis.axis_name in self.log and limits:
                 log_axis(axis, *limits)

@@ -6,7 +6,7 @@ Margins are matplotlib's constrained layout; text is never read as mathematics, 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis, XAxis, YAxis
+from matplotlib.axis import XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from PIL import Image
 
 from calib import files
@@ -83,38 +83,9 @@ def sheet(
 
 def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> None:
     """Make an axis logarithmic from `low` to `high`, with at most about `most` ticks: 1, 2, 5 or powers of ten."""
-    axes = axis.axes
-    if isinstance(axis, XAxis):
-        axes.set(xscale="log", xlim=(low, high))
-    else:
-        axes.set(yscale="log", ylim=(low, high))
-    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
-    ticks = (powers[:, None] * ([1.0, 2.0, 5.0] if high < 100.0 * low else [1.0])).ravel()
-    ticks = ticks[(low <= ticks) & (ticks <= high)]
-    if len(ticks) < 2:  # within less than a factor of about two: even steps
-        ticks = np.asarray(MaxNLocator(min(most, 5)).tick_values(low, high))
-        ticks = ticks[(low <= ticks) & (ticks <= high)]
-    ticks = ticks[:: max(1, -(-len(ticks) // most))]
-    label_ticks(axis, ticks, [number(tick) for tick in ticks])
-    axis.set_minor_locator(NullLocator())
-
-
-def label_ticks(axis: Axis, places: Any, labels: Sequence[str], size: float | None = None, rotation: float = 0) -> None:
-    """Put ticks with these labels at these places, all within view, without making a tick.
-
-    Args:
-        places: (k,) data coordinates.
-        labels: (k,).
-        size: of the letters [pt].
-        rotation: of the labels [deg].
-    """
-    places = np.asarray(places, dtype=float)
-    axis.set_major_locator(FixedLocator(places))
-    axis.set_major_formatter(FixedFormatter(labels))
-    if len(places):
-        axis.set_view_interval(places.min(), places.max())
-    given: dict[str, Any] = {} if size is None else {"labelsize": size}
-    axis.set_tick_params(rotation=rotation, **given)
+    axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
+    locator = LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,), numticks=most)
+    axis.set(major_locator=locator, minor_locator=NullLocator(), major_formatter=lambda value, _: number(value))
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
