@@ -139,10 +139,12 @@ def excite(
     outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
         outlook, predicted = _outlook(given, settings, problem, found, say)
+    pairs = zip(problem.goals, found.values)
+    reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
     return Designed(
         given, settings, problem, found, proof, condition_found,
-        _reached(problem, found), front, played,
+        reached, front, played,
         (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook,
         predicted,
     )  # fmt: skip
@@ -291,12 +293,6 @@ def _constraints(
         for one in (dynamics.smooth, dynamics.exact)
     ]  # fmt: skip
     return (*limits.constraints, torque[0]), (*limits.constraints, torque[1]), notes
-
-
-def _reached(problem: ExcitationProblem, found: SearchResult) -> tuple[tuple[str, float, float, float], ...]:
-    return tuple(
-        (goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in zip(problem.goals, found.values)
-    )
 
 
 def _front(

@@ -12,7 +12,6 @@ from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel, columns_at_rest, information
 from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.errors import UsageError
@@ -189,14 +188,13 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
 def _dynamics(
     model: IdentificationModel, values: np.ndarray | None, covariance: np.ndarray | None, friction: bool, notes: tuple
 ) -> ExcitedModel:
-    smooth = replace(model, terms=tuple(_smoothed(one) for one in model.terms))
+    smoothed = (
+        replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
+    )
+    smooth = replace(model, terms=tuple(smoothed))
     found = base_parameters.find(model)
     chosen = None if values is None else found.transform @ values
     return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, covariance, friction, notes)
-
-
-def _smoothed(one: DriveTerm) -> DriveTerm:
-    return replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one
 
 
 def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from calib.config import parse, read_toml, strict
+from calib.config import check_keys, parse, read_toml, strict
 from calib.config_types import Expect, numbers
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
@@ -46,21 +46,10 @@ PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint
 
 @strict
 @dataclass(frozen=True)
-class _DrivesTable:
-    """[drives]: parameters one per joint (SI, joint side)."""
-
-    Ia: PerJoint | None = None
-    Fv: PerJoint | None = None
-    Fc: PerJoint | None = None
-    off: PerJoint | None = None
-
-
-@strict
-@dataclass(frozen=True)
 class _DrivesFile:
-    """The file of ``calib plan --drives``."""
+    """The file of ``calib plan --drives``: [drives] with any of Ia, Fv, Fc, off, one per joint (SI, joint side)."""
 
-    drives: _DrivesTable = field(default_factory=_DrivesTable)
+    drives: Mapping[str, PerJoint] = field(default_factory=dict)
 
 
 COARSE = 150  # grid of the outer loop
@@ -135,7 +124,8 @@ def plan(
     chain, source = load_rigid(robot, waypoints, base, tip)
     known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
-    lower, upper, bounds = known.positions.lower, known.positions.upper, _timing_limits(known)
+    lower, upper, free = known.positions.lower, known.positions.upper, 1.0 - (known.margin or 0.0)
+    bounds = TimingLimits(known.bounds.velocity, known.bounds.acceleration, known.bounds.torque * free)
     arm = chain if model is None else read_dynamics(model)[0]
     points = read_waypoints(waypoints, arm, lower, upper, settings.start)
     say("the path")
@@ -186,8 +176,8 @@ def _timed(
 def _read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
     """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
     own = parse(_DrivesFile, read_toml(path), str(path)).drives
-    stated = {key: value for key in DRIVES if (value := getattr(own, key)) is not None}
-    return {key: np.array(numbers(value, chain.n, f"{path}: drives.{key}")) for key, value in stated.items()}
+    check_keys(own, DRIVES, f"{path}: drives")
+    return {key: np.array(numbers(value, chain.n, f"{path}: drives.{key}")) for key, value in own.items()}
 
 
 def _check_places(path: JointPath, known: MotionLimits) -> None:
@@ -273,12 +263,6 @@ def _guarded(bounds: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLi
             f"is {bounds.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
         )
     return replace(bounds, torque=bounds.torque - margin)
-
-
-def _timing_limits(known: MotionLimits) -> TimingLimits:
-    """Return the limits of timing."""
-    margin = known.margin or 0.0
-    return TimingLimits(known.bounds.velocity, known.bounds.acceleration, known.bounds.torque * (1 - margin))
 
 
 def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPath], np.ndarray | None]:

@@ -177,7 +177,15 @@ class Heat:
             aspect="equal" if self.extent else "auto",
         )  # fmt: skip
         for (i, j), value in np.ndenumerate(self.values) if self.written else ():
-            axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=5.5, color=_letters(value))
+            axes.text(
+                j,
+                i,
+                f"{value:.2f}",
+                ha="center",
+                va="center",
+                fontsize=5.5,
+                color=INK if abs(value) <= 0.6 else "white",
+            )
         _scale(axes, drawn, self.unit)
 
 
@@ -211,10 +219,6 @@ class Box:
             medianprops={"color": "white", "linewidth": 1.4}, whiskerprops={"color": QUIET}, capprops={"linewidth": 0},
             flierprops={"marker": ".", "markersize": 2.0, "markeredgecolor": QUIET},
         )  # fmt: skip
-
-
-def _letters(value: float) -> str:
-    return "white" if abs(value) > 0.6 else INK
 
 
 def _scale(axes: Axes, drawn: Any, unit: str, **options: Any) -> None:

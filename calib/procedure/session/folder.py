@@ -323,13 +323,10 @@ def locked(session: Session, say: Any = print) -> Iterator[None]:
         yield
         path.unlink(missing_ok=True)
     except Exception:
-        with_own = path.exists() and os.stat(path).st_ino == os.fstat(handle).st_ino and _mine(handle)
-        if with_own:
+        holder = os.pread(handle, 200, 0).decode(errors="replace")
+        there = path.exists() and os.stat(path).st_ino == os.fstat(handle).st_ino
+        if there and holder.startswith(f"process {os.getpid()} "):
             path.unlink(missing_ok=True)
         raise
     finally:
         os.close(handle)
-
-
-def _mine(handle: int) -> bool:
-    return os.pread(handle, 200, 0).decode(errors="replace").startswith(f"process {os.getpid()} ")

@@ -236,7 +236,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
         lines = deliver(session.fit.path, source, out)
     else:
         lines = [calibrated.ROBOT]
-        write_staged(out, USES, partial(_copy, session.fit.robot))
+        write_staged(out, USES, partial(shutil.copy, session.fit.robot))
     if not session.dynamic:
         return lines
     say("all parameters of possible bodies")
@@ -257,10 +257,6 @@ def deliver_identified(session: Session, out: Path) -> list[str]:
 
     source = session.robot_file
     return deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
-
-
-def _copy(source: Path, folder: Path) -> None:
-    files.write(folder / source.name, source.read_bytes())
 
 
 def clear_staging(session: Session) -> None:

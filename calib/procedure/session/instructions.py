@@ -35,9 +35,10 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
     device = session.settings.instrument.name
     if not session.settings.poses.plan or not path.exists():
         return f"Measure the target's {what} with the {device} at poses all over the workspace."
-    count = len(read_table(path))
+    ways = session.path(f"2-poses/{WAYS}")
+    order = f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
     return (
-        f"Drive the {count} poses of {path}{_in_order(session) if name == 'poses' else ''}"
+        f"Drive the {len(read_table(path))} poses of {path}{order if name == 'poses' and ways.exists() else ''}"
         f"{_and_validation(session) if both else ''}, let the arm settle, measure the "
         f"target's {what} with the {device} and log the joint angles read back; the first three once more at the end "
         "show drift "
@@ -54,12 +55,6 @@ def _take_images(session: Session, path: Path, both: bool) -> str:
         f"Drive {where}; at each let the arm settle for a second, take an image of the board (focus, zoom and exposure "
         "fixed, no automatic ones, no image turned or scaled), and log the joint angles read back."
     )
-
-
-def _in_order(session: Session) -> str:
-    """Name the ways between the poses."""
-    path = session.path(f"2-poses/{WAYS}")
-    return f" in their order (ways: {path}; calib view {session.folder} rehearses them)" if path.exists() else ""
 
 
 def _and_validation(session: Session) -> str:
