@@ -55,7 +55,7 @@ def files_of(folder: Path, ours: Collection[str]) -> list[str]:
     return sorted(name for name in os.listdir(folder) if any(fnmatchcase(name, one) for one in ours))
 
 
-def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], None]) -> Path:
+def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], object]) -> Path:
     """Let `write` fill a temporary folder beside `out`, and move its files there.
 
     A folder that is not there appears whole; in one from an earlier run each file is replaced, its own other files
