@@ -8,14 +8,14 @@ from typing import Any
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Base, Out, Plots, Robot, Seed, Tip, progress, say, say_written
+from calib.cli.shared import Out, Seed, progress, say, say_written
 
 app = typer.Typer()
 
 
 @command(app, "identify")
 def identify_dynamics(
-    robot: Robot,
+    robot: str,
     recordings: list[str],
     out: Out,
     validate: list[str] | None = None,
@@ -23,10 +23,10 @@ def identify_dynamics(
     friction: str | None = None,
     options: Path | None = None,
     excitation: Path | None = None,
-    base: Base = None,
-    tip: Tip = None,
+    base: str | None = None,
+    tip: str | None = None,
     seed: Seed = 0,
-    plots: Plots = True,
+    plots: bool = True,
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
 

@@ -8,21 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import (  # fmt: skip
-    Base,
-    Out,
-    Overwrite,
-    Plots,
-    Robot,
-    Seed,
-    Tip,
-    Workers,
-    exit_failed,
-    numbers,
-    progress,
-    say,
-    say_written,
-)
+from calib.cli.shared import Out, Seed, exit_failed, numbers, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 
 app = typer.Typer()
@@ -30,16 +16,16 @@ app = typer.Typer()
 
 @command(app)
 def fit(
-    robot: Robot,
+    robot: str,
     measured: list[Path],
     out: Out,
     settings: FitSettings,
     validate: list[Path] | None = None,
     options: Path | None = None,
     selection: Path | None = None,
-    base: Base = None,
-    tip: Tip = None,
-    plots: Plots = True,
+    base: str | None = None,
+    tip: str | None = None,
+    plots: bool = True,
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and judge it.
 
@@ -78,18 +64,18 @@ def fit(
 
 @command(app)
 def select(
-    robot: Robot,
+    robot: str,
     out: Out,
     settings: SelectionSettings,
     m: Annotated[int, typer.Option("-m", "--poses", help="how many poses")] = 30,
     constraints: Path | None = None,
     run: Path | None = None,
     existing: Path | None = None,
-    workers: Workers = "1",
-    base: Base = None,
-    tip: Tip = None,
-    plots: Plots = True,
-    overwrite: Overwrite = False,
+    workers: str = "1",
+    base: str | None = None,
+    tip: str | None = None,
+    plots: bool = True,
+    overwrite: bool = False,
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best.
 
@@ -141,8 +127,8 @@ def export(
     ur_kinematics: Path | None = None,
     offsets: Path | None = None,
     into: Path | None = None,
-    for_corrections: Annotated[bool, typer.Option("--for-corrections")] = False,
-    overwrite: Overwrite = False,
+    for_corrections: bool = False,
+    overwrite: bool = False,
     prior: str = "entropic",
 ) -> None:
     """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included.
@@ -159,7 +145,7 @@ def export(
         for_corrections: the URDF that joint_corrections.csv belongs to, worse without it
         prior: with --into: what masses that the torques do not identify are regularised towards, entropic or euclidean
     """
-    from calib.errors import UsageError
+    from calib.errors import UsageError, require
     from calib.files import results
     from calib.procedure.export import delivery, geometry
     from calib.procedure.robot_kinds import stage_of
@@ -175,10 +161,8 @@ def export(
             lines = export_all(folder, into, urdf=urdf, prior=prior)
         say_written(lines, into, delivery.verdicts(folder).level)
         return
-    if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
-        raise UsageError(
-            "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
-        )
+    words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
+    require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), words, UsageError)
     found = geometry.read(folder)
     targets = geometry.targets(urdf, out, ur_kinematics, offsets)
     own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
@@ -214,8 +198,8 @@ def compensate(
     dof: int | None = None,
     start: str | None = None,
     tolerance: Annotated[str, typer.Option(metavar="MM,MRAD")] = "0.001,0.01",
-    partial: Annotated[bool, typer.Option("--partial")] = False,
-    overwrite: Overwrite = False,
+    partial: bool = False,
+    overwrite: bool = False,
     seed: Seed = 0,
 ) -> None:
     """Turn targets into joint commands that put the real tool there.

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Base, Out, Overwrite, Plots, Robot, Tip, Workers, progress, say_written
+from calib.cli.shared import Out, progress, say_written
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
 
 app = typer.Typer()
@@ -16,15 +16,15 @@ app = typer.Typer()
 
 @command(app)
 def excite(
-    robot: Robot,
+    robot: str,
     out: Out,
     settings: ExcitationSettings,
     model: Path | None = None,
     limits: Path | None = None,
-    workers: Workers = "1",
-    base: Base = None,
-    tip: Tip = None,
-    plots: Plots = True,
+    workers: str = "1",
+    base: str | None = None,
+    tip: str | None = None,
+    plots: bool = True,
 ) -> None:
     """Design a motion that excites ROBOT's dynamics, within limits.
 
@@ -49,7 +49,7 @@ def excite(
 
 
 @command(app)
-def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: Overwrite = False) -> None:
+def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = False) -> None:
     """Find a designed motion in a log, and average its periods. What comes out is a recording for calib identify.
 
     Args:
@@ -69,16 +69,16 @@ def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: Overwrite
 
 @command(app)
 def plan(
-    robot: Robot,
+    robot: str,
     waypoints: Annotated[Path, typer.Option()],
     out: Out,
     settings: PlanSettings,
     model: Path | None = None,
     limits: Path | None = None,
     drives: Path | None = None,
-    base: Base = None,
-    tip: Tip = None,
-    plots: Plots = True,
+    base: str | None = None,
+    tip: str | None = None,
+    plots: bool = True,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits.
 

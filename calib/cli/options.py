@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
 from functools import wraps
@@ -19,23 +19,37 @@ from calib.config_types import OneOf, Typed
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class Common:
+    """Parameters that mean the same in all commands.
+
+    Attributes:
+        robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
+        base: URDF: the link the arm starts at.
+        tip: URDF: the link the arm ends at.
+        workers: local processes, or the address of a Dask scheduler.
+        plots: draw figures, or leave them out.
+        overwrite: replace files, whatever they hold; without: those of an earlier run.
+    """
+
+
 def command(app: typer.Typer, name: str | None = None) -> Callable[[F], F]:
     """Return a decorator that adds a function to `app` as a command.
 
-    What ``Args:`` of its docstring says of a parameter is the option's help. A parameter that is annotated with a
-    settings dataclass becomes an option per field, described under ``Attributes:`` of that class; fields that the
-    function takes itself are left to it.
+    What ``Args:`` of its docstring, or `Common`, says of a parameter is the option's help; a flag that is off by
+    default has no name to switch it off. A parameter that is annotated with a settings dataclass becomes an option per
+    field, described under ``Attributes:`` of that class; fields that the function takes itself are left to it.
     """
 
     def add(function: F) -> F:
-        hints, about = get_type_hints(function, include_extras=True), described(function)
+        hints, about = get_type_hints(function, include_extras=True), described(Common) | described(function)
         own, made = signature(function).parameters, list[Parameter]()
         settings = {key: hint for key, hint in hints.items() if key in own and is_dataclass(hint)}
         for key, one in own.items():
             if key in settings:
                 made += [option for option in _options(settings[key]) if option.name not in own]
             else:
-                annotation = _with_help(hints[key], about.get(key, ""), one.default is Parameter.empty)
+                names = (f"--{key.replace('_', '-')}",) if one.default is False else ()
+                annotation = _with_help(hints[key], about.get(key, ""), names, one.default is Parameter.empty)
                 made.append(one.replace(annotation=annotation, kind=Parameter.KEYWORD_ONLY))
 
         @wraps(function)
@@ -51,11 +65,11 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[F], F]:
     return add
 
 
-def _with_help(hint: Any, words: str, positional: bool) -> Any:
+def _with_help(hint: Any, words: str, names: Sequence[str], positional: bool) -> Any:
     """Return an annotation whose option, or argument, has a help; its metadata may say what else typer is to know."""
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     option = next((copy(one) for one in metadata if isinstance(one, ParameterInfo)), None)
-    option = option or (typer.Argument() if positional else typer.Option())
+    option = option or (typer.Argument() if positional else typer.Option(*names))
     option.help = option.help or words
     return Annotated[kind, option]
 

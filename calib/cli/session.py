@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Base, Plots, Seed, Tip, Workers, exit_failed, make_console, reporting, say
+from calib.cli.shared import Seed, exit_failed, make_console, reporting, say
 from calib.errors import CalibError, UsageError, command_line, require
 from calib.procedure.session.answers import Answers
 
@@ -22,11 +22,11 @@ Folder = Annotated[Path, typer.Argument(help="the session's folder")]
 def new(
     folder: Folder,
     given: Answers,
-    dynamics_only: Annotated[bool, typer.Option("--dynamics-only")] = False,
+    dynamics_only: bool = False,
     poses: int = 40,
     validation: int = 20,
-    base: Base = "",
-    tip: Tip = "",
+    base: str | None = "",
+    tip: str | None = "",
     seed: Seed = 0,
 ) -> None:
     """Make a session FOLDER: calibrate a robot step by step. A certificate comes at the end.
@@ -79,9 +79,7 @@ def _asked(given: Answers) -> Answers:
 
 
 @command(app)
-def formats(
-    topic: Annotated[str | None, typer.Argument()] = None, schema: Annotated[bool, typer.Option("--schema")] = False
-) -> None:
+def formats(topic: Annotated[str | None, typer.Argument()] = None, schema: bool = False) -> None:
     """Print what files hold: columns, keys, units.
 
     Args:
@@ -110,13 +108,13 @@ def explain(code: Annotated[str | None, typer.Argument()] = None) -> None:
 
 
 @command(app, "next")
-def next_step(folder: Folder, plots: Plots = True) -> None:
+def next_step(folder: Folder, plots: bool = True) -> None:
     """Go on in a session, then say what to do at the robot."""
     _go_on(folder, "next", plots=plots)
 
 
 @command(app)
-def redo(folder: Folder, step: str, plots: Plots = True) -> None:
+def redo(folder: Folder, step: str, plots: bool = True) -> None:
     """Make a step of a session again, and all that rests on it.
 
     Args:
@@ -136,7 +134,7 @@ def status(folder: Folder) -> None:
 
 
 @command(app)
-def run(sessions: list[Path], workers: Workers = "1", plots: Plots = True) -> None:
+def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
     """Run many SESSIONS, one folder per robot, as far as they go. A table at the end says how they stand.
 
     A robot that fails does not stop the others; its folder's run.log says why. The exit code is the worst of all.

@@ -16,15 +16,7 @@ import typer
 
 PIPED = 160  # columns of tables that no terminal bounds
 
-Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")]
 Out = Annotated[Path, typer.Option()]
-Workers = Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")]
-Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
-Tip = Annotated[str | None, typer.Option(help="URDF: the link the arm ends at")]
-Plots = Annotated[bool, typer.Option("--plots/--no-plots", help="draw figures, or leave them out")]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="replace files, whatever they hold; without: those of an earlier run")
-]
 Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from calib import files
 from calib.config import parse, read_toml, strict
 from calib.config_types import OneOf, Real, Whole
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 
 KINDS = ("charuco", "chessboard", "apriltag")
 DICTIONARIES = (
@@ -59,10 +59,8 @@ class Board:
                 f"marker = {self.marker:g}: of an apriltag grid this is the gap between two tags; 0.05 to 2 times "
                 f"square = {self.square:g}"
             )
-        if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
-            raise ValueError(
-                f"{self.columns} x {self.rows} squares look the same upside down; an even and an odd number do not"
-            )
+        words = f"{self.columns} x {self.rows} squares look the same upside down; an even and an odd number do not"
+        require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, words, ValueError)
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs 4 squares each way at least")
         if self.dictionary in DICTIONARIES and self.tags > (count := _dictionary_size(self.dictionary)):

@@ -15,7 +15,7 @@ import numpy as np
 from calib import files
 from calib.config_types import shown
 from calib.data.camera.lens import Lens
-from calib.errors import CalibError, MeasurementError, suggestion
+from calib.errors import CalibError, MeasurementError, require, suggestion
 
 FILE = "camera.yaml"
 MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
@@ -42,10 +42,8 @@ def read_lens(path: str | Path) -> Lens:
         raise MeasurementError(f"camera_matrix: expected [fx 0 cx 0 fy cy 0 0 1], found {matrix.tolist()}", path)
     bend = _numbers(found, ("distortion_coefficients", "D", "d"), path)
     name = str(found.get("distortion_model") or "plumb_bob").lower()
-    if name not in MODELS:
-        raise MeasurementError(
-            f"distortion_model '{name}'{suggestion(name, MODELS)} is none of {', '.join(MODELS)}", path
-        )
+    words = f"distortion_model '{name}'{suggestion(name, MODELS)} is none of {', '.join(MODELS)}"
+    require(name in MODELS, words, MeasurementError, path)
     allowed = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}.get(name, (4,))
     if len(bend) not in allowed:
         raise MeasurementError(f"distortion_model {name} has {allowed[-1]} coefficients, found {len(bend)}", path)

@@ -33,7 +33,7 @@ from typing import Annotated, Any
 from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
 from calib.data.recordings.recording import Joints, named
-from calib.errors import MeasurementError, UsageError, suggestion
+from calib.errors import MeasurementError, UsageError, require, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
@@ -65,10 +65,8 @@ SCALES = {
 def _ours(names: Any) -> Any:
     """Refuse a name that is none of ours."""
     for name in names if isinstance(names, Mapping) else ():
-        if name not in SYNONYMS:
-            raise ValueError(
-                f"'{name}' is none of our names{suggestion(name, SYNONYMS)}; ours are {', '.join(SYNONYMS)}"
-            )
+        words = f"'{name}' is none of our names{suggestion(name, SYNONYMS)}; ours are {', '.join(SYNONYMS)}"
+        require(name in SYNONYMS, words, ValueError)
     return names
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import i0
 
 from calib.arrays import frozen
-from calib.errors import CalibError, MeasurementError
+from calib.errors import MeasurementError, require
 
 KINDS = ("chebyshev", "kaiser")
 SHARE = 0.8  # of the new Nyquist frequency that is kept
@@ -70,10 +70,8 @@ def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimato
     Raises:
         CalibError: for a factor below 1 or a kind that is none.
     """
-    if factor < 1 or kind not in KINDS:
-        raise CalibError(
-            f"decimation by {factor} with a '{kind}' filter: expected at least 1, and {' or '.join(KINDS)}"
-        )
+    words = f"decimation by {factor} with a '{kind}' filter: expected at least 1, and {' or '.join(KINDS)}"
+    require(factor >= 1 and kind in KINDS, words)
     band = SHARE * rate / (2 * factor)
     if factor == 1:
         return Decimator(1, frozen([1.0]), rate, band)

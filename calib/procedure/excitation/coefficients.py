@@ -28,7 +28,7 @@ import numpy as np
 
 from calib.config import parse, read_toml
 from calib.config_types import Expect, Filled, Name, OneOf, Positive, Real, Whole
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
 from trajectories.fourier import evaluate
@@ -116,8 +116,7 @@ def read(folder: Path) -> Periodic:
         UsageError: where there is none, or it is damaged.
     """
     path = folder / NAME
-    if not path.is_file():
-        raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote")
+    require(path.is_file(), f"{folder} holds no {NAME}: give the folder that calib excite wrote", UsageError)
     table = parse(TrajectoryFile, read_toml(path), str(path))
     coefficients = []
     for number, joint in enumerate(table.joint, 1):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.settings import AIMS, ExcitationSettings, split_goal
 from trajectories.design.objectives import (
@@ -80,8 +80,7 @@ def _objective(
     """Return the objective of a name, and the goal to minimise it to."""
     text, chain = f"{name}={value:g}", given.chain
     if name in SCALINGS:
-        if not value > 1:
-            raise UsageError(f"goal '{text}': a condition number is above 1")
+        require(value > 1, f"goal '{text}': a condition number is above 1", UsageError)
         return replace(condition, scaling=name), value
     if name == "duration":
         if shortest is None or not value > 0:
@@ -95,8 +94,7 @@ def _objective(
     numbered = {f"joint{j + 1}": (j,) for j in range(chain.n)} | {"wrist": wrist(chain.n)}
     if name not in numbered:
         raise UsageError(f"goal '{text}': '{name}' is none of raw, normalised, duration, coverage, wrist, joint1 …")
-    if not 0 < value < 1:
-        raise UsageError(f"goal '{text}': the mean torque is a share of its limit, above 0 and below 1")
+    require(0 < value < 1, f"goal '{text}': the mean torque is a share of its limit, above 0 and below 1", UsageError)
     return torque_slack(numbered[name], given, f"goal '{text}'"), 1.0 - value
 
 

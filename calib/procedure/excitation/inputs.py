@@ -14,7 +14,7 @@ from calib.dynamics.base import BaseModel, columns_at_rest, information
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.identification.identify_options import FileSettings
 from calib.identification.model_file import from_table, read_covariance, read_table, refuse_currents
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -159,8 +159,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     table = read_table(folder)
     try:
         found = from_table(chain, table)
-        if not found.model.torque_rows.has_bodies:
-            raise ValueError("rows 'drive' tell nothing of the bodies")
+        require(found.model.torque_rows.has_bodies, "rows 'drive' tell nothing of the bodies", ValueError)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         theirs = description.read(folder / ROBOT)
         if theirs.n != chain.n:
@@ -230,8 +229,7 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
                 f"lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
             )
         found[j] = value
-    if len(found) == chain.n:
-        raise UsageError("lock: every joint is locked; nothing is left to move")
+    require(len(found) != chain.n, "lock: every joint is locked; nothing is left to move", UsageError)
     return found
 
 

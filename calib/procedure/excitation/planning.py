@@ -16,13 +16,13 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
-from calib.errors import RobotError, UsageError
+from calib.errors import RobotError, UsageError, require
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.torque_uncertainty import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.motion_bounds import MotionBounds
-from calib.procedure.excitation.playback import approach_to, check_slower
+from calib.procedure.excitation.playback import approach_to
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.kinematic_stage.inputs import load_rigid
@@ -201,13 +201,8 @@ def _check_places(path: JointPath, known: MotionLimits) -> None:
 
 
 def _check(settings: PlanSettings) -> None:
-    if not (np.isfinite(settings.rate) and settings.rate > 0):
-        raise UsageError(f"rate {settings.rate:g}: expected a number of samples per second above zero")
-    if settings.shorten < 0:
-        raise UsageError(f"shorten {settings.shorten}: expected a number of timings, 0 for none")
-    if settings.shorten and settings.lines:
-        raise UsageError("shorten changes the path between waypoints; straight lines (--line) leave nothing to change")
-    check_slower(settings.slower)
+    words = "shorten changes the path between waypoints; straight lines (--line) leave nothing to change"
+    require(not (settings.shorten and settings.lines), words, UsageError)
 
 
 def _law(
@@ -215,8 +210,7 @@ def _law(
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
     """Return the dynamics: identified, or the robot's inertias with stated drives; None without any."""
     if folder is not None:
-        if drives_file is not None:
-            raise UsageError("model and drives both say what the drives are; take one of them away")
+        require(drives_file is None, "model and drives both say what the drives are; take one of them away", UsageError)
         law, unsure = _identified(chain, folder, payloads)
         return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
     try:
@@ -241,8 +235,7 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     """Return an identified model with the payloads that are on board, and its uncertainty."""
     refuse_currents(folder, "a motion plan")
     arm, dynamics = read_dynamics(folder)
-    if arm.n != chain.n:
-        raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
+    require(arm.n == chain.n, f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}", UsageError)
     model = dynamics.model
     known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.dynamics.base import BaseModel
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
 from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
@@ -50,17 +50,8 @@ class Playback:
 
 def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> None:
     """Refuse, before the search, what could not be played."""
-    if settings.repeat < 1:
-        raise UsageError(f"repeat {settings.repeat}: expected 1 period or more")
-    check_slower(settings.slower)
     if settings.start is not None:
         _check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
-
-
-def check_slower(factor: float) -> None:
-    """Refuse a rehearsal that is faster than the motion."""
-    if not (np.isfinite(factor) and factor >= 1):
-        raise UsageError(f"slower {factor:g}: a rehearsal runs a factor of 1 or more slower")
 
 
 def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
@@ -138,8 +129,7 @@ def approach_to(
 def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
     """Refuse a pose (n,) that the robot cannot be in."""
     limits = known.positions
-    if start.shape != (chain.n,):
-        raise UsageError(f"start: expected {chain.n} joint values, found {start.size}")
+    require(start.shape == (chain.n,), f"start: expected {chain.n} joint values, found {start.size}", UsageError)
     for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):
         if not lower <= value <= upper:
             raise UsageError(f"start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")

@@ -22,7 +22,7 @@ import numpy as np
 
 from calib import files
 from calib.data.signals.bandwidth import LOWEST, SHARE
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
@@ -210,8 +210,7 @@ def lines(one: MotionOutlook) -> list[str]:
 
 def check_folder(folder: Path) -> None:
     """Refuse, before any work is done, a folder without a prediction."""
-    if not (folder / NAME).is_file():
-        raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote")
+    require((folder / NAME).is_file(), f"{folder} holds no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from calib import files
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.resampling import resample
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, require
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
@@ -65,8 +65,7 @@ def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
     Raises:
         UsageError, MeasurementError: for a folder or a log that is none, and where the motion is not in the log.
     """
-    if skip < 0:
-        raise UsageError(f"--skip {skip}: expected a number of periods, 0 or more")
+    require(skip >= 0, f"--skip {skip}: expected a number of periods, 0 or more", UsageError)
     motion = coefficients.read(folder)
     recording = read_recording(log, Joints(motion.joint_names))
     rate, series = _longest(recording, motion.period)

@@ -13,7 +13,7 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import IN_HAND, JOINTS, Pixels, is_image_folder
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
-from calib.errors import CalibError, MeasurementError, UsageError
+from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import needed
 from calib.geometry.checks.copied_rows import repeated
 from calib.geometry.checks.orientations import check_orientations
@@ -99,8 +99,7 @@ def gather(
         base, tip: links of a URDF.
     """
     options, settings = options or FitOptions(), settings or FitSettings()
-    if not measured:
-        raise UsageError("no measurement file given")
+    require(measured, "no measurement file given", UsageError)
     files = [_path(each) for each in measured]
     check_files(options, [*files, *map(_path, validate)])
     chain, source = load_robot(robot, files[0], options, base, tip)

@@ -13,7 +13,7 @@ import numpy as np
 from calib import files
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
@@ -127,8 +127,7 @@ def choose(
         map: where parallel work runs (`calib.workers`).
         progress: called with (done, total, what).
     """
-    if m < 1:
-        raise UsageError(f"-m {m}: at least one pose has to be chosen")
+    require(m >= 1, f"-m {m}: at least one pose has to be chosen", UsageError)
     chain, source = load_robot(robot, existing, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
     limits = read_limits(constraints, cell, source, settings.without)

@@ -19,7 +19,7 @@ from calib.data.camera.board import Board, corners, read_board
 from calib.data.camera.camera_info import read_lens
 from calib.data.camera.lens import Lens
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.geometry.identifiability import base_columns
 from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.images.optics import BoardShape, Optics
@@ -239,8 +239,7 @@ def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> 
         UsageError, MeasurementError, RobotError: for a file that is missing, or a place that cannot be.
     """
     for name in (stated.lens, stated.board):
-        if not (folder / name).is_file():
-            raise UsageError(f"{where}: camera: no file '{name}' beside it")
+        require((folder / name).is_file(), f"{where}: camera: no file '{name}' beside it", UsageError)
     if not stated.range[0] < stated.range[1]:
         raise UsageError(f"{where}: camera.range: {stated.range[0]:g} is not below {stated.range[1]:g}")
     lens, board = read_lens(folder / stated.lens), read_board(folder / stated.board)

@@ -19,7 +19,7 @@ from calib.config_types import Real
 from calib.data.camera.board import FILE, read_board
 from calib.data.camera.camera_info import read_lens
 from calib.data.poses.pixels import IN_HAND, TO_HAND
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.transforms import pose, to_xyz_rpy
 
@@ -65,8 +65,7 @@ def _plain(text: str) -> str:
 
 def _lengths(text: str, count: int, most: float, expected: str = "x,y,z in metres") -> list[float]:
     values = [Real(least=-most, most=most, unit="m", quantity="length").read(part) for part in text.split(",")]
-    if len(values) != count:
-        raise ValueError(f"expected {expected}")
+    require(len(values) == count, f"expected {expected}", ValueError)
     return values
 
 
@@ -95,8 +94,7 @@ def _obstacles(text: str) -> list[dict[str, Any]]:
         words = each.replace(" at ", " ").split()
         if _plain(each) in (*UNKNOWN, NONE):
             continue
-        if len(words) != 4:
-            raise ValueError(f"expected {form}")
+        require(len(words) == 4, f"expected {form}", ValueError)
         sizes = [Real(above=0, most=MAX_WIDE, unit="m", quantity="length").read(part) for part in words[2].split(",")]
         result.append({"name": words[0], "kind": words[1], "size": sizes, "xyz": _lengths(words[3], 3, MAX_WIDE)})
     return result
@@ -104,8 +102,7 @@ def _obstacles(text: str) -> list[dict[str, Any]]:
 
 def _mounting(text: str) -> str:
     held = text.lower().replace("-", " ").replace("_", " ")
-    if held not in (IN_HAND, TO_HAND):
-        raise ValueError(f"expected {IN_HAND} (the arm carries the camera), {TO_HAND}")
+    require(held in (IN_HAND, TO_HAND), f"expected {IN_HAND} (the arm carries the camera), {TO_HAND}", ValueError)
     return held
 
 
@@ -113,16 +110,14 @@ def _file(read: Any, text: str) -> str:
     """Return the path of a lens or a board that can be read."""
     path = Path(text).expanduser()
     path = path / FILE if read is read_board and path.is_dir() else path
-    if not path.is_file():
-        raise ValueError("no such file; give one")
+    require(path.is_file(), "no such file; give one", ValueError)
     read(path)
     return str(path)
 
 
 def _turned(name: str, most: float, text: str, known: dict[str, str]) -> dict[str, list[float]]:
     """Return a place whose z axis is the direction of view: along a camera's, against a board's facing."""
-    if "mounting" not in known:
-        raise ValueError("of the camera or of the board? Say --mounting, too")
+    require("mounting" in known, "of the camera or of the board? Say --mounting, too", ValueError)
     looks = (_mounting(known["mounting"]) == IN_HAND) == (name == "carried")
     spot, _, way = text.partition("facing")
     if not way.strip() and name == "stands":

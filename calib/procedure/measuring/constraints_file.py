@@ -56,6 +56,7 @@ import numpy as np
 
 from calib.config import parse, read_toml, strict
 from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, shown
+from calib.errors import require
 from calib.procedure.measuring.camera_view import UNKNOWN, CameraTable
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
@@ -201,7 +202,5 @@ def beside(path: Path) -> dict[str, Path]:
 
 
 def rising(span: tuple[float, ...], where: str) -> None:
-    if len(span) != 2:
-        raise ValueError(f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}")
-    if not span[0] < span[1]:
-        raise ValueError(f"{where}: {span[0]:g} is not below {span[1]:g}")
+    require(len(span) == 2, f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}", ValueError)
+    require(span[0] < span[1], f"{where}: {span[0]:g} is not below {span[1]:g}", ValueError)

@@ -18,7 +18,7 @@ import numpy as np
 from calib.config import check_keys, parse, read_toml
 from calib.config_types import number
 from calib.data.poses.pixels import IN_HAND
-from calib.errors import RobotError, UsageError
+from calib.errors import RobotError, UsageError, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.procedure.measuring.camera_view import BLIND, CameraTable, CameraView, ImageObservation, camera_view
@@ -238,8 +238,7 @@ def _joints(
                 f"{place}: {low:g} to {high:g} limits nothing: the joint's own range is {own[0]:g} to {own[1]:g}"
             )
         lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
-        if not lower[j] < upper[j]:
-            raise UsageError(f"{place}: nothing is left between {lower[j]:g} and {upper[j]:g}")
+        require(lower[j] < upper[j], f"{place}: nothing is left between {lower[j]:g} and {upper[j]:g}", UsageError)
     return lower, upper, tuple(notes)
 
 
@@ -351,8 +350,7 @@ def _never_act(
         for name, distance in beyond.items()
     ]
     for said, distance in zip(words, beyond.values()):
-        if distance > ABSURD * reach:
-            raise UsageError(f"{where}: {said} Lengths are in m")
+        require(distance <= ABSURD * reach, f"{where}: {said} Lengths are in m", UsageError)
     return set(beyond), tuple(words)
 
 

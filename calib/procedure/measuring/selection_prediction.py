@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.errors import Finding, UsageError, finding
+from calib.errors import Finding, UsageError, finding, require
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.records import read_json
@@ -67,13 +67,10 @@ def read(selection: Path) -> SelectionPrediction:
         path = beside(selection)
     else:
         found = sorted(selection.glob(f"*{SUFFIX}"))
-        if len(found) > 1:
-            raise UsageError(f"{selection} holds {len(found)} predictions: name one CSV of poses")
+        require(len(found) <= 1, f"{selection} holds {len(found)} predictions: name one CSV of poses", UsageError)
         path = found[0] if found else selection / f"*{SUFFIX}"
-    if not path.is_file():
-        raise UsageError(
-            f"there is no {path}: give the CSV that calib select wrote, its prediction beside it, or their folder"
-        )
+    words = f"there is no {path}: give the CSV that calib select wrote, its prediction beside it, or their folder"
+    require(path.is_file(), words, UsageError)
     return read_json(path, "choose the poses again", SelectionPrediction)
 
 

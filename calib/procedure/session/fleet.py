@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib import bug_reports, files
-from calib.errors import CalibError, TaskLost, UsageError, complaint
+from calib.errors import CalibError, TaskLost, UsageError, complaint, require
 from calib.procedure.findings import LEVELS
 from calib.procedure.report import console
 from calib.procedure.session import instructions, steps
@@ -75,8 +75,7 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     twice = [path for path, own in zip(found, real) if real.count(own) > 1]
     if twice:
         raise UsageError(f"{twice[0]} is named twice")
-    if not found:
-        raise UsageError("no session named; give folders or their session.toml")
+    require(found, "no session named; give folders or their session.toml", UsageError)
     return found
 
 

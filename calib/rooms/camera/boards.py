@@ -12,7 +12,7 @@ from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import KINDS, Board
 from calib.data.poses.pixels import JOINTS
-from calib.errors import CalibError, MeasurementError, UsageError
+from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.procedure.measuring.image_findings import coverage_words
 from calib.rooms.camera.corner_file import Found
 from calib.rooms.camera.image_folders import find_corners, joint_table, problem_words, read_own_board
@@ -41,8 +41,7 @@ def make(
     from calib.rooms.camera import board_print
     from calib.rooms.camera.detection import FEWEST
 
-    if kind not in KINDS:
-        raise UsageError(f"--kind {kind}: expected one of {', '.join(KINDS)}")
+    require(kind in KINDS, f"--kind {kind}: expected one of {', '.join(KINDS)}", UsageError)
     if paper is not None and paper.lower() not in board_print.PAPERS:
         raise UsageError(f"--paper {paper}: expected one of {', '.join(board_print.PAPERS)}")
     if square < SMALLEST:
@@ -102,8 +101,7 @@ def _images(folder: Path) -> list[str]:
     from calib.rooms.camera.images import SUFFIXES
 
     names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-    if not names:
-        raise UsageError(f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})")
+    require(names, f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})", UsageError)
     return names
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Out, Overwrite, progress, say
+from calib.cli.shared import Out, progress, say
 
 app = typer.Typer()
 Millimetres = typer.Option(metavar="MM")
@@ -24,7 +24,7 @@ def board(
     marker: Annotated[float | None, Millimetres] = None,
     dictionary: str | None = None,
     paper: str | None = None,
-    overwrite: Overwrite = False,
+    overwrite: bool = False,
 ) -> None:
     """Make a board to print at true scale; a ruler checks the print.
 

@@ -34,7 +34,7 @@ from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pixels import CORNERS, JOINTS, Pixels
 from calib.data.poses.plausible import Limits
-from calib.errors import CalibError, MeasurementError
+from calib.errors import CalibError, MeasurementError, require
 from calib.rooms.camera import corner_file
 from calib.rooms.camera.corner_file import Found
 from calib.words import counted, listing
@@ -93,20 +93,16 @@ def read_own_board(path: Path) -> Board:
     Raises:
         MeasurementError: where there is none.
     """
-    if not (path / boards.FILE).is_file():
-        raise MeasurementError(
-            f"has no {boards.FILE}, which says what board is seen: copy the one that calib board wrote into it", path
-        )
+    words = f"has no {boards.FILE}, which says what board is seen: copy the one that calib board wrote into it"
+    require((path / boards.FILE).is_file(), words, MeasurementError, path)
     return boards.read_board(path)
 
 
 def joint_table(path: Path) -> Table:
     """Read the folder's ``joints.csv``."""
     place = path / JOINTS
-    if not place.is_file():
-        raise MeasurementError(
-            f"has no {JOINTS}: a table of image, q1 [deg] ... is needed, one row per image with its joint values", path
-        )
+    words = f"has no {JOINTS}: a table of image, q1 [deg] ... is needed, one row per image with its joint values"
+    require(place.is_file(), words, MeasurementError, path)
     table = read_table(place)
     names = table.texts("image")
     if twice := [name for name, count in Counter(names).items() if count > 1]:

@@ -45,8 +45,7 @@ def decode(content: bytes) -> np.ndarray:
     Raises:
         ValueError: where it is none.
     """
-    if not content:
-        raise ValueError("the file is empty")
+    require(content, "the file is empty", ValueError)
     if content.startswith(PNG) and b"IEND" not in content[-64:]:  # libpng would complain on its own
         raise ValueError("no image format that is known, or cut short")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

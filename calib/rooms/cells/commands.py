@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Plots, Seed, exit_failed, reporting
+from calib.cli.shared import Seed, exit_failed, reporting
 from calib.errors import command_line
 
 app = typer.Typer()
@@ -18,12 +17,12 @@ app = typer.Typer()
 def demo(
     out: Path = Path("calib-demo"),
     robot: str = "lwr4plus",
-    geometry_only: Annotated[bool, typer.Option("--geometry-only")] = False,
+    geometry_only: bool = False,
     instrument: str = "cmm",
-    guided: Annotated[bool, typer.Option("--guided")] = False,
+    guided: bool = False,
     bring: Path | None = None,
     seed: Seed = 0,
-    plots: Plots = True,
+    plots: bool = True,
 ) -> None:
     """Calibrate a simulated robot; compare with the hidden truth.
 

@@ -15,7 +15,7 @@ import numpy as np
 from calib import files
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import read_poses
-from calib.errors import SessionError, UsageError, command_line
+from calib.errors import SessionError, UsageError, command_line, require
 from calib.estimate_files import read_estimate
 from calib.folders import CERTIFICATE
 from calib.geometry import installation_file
@@ -106,8 +106,7 @@ def run(
             _bring_for(session, waiting.step.name, say, progress)
             waiting = steps.run_next(session, say, progress, "calib demo")
     if waiting is not None:
-        if not guided:
-            raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
+        require(guided, f"the demonstration stopped at {waiting.step.name}: {waiting.words}", SessionError)
         return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
     before, after = _compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, Workers, exit_failed, reporting, say
-from calib.errors import UsageError
+from calib.cli.shared import Seed, exit_failed, reporting, say
+from calib.errors import UsageError, require
 
 app = typer.Typer()
 SHOWN = 3  # conditions whose tables are printed in full
@@ -22,11 +22,11 @@ def study(
     out: Path | None = None,
     methods: str | None = None,
     runs: Annotated[int | None, typer.Option(min=0)] = None,
-    workers: Workers = "1",
-    report_only: Annotated[bool, typer.Option("--report-only")] = False,
-    list_methods: Annotated[bool, typer.Option("--list-methods")] = False,
+    workers: str = "1",
+    report_only: bool = False,
+    list_methods: bool = False,
     list_studies: Annotated[bool, typer.Option("--list")] = False,
-    plots: Plots = True,
+    plots: bool = True,
 ) -> None:
     """Compare identification methods where the truth is known. Runs STUDY, or what of it is missing (Monte Carlo).
 
@@ -70,16 +70,16 @@ def study(
 
 @command(app)
 def compare(
-    robot: Robot,
+    robot: str,
     recordings: list[str],
     validate: list[str] | None = None,
     methods: str | None = None,
     friction: str = "standard",
     options: Path | None = None,
     out: Path | None = None,
-    overwrite: Overwrite = False,
-    base: Base = None,
-    tip: Tip = None,
+    overwrite: bool = False,
+    base: str | None = None,
+    tip: str | None = None,
     seed: Seed = 0,
 ) -> None:
     """Rank identification methods on recordings of your robot. What counts is how well they predict other motion.
@@ -130,6 +130,5 @@ def _names(text: str | None) -> list[str] | None:
     found = [name.strip() for name in text.split(",") if name.strip()]
     for name in found:
         method_named(name)
-    if not found:
-        raise UsageError("--methods names none; calib study --list-methods")
+    require(found, "--methods names none; calib study --list-methods", UsageError)
     return found

@@ -218,10 +218,8 @@ def _paths(files: Sequence[str | Path]) -> list[Path]:
     for one in map(str, files):
         found = [path for name, path in own.items() if fnmatchcase(name.lower(), one.lower())]
         if not Path(one).exists() and not one.endswith(".toml"):
-            if not found:
-                raise UsageError(
-                    f"no study '{one}'{suggestion(one, own)}: neither a file nor one of calib study --list"
-                )
+            words = f"no study '{one}'{suggestion(one, own)}: neither a file nor one of calib study --list"
+            require(found, words, UsageError)
             result += found
         else:
             result.append(Path(one))
@@ -238,10 +236,8 @@ def _parse(path: Path) -> StudyFile:
     found = parse(StudyFile, read_toml(path), str(path))
     for key, names in (("methods", found.methods), ("runs_of", found.runs_of)):
         for name in names:
-            if name not in METHODS and (key, name) != ("methods", "all"):
-                raise UsageError(
-                    f"{path}: {key}: there is no method '{name}'{suggestion(name, METHODS)}; calib study --list-methods"
-                )
+            words = f"{path}: {key}: there is no method '{name}'{suggestion(name, METHODS)}; calib study --list-methods"
+            require(name in METHODS or (key, name) == ("methods", "all"), words, UsageError)
     return found
 
 

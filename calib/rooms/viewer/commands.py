@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Overwrite, say
+from calib.cli.shared import say
 from calib.errors import UsageError, command_line
 
 app = typer.Typer()
@@ -20,7 +20,7 @@ def view(
     save: Path | None = None,
     spawn: Annotated[bool | None, typer.Option("--spawn/--no-spawn")] = None,
     robot: str | None = None,
-    overwrite: Overwrite = False,
+    overwrite: bool = False,
 ) -> None:
     """Show robot, errors, poses, motions or torques in Rerun.
 

@@ -16,7 +16,7 @@ from calib.config import read_toml
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.plans import read_poses
 from calib.dynamics.torque_rows import MOTOR, ROWS
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, require
 from calib.geometry import installation_file
 from calib.geometry.installation import Installation, see
 from calib.identification import model_file
@@ -151,10 +151,8 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
     )
-    if not (scene.measured or scene.chosen or scene.played or scene.torques):
-        raise UsageError(
-            f"{folder} holds nothing to see: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
-        )
+    words = f"{folder} holds nothing to see: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
+    require(scene.measured or scene.chosen or scene.played or scene.torques, words, UsageError)
     if chain is None:
         words = "no robot is drawn: the folder does not say which; give --robot"
         return replace(scene, notes=(*scene.notes, words))

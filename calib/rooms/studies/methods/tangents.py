@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arrays import frozen, shaped
-from calib.errors import CalibError, Diverged
+from calib.errors import Diverged, require
 from calib.simulation.loop.closed_loop import LOWER, Packed, Plant, body_rows, failure, layout_of, packed, sample_ticks
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
@@ -55,10 +55,8 @@ def simulate_tangents(
     from calib.simulation.loop import loop_kernels
 
     for one in plant.terms:
-        if not one.form.slopes:
-            raise CalibError(
-                f"term '{one.name}' ({one.shape}): no tangents of friction that hangs on loads or the past"
-            )
+        words = f"term '{one.name}' ({one.shape}): no tangents of friction that hangs on loads or the past"
+        require(one.form.slopes, words)
     n, count, c = plant.bodies.n, len(reference.t), len(columns)
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = np.arange(c)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, require
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, identify
 from calib.identification.methods.method import Method
@@ -107,8 +107,7 @@ def compare_methods(
         UsageError: where no recording is unseen, or one shares time with those learnt from; where a name is none of
             a method.
     """
-    if not inputs.unseen:
-        raise UsageError("methods are ranked by motion that none has seen: give some with --validate")
+    require(inputs.unseen, "methods are ranked by motion that none has seen: give some with --validate", UsageError)
     if shared := overlaps(inputs.cases, inputs.unseen):
         raise UsageError(f"{shared[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
     repeated = repeated_motion(inputs.cases, inputs.unseen)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib import files
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.rooms.studies import summary
 from calib.rooms.studies.conditions import Study, read_study, shipped
 from calib.rooms.studies.reports import report
@@ -132,8 +132,7 @@ def run_study(
 
 def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
     """Refuse, before any work is done, a folder that holds other files of these names, or a file."""
-    if out.is_file():
-        raise UsageError(f"{out} is a file; a study's rows go into a folder (--out)")
+    require(not out.is_file(), f"{out} is a file; a study's rows go into a folder (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], named)
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
     if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
