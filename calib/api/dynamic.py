@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib.api.given import listed, optional
-from calib.api.rendering import as_text, data_frame
+from calib.api.rendering import Judged, data_frame
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -28,11 +28,13 @@ from calib.workers.threads import one_blas_thread
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from calib.procedure.report.page import Section
+
 Recorded = str | Path | Recording
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DynamicsModel:
+class DynamicsModel(Judged):
     """Identified dynamics and how far to trust them. ``print`` shows errors on other motion, friction and verdict.
 
     Attributes:
@@ -102,19 +104,16 @@ class DynamicsModel:
         rows = zip(found.names, found.units, found.values.tolist(), sigma.tolist())
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
-    def renderables(self) -> Iterator[Any]:
-        """Yield what ``print`` shows, for a rich console."""
-        from calib.procedure.report import console, dynamics_section
+    def section(self) -> Section:
+        """Return errors on other motion, friction and verdict as a section of a report."""
+        from calib.procedure.report import dynamics_section
 
-        yield from console.section(dynamics_section.outcome_section(self.outcome))
+        return dynamics_section.outcome_section(self.outcome)
 
     def __repr__(self) -> str:
         return (
             f"<DynamicsModel of {self.robot.chain.name}: {len(self.estimate.names)} parameters, {self.verdict.level}>"
         )
-
-    def __str__(self) -> str:
-        return as_text(self.renderables())
 
 
 def methods() -> tuple[MethodEntry, ...]:

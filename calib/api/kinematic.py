@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import files
 from calib.api.given import listed, optional, saved
-from calib.api.rendering import as_text, data_frame
+from calib.api.rendering import Judged, data_frame
 from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
@@ -32,6 +32,8 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from calib.procedure.report.page import Page, Section
 
 Progress = Callable[[str], None]
 Measured = str | Path | PoseMeasurements
@@ -111,7 +113,7 @@ class PoseSelection:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GeometryFit:
+class GeometryFit(Judged):
     """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict.
 
     Attributes:
@@ -187,17 +189,21 @@ class GeometryFit:
             estimate_table(self.outcome.selection.fit, self.outcome.selection.nominal.cell).rows(), list(HEADER)
         )
 
-    def renderables(self) -> Iterator[Any]:
-        """Yield what ``print`` shows, for a rich console."""
-        from calib.procedure.report import console, geometry_section
+    def section(self) -> Section:
+        """Return errors on unseen poses, ladder and verdict as a section of a report."""
+        from calib.procedure.report import geometry_section
 
-        yield from console.section(geometry_section.outcome_section(folder.metrics(self.outcome)))
+        return geometry_section.outcome_section(folder.metrics(self.outcome))
+
+    def page(self) -> Page:
+        """Return the certificate of this fit, without figures."""
+        from calib.procedure.report import certificate
+        from calib.procedure.report.fit_report import collect
+
+        return certificate.of_fit(collect(self.outcome), {}, self.outcome.inputs)
 
     def __repr__(self) -> str:
         return f"<GeometryFit of {self.robot.chain.name}: model {self.outcome.selection.chosen}, {self.verdict.level}>"
-
-    def __str__(self) -> str:
-        return as_text(self.renderables())
 
 
 @dataclass(frozen=True, eq=False, repr=False)

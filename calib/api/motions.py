@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 from calib.api.dynamic import DynamicsModel
 from calib.api.given import optional, saved
 from calib.arguments import checked
@@ -17,11 +19,19 @@ from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, Ex
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
+from trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Progress = Callable[[str], None]
+
+
+Sampled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _columns(track: Setpoints) -> Sampled:
+    return track.times, track.q, track.v, track.a
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,6 +43,14 @@ class ExcitationDesign:
     """
 
     designed: design.Designed
+
+    def sampled(self, rate: float | None = None) -> Sampled:
+        """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], ends included.
+
+        Without `rate` the samples are those of the controller's rate that `save` writes; at any rate they are of the
+        series itself, nothing is interpolated.
+        """
+        return _columns(folder.one_period(self.designed, rate))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
@@ -73,6 +91,10 @@ class MotionPlan:
     def duration(self) -> float:
         """How long the motion takes [s]."""
         return self.planned.track.duration
+
+    def sampled(self) -> Sampled:
+        """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] at the controller's rate (`PlanSettings`)."""
+        return _columns(self.planned.track)
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

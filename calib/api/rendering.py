@@ -1,10 +1,14 @@
-"""Results as text: what the commands print, for ``print(result)``."""
+"""Results as text and HTML: what the commands print, for ``print(result)``; a certificate's page for a notebook."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calib.procedure.report.page import Page, Section
 
 WIDTH = 120
 
@@ -17,6 +21,34 @@ def as_text(renderables: Iterable[Any]) -> str:
     for each in renderables:
         console.print(each, soft_wrap=True)
     return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
+
+
+class Judged(ABC):
+    """A result that one section of a report shows: on a console, by ``print``, and as a page in a notebook."""
+
+    @abstractmethod
+    def section(self) -> Section:
+        """Return the section: verdict, figures, tables, sentences."""
+
+    def renderables(self) -> Iterator[Any]:
+        """Yield what ``print`` shows, for a rich console."""
+        from calib.procedure.report import console
+
+        yield from console.section(self.section())
+
+    def __str__(self) -> str:
+        return as_text(self.renderables())
+
+    def page(self) -> Page:
+        """Return the section as a page of its own."""
+        from calib.procedure.report import certificate
+
+        return certificate.certificate(repr(self).strip("<>"), "", (), [self.section()])
+
+    def _repr_html_(self) -> str:
+        from calib.procedure.report import certificate
+
+        return certificate.render(self.page())
 
 
 def data_frame(rows: Iterable[Any], columns: list[str]) -> Any:

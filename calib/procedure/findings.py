@@ -35,7 +35,10 @@ LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
 
 @dataclass(frozen=True)
 class Verdict:
-    """One of `LEVELS`, why, in one sentence, the code of the finding that decided, and what to do."""
+    """One of `LEVELS`, why, in one sentence, the code of the finding that decided, and what to do.
+
+    It equals the name of its level: ``fit.verdict == "pass"``.
+    """
 
     level: str
     reason: str
@@ -44,6 +47,14 @@ class Verdict:
 
     def __str__(self) -> str:
         return f"verdict {self.level}: {self.reason}"
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, str):
+            return self.level == other
+        return isinstance(other, Verdict) and (self.level, self.reason) == (other.level, other.reason)
+
+    def __hash__(self) -> int:
+        return hash(self.level)
 
     @classmethod
     def of(cls, figures: str, findings: Iterable[Finding] = ()) -> Verdict:

@@ -6,6 +6,7 @@ import inspect
 import json
 import tomllib
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -209,6 +210,24 @@ def test_results_print_ladder_errors_and_verdict(fitted, model):
     assert fitted.verdict.reason.split(";")[0] in " ".join(shown.split()) and "nominal" in shown
     assert model.verdict.level in str(model) and "other.npz" in str(model)
     assert set(fitted.plot()) >= {"position", "parameters"} and set(model.plot()) >= {"torque_1", "friction"}
+
+
+def test_a_notebook_shows_the_page_and_a_verdict_equals_its_name(fitted, model):
+    for result in (fitted, model):
+        assert result.verdict == result.verdict.level and result.verdict != "other"
+        assert result.verdict.reason[1:40] in unescape(result._repr_html_())
+
+
+def test_a_designed_motion_is_sampled_at_any_rate_without_interpolation(tmp_path):
+    settings = calib.ExcitationSettings(period=4.0, starts=1, evaluations=20, outlook=False, rate=100.0)
+    design = calib.design_excitation("tx40", settings)
+    t, q, v, a = design.sampled()
+    written = (design.save(tmp_path / "m", plots=False) / "trajectory.csv").read_text().splitlines()
+    rows = np.genfromtxt([line for line in written if line[0] != "#"], delimiter=",", names=True)
+    assert np.allclose(rows["q3"], q[:, 2], atol=1e-9) and np.allclose(rows["a6"], a[:, 5], atol=1e-8)
+    fine = design.sampled(1000.0)
+    assert all(np.allclose(one[::10], other, atol=1e-9) for one, other in zip(fine, (t, q, v, a)))
+    assert np.allclose(np.gradient(fine[1], fine[0], axis=0)[1:-1], fine[2][1:-1], atol=1e-3)
 
 
 def test_the_geometrys_covariance_reaches_the_dynamics_in_memory(logs):

@@ -57,7 +57,7 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     """
 
     def write(folder: Path) -> None:
-        period, played = _one_period(designed), designed.playback
+        period, played = one_period(designed), designed.playback
         chain, bounds = designed.inputs.chain, designed.inputs.limits.bounds
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
         series = coefficients.table(_periodic(designed), chain.name, bounds.lines())
@@ -119,9 +119,9 @@ def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every:
     files.write(folder / "trajectory.yaml", files.remarks(bounds.lines()) + to_yaml(message))
 
 
-def _one_period(designed: Designed) -> Setpoints:
-    """Return one period at the controller's rate, both ends included; without torques."""
-    count = round(designed.period * designed.settings.rate)
+def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
+    """Return one period at `rate` [Hz], by default the controller's, both ends included; without torques."""
+    count = max(round(designed.period * (rate or designed.settings.rate)), 1)
     times = np.arange(count + 1) * (designed.period / count)
     motion = dense_motion(designed.family, designed.found.x, times, designed.found.factor)
     return Setpoints(count / designed.period, motion.q, motion.v, motion.a)
