@@ -15,7 +15,6 @@ import numpy as np
 
 from poses.information import log_det
 
-RIDGE = 1e-6
 """Information added to every design against the unit mean information of one candidate, so that sets still short of
 full rank can be compared: our choice; values reported to the user never contain it."""
 
@@ -51,7 +50,8 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
     """Build the design of some members afresh (this also sheds the rounding errors of many updates)."""
     p = pool.z.shape[2]
     rows = pool.z[list(members)].reshape(-1, p)
-    matrix = pool.known + RIDGE * np.eye(p) + rows.T @ rows
+    ridge = 1e-6
+    matrix = pool.known + ridge * np.eye(p) + rows.T @ rows
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = (pool.z.reshape(-1, p) @ root.T).reshape(len(pool.z), -1)
     taken = np.zeros(len(pool.z), dtype=bool)

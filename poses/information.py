@@ -10,7 +10,6 @@ from scipy.linalg import solve_triangular
 
 from poses.errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
-RANK_TOLERANCE = 1e-7
 """Smallest accepted ratio of singular values of the column-scaled candidates: our choice (Gram matrices see 1e-8)."""
 
 
@@ -112,9 +111,9 @@ def _check_columns(scale: np.ndarray) -> None:
         )
 
 
-def _check_rank(mean: np.ndarray) -> None:
+def _check_rank(mean: np.ndarray, rank_tolerance: float = 1e-7) -> None:
     s = np.sqrt(np.maximum(np.linalg.eigvalsh(mean)[::-1], 0.0))
-    rank = int((s > RANK_TOLERANCE * s[0]).sum())
+    rank = int((s > rank_tolerance * s[0]).sum())
     if rank < len(s):
         raise NotIdentifiable(
             f"all candidates together have rank {rank} for {len(s)} parameters (smallest singular value ratio "

@@ -10,8 +10,6 @@ import numpy as np
 
 from trajectories.errors import BadInput, require
 
-JUMP = 1e-6  # of a joint [rad or m] at a seam between two tracks
-
 
 @dataclass(frozen=True, eq=False)
 class Setpoints:
@@ -57,6 +55,7 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
         BadInput: for other rates, or a jump of position or speed at a seam, with its joint and size.
     """
     first, rate = tracks[0], tracks[0].rate
+    max_jump = 1e-6  # of a joint [rad or m] at a seam between two tracks
     for k, (one, two) in enumerate(pairwise(tracks)):
         if two.rate != rate:
             raise BadInput(
@@ -64,7 +63,7 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
             )
         for what, end, start in (("position", one.q[-1], two.q[0]), ("speed", one.v[-1], two.v[0])):
             jump = np.abs(start - end)
-            if jump.max() > JUMP * (1 if what == "position" else rate):
+            if jump.max() > max_jump * (1 if what == "position" else rate):
                 j = int(jump.argmax())
                 raise BadInput(
                     f"motion {k + 2} begins {jump[j]:.3g} away from motion {k + 1}'s end ({what} of joint {j + 1}): "

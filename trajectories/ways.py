@@ -13,9 +13,7 @@ import numpy as np
 
 Clear = Callable[[np.ndarray], np.ndarray]
 
-REACH = 0.5
 """Largest step of a tree in one joint, as a share of its unit (see `Room`). Our choice."""
-GOAL = 0.1
 """Share of draws that are the middle between the ends and near it rather than anywhere. Our choice."""
 
 
@@ -62,8 +60,9 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
         return np.array([start, goal])
     generator = np.random.default_rng(seed)
     trees = [([start], [-1]), ([goal], [-1])]
+    goal_share = 0.1
     for number in range(most):
-        if generator.random() < GOAL:
+        if generator.random() < goal_share:
             aim = (start + goal) / 2 + generator.normal(size=len(start)) * room.unit
         else:
             aim = generator.uniform(room.lower, room.upper)
@@ -80,13 +79,13 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
     return None
 
 
-def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray) -> int | None:
+def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray, max_step: float = 0.5) -> int | None:
     """Let a tree grow by one step towards a place; return the number of the new node, None where that is not clear."""
     nodes, parents = tree
     away = (aim - np.array(nodes)) / room.unit
     near = int(np.linalg.norm(away, axis=1).argmin())
     largest = float(np.abs(away[near]).max())
-    new = aim if largest <= REACH else nodes[near] + (aim - nodes[near]) * (REACH / largest)
+    new = aim if largest <= max_step else nodes[near] + (aim - nodes[near]) * (max_step / largest)
     if not room.clear(new[None])[0] or not straight_is_clear(room, nodes[near], new):
         return None
     nodes.append(new)

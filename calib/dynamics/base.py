@@ -27,7 +27,6 @@ from calib.estimation.triangles import retriangulate
 SAMPLES = 500
 SMALLEST = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small
 BLOCK = 2048  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
-NEGLIGIBLE = 1e-11  # coefficients below this part of the largest of their column are rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,13 +249,16 @@ def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return result
 
 
-def _clean(split: ColumnSplit) -> ColumnSplit:
-    """Return the split with coefficients that are rounding set to zero."""
+def _clean(split: ColumnSplit, rounding: float = 1e-11) -> ColumnSplit:
+    """Return the split with coefficients that are rounding set to zero.
+
+    `rounding`: coefficients below this part of the largest of their column are rounding.
+    """
     coefficients = np.array(split.coefficients)
     size = np.abs(coefficients).max(axis=0, initial=0.0)
-    coefficients[np.abs(coefficients) <= NEGLIGIBLE * size] = 0.0
+    coefficients[np.abs(coefficients) <= rounding * size] = 0.0
     coefficients[:, np.isin(split.dropped, split.without_effect)] = 0.0
-    near = np.abs(coefficients - np.round(coefficients)) <= NEGLIGIBLE
+    near = np.abs(coefficients - np.round(coefficients)) <= rounding
     return replace(split, coefficients=frozen(np.where(near, np.round(coefficients), coefficients)))
 
 
@@ -283,7 +285,6 @@ def _require_same(base: Base, model: RegressorModel) -> None:
         raise CalibError("the base parameters belong to another model: its rows or its parameters' names differ")
 
 
-INDEPENDENT = 1e-4  # of a column at unit norm that no other one explains (our choice)
 BLOCK = 4000  # samples at a time
 
 
@@ -327,4 +328,5 @@ def columns_at_rest(
     if known is not None:
         values, V = np.linalg.eigh(known)
         rows = np.concatenate([rows, np.sqrt(np.maximum(values, 0.0))[:, None] * V.T])
-    return np.asarray(split_columns(rows, [np.array([k]) for k in range(rows.shape[1])], INDEPENDENT).kept)
+    min_independent = 1e-4  # of a column at unit norm that no other one explains (our choice)
+    return np.asarray(split_columns(rows, [np.array([k]) for k in range(rows.shape[1])], min_independent).kept)

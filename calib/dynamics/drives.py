@@ -22,7 +22,6 @@ Motion = tuple[tuple[int, float], ...]
 STANDARD = {"Ia": "acceleration", "Fv": "velocity", "Fc": "sign", "off": "one"}
 LINK_SIDE = {"Fvl": "velocity", "Fcl": "sign", "offl": "one"}
 MOTOR_SIDE = {"Ia": "acceleration", "Fvm": "velocity", "Fcm": "sign", "offm": "one"}
-CABLE_ORDERS = 3  # half turns over a joint's travel: smooth, and no more (our choice)
 
 
 @dataclass(frozen=True)
@@ -271,8 +270,9 @@ def cable(joint: int, travel: float) -> tuple[DriveTerm, ...]:
 
     The lowest sines and cosines of a period of twice the travel [rad or m]: a smooth function on it.
     """
+    max_order = 3  # half turns over a joint's travel: smooth, and no more (our choice)
     return tuple(
         term(f"{name}{joint + 1}.{k}", shape, joint, k * math.pi / travel, math.inf, side="link")
-        for k in range(1, CABLE_ORDERS + 1)
+        for k in range(1, max_order + 1)
         for name, shape in (("Cs", "sine"), ("Cc", "cosine"))
     )

@@ -24,8 +24,6 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
 
-MIXED = 1e-6  # of a column, beyond which friction counts as regrouped with something else
-
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -112,7 +110,8 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
     rubbing = _is_friction(model.model)
     kept, dropped = rubbing[model.base.kept], rubbing[model.base.split.dropped]
     mixed = np.abs(model.base.split.coefficients) * (kept[:, None] != dropped)
-    if mixed.max(initial=0.0) > MIXED:
+    max_mixed = 1e-6  # of a column, beyond which friction counts as regrouped with something else
+    if mixed.max(initial=0.0) > max_mixed:
         name = model.names[int(mixed.max(axis=1).argmax())]
         raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
     standard = model.base.to_standard(values)

@@ -10,8 +10,6 @@ import scipy.linalg
 
 from calib.arrays import frozen
 
-TIE = 1e-3  # columns of nearly equal norm enter in their own order
-
 
 @dataclass(frozen=True, eq=False)
 class ColumnSplit:
@@ -91,6 +89,7 @@ def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tole
     """Return the sorted indices of independent columns, group after group."""
     basis = np.zeros((scaled.shape[0], 0))
     kept: list[int] = []
+    tie = 1e-3  # columns of nearly equal norm enter in their own order
     for group in groups:
         candidates = np.setdiff1d(group, silent)
         if len(candidates) == 0 or basis.shape[1] == scaled.shape[0]:
@@ -98,7 +97,7 @@ def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tole
         rest = scaled[:, candidates]
         for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
             rest = rest - basis @ (basis.T @ rest)
-        rest = rest * (1.0 - TIE * np.arange(len(candidates)) / len(candidates))
+        rest = rest * (1.0 - tie * np.arange(len(candidates)) / len(candidates))
         q, r, order = (np.asarray(x) for x in scipy.linalg.qr(rest, mode="economic", pivoting=True))
         count = int(np.sum(np.abs(np.diag(r)) > tolerance))
         kept.extend(candidates[order[:count]])

@@ -7,8 +7,6 @@ import numpy as np
 from calib.arrays import shaped
 from calib.estimation.whiteness import autocorrelation, inflation
 
-LAGS = 12  # at least, of the residuals' autocorrelation
-
 
 def scatter(white: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return Σ_j σ_j² Σ_kl ρ_j(k - l) w_jk w_jlᵀ (p, p): the covariance of Σ_k W_kᵀ r_k.
@@ -27,13 +25,14 @@ def scatter(white: np.ndarray, residual: np.ndarray) -> np.ndarray:
     count, p = len(white), white.shape[2]
     size = 1 << (2 * count - 1).bit_length()
     result = np.zeros((p, p))
+    min_lags = 12  # at least, of the residuals' autocorrelation
     for row in range(white.shape[1]):
         own, values = residual[:, row], white[:, row]
         variance = float(np.mean(own**2))
-        if variance == 0.0 or count < 4 * LAGS:
+        if variance == 0.0 or count < 4 * min_lags:
             result += variance * values.T @ values
             continue
-        lags = int(min(count // 4, max(LAGS, 15 * inflation(own))))
+        lags = int(min(count // 4, max(min_lags, 15 * inflation(own))))
         rho = autocorrelation(own, lags) * (1.0 - np.arange(1, lags + 1) / (lags + 1.0))
         kernel = np.zeros(size)
         kernel[0], kernel[1 : lags + 1], kernel[size - lags :] = 1.0, rho, rho[::-1]

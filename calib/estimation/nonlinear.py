@@ -15,7 +15,6 @@ import numpy as np
 import scipy.linalg
 
 State = TypeVar("State")
-EXACT = 0.01
 
 
 class Status(Enum):
@@ -90,7 +89,7 @@ def solve(
 
     Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
     estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
-    is better any more, and what is left is `EXACT` standard deviations of a measurement rms, as of computed ones.
+    is better any more, and what is left is `exact_cost` standard deviations of a measurement rms, as of computed ones.
 
     Args:
         linearise: state -> residual (rows,) and W (rows, p), whitened.
@@ -105,13 +104,14 @@ def solve(
     factor, target, cost = triangle(residual, matrix)
     state, lam, count, history, floor = start, damping, 1, [float(np.sqrt(cost))], 1e-22 * cost
     status = None
+    exact_cost = 0.01
     while status is None:
         if target @ target <= tolerance**2 * cost / dof or cost <= floor:
             status = Status.CONVERGED
         elif count >= limit:
             status = Status.ITERATIONS
         elif lam > 1e10:
-            status = Status.CONVERGED if cost <= EXACT**2 * matrix.shape[0] else Status.STALLED
+            status = Status.CONVERGED if cost <= exact_cost**2 * matrix.shape[0] else Status.STALLED
         else:
             trial = retract(state, damped_step(factor, target, lam))
             reduced = triangle(*linearise(trial))

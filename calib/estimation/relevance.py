@@ -10,10 +10,7 @@ from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
 
 from calib.errors import Unidentifiable
 
-EXACT = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
 SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
-UNSEEN = 1e-12  # of a group's largest information, below which a direction is rounding
-OUTWEIGHED = 2.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +99,13 @@ def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Cond
     alone = np.flatnonzero((groups < 0) | (members[inverse] == 1))
     blocks: list[tuple[np.ndarray, np.ndarray | None]] = [(alone, None)]
     labels, sizes, counts = [groups[alone]], [start[alone]], [np.ones(len(alone))]
+    rounding = 1e-12  # of a group's largest information, below which a direction is rounding
     for group in family[(family >= 0) & (members > 1)]:
         own = np.flatnonzero(groups == group)
         size = float(np.exp(np.log(start[own]).mean()))
         profile = start[own] / size
         seen, basis = np.linalg.eigh(square[np.ix_(own, own)] * np.outer(profile, profile))
-        kept = seen > UNSEEN * seen[-1]
+        kept = seen > rounding * seen[-1]
         kept[-1] = True
         blocks.append((own, profile[:, None] * basis[:, kept]))
         width = int(kept.sum())
@@ -151,6 +149,9 @@ def relevance(
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
     index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
     square, last = data.square, np.full(len(groups), np.inf)
+    exact_residual = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
+    # a group is out once its prior is this many times as precise as the data on its columns (our choice)
+    max_prior_weight = 2.0
     for _ in range(iterations):
         inside = np.flatnonzero(alive[family[index]])
         if len(inside) < len(index):
@@ -161,11 +162,11 @@ def relevance(
         gamma = np.bincount(own, told, count + 1)
         size = np.bincount(own, solution**2, count + 1)
         lam[:count] = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)[:count]
-        alive[:count] &= (lam < OUTWEIGHED * beta * np.maximum(information, 1e-300))[:count]
+        alive[:count] &= (lam < max_prior_weight * beta * np.maximum(information, 1e-300))[:count]
         effective = float(gamma.sum())
         misfit = data.total - 2.0 * solution @ data.cross[index]
         misfit += solution @ square @ solution
-        least = EXACT**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
+        least = exact_residual**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
         beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
         if settled > 0.0 and np.sum((solution - last[index]) ** 2 / variance) < settled**2 * counts[index].sum():
             break

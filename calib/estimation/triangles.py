@@ -20,8 +20,6 @@ from calib.arrays import frozen, shaped
 from calib.errors import CalibError, Unidentifiable, require
 from calib.words import listing
 
-CHUNK = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
-RESOLUTION = 1e-10  # singular values of unit-norm columns below this part of the largest are rounding
 ADVICE = "choose base columns first (columns.split_columns), or add motion that tells them apart"
 
 
@@ -87,12 +85,13 @@ def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.nd
     if len(matrix) and not 0 <= found[0] <= found[-1] < data.groups:
         raise CalibError(f"rows belong to groups {found[0]} to {found[-1]}, but there are {data.groups} groups")
     factors, rows = np.array(data.factors), np.array(data.rows)
+    chunk = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
     for g in found if len(matrix) else ():
         own = np.flatnonzero(index == g) if index.ndim else None  # no copies of rows that are all of one group
         count = len(matrix) if own is None else len(own)
         rows[g] += count
-        for start in range(0, count, CHUNK):
-            part = slice(start, start + CHUNK) if own is None else own[start : start + CHUNK]
+        for start in range(0, count, chunk):
+            part = slice(start, start + chunk) if own is None else own[start : start + chunk]
             factors[g] = _update(factors[g], matrix[part], target[part])
     return replace(data, factors=frozen(factors), rows=frozen(rows, int))
 
@@ -200,7 +199,8 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
         Unidentifiable: naming every column with a part in a null direction.
     """
     values = np.linalg.svd(scaled, compute_uv=False)
-    weak = values <= RESOLUTION * values[0] if values[0] > 0.0 else np.ones(len(values), dtype=bool)
+    resolution = 1e-10  # singular values of unit-norm columns below this part of the largest are rounding
+    weak = values <= resolution * values[0] if values[0] > 0.0 else np.ones(len(values), dtype=bool)
     if not weak.any():
         return values
     part = np.linalg.norm(np.linalg.svd(scaled)[2][weak], axis=0)

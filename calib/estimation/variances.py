@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 ROUNDS = 200  # of the fixed point
-GROSS = 9.0  # squared errors count as so many times their variance at most (our choice)
 
 
 def variance_weights(
@@ -23,9 +22,10 @@ def variance_weights(
         rounds: of the fixed point; fewer will do from weights of nearly the same errors.
     """
     weights = np.array(start, dtype=float)
+    max_ratio = 9.0  # squared errors count as so many times their variance at most (our choice)
     for _ in range(rounds):
         variance = np.maximum(shapes @ weights, 1e-30)
-        ratio = np.minimum(squares / variance, GROSS)
+        ratio = np.minimum(squares / variance, max_ratio)
         push, pull = (counts * ratio / variance) @ shapes, (counts / variance) @ shapes
         weights *= push / np.maximum(pull, 1e-300)
     return weights

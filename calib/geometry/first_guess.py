@@ -35,7 +35,6 @@ from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion, invert, pose
 from calib.units import DEG
 
-WRONG_UNIT = 15.0  # measured over predicted spread of the positions (our choice)
 UNITS = {
     1e3: "are they mm under a header that says m",
     1e-3: "are they m under a header that says mm",
@@ -46,7 +45,6 @@ UNITS = {
     0.03937: "are they in under a header that says mm",
 }
 FEW_DEGREES = 2.1 * math.pi * DEG  # no joint goes further: they may be rad read as deg (our choice)
-MIN_SPREAD = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
 TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
 ENOUGH = 300  # rows of a block that a guess is made from (our choice)
 
@@ -94,15 +92,17 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
         chain: predicts them from the joints.
 
     Raises:
-        MeasurementError: for a ratio beyond `WRONG_UNIT`, with the units that would explain it; for positions on a
+        MeasurementError: for a ratio beyond `max_ratio`, with the units that would explain it; for positions on a
             line.
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
     (measured, second), (predicted, across) = _spread(block.position), _spread(forward(chain, block.q)[:, :3, 3])
-    if predicted < MIN_SPREAD:
+    min_spread = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
+    if predicted < min_spread:
         return
-    if not 1.0 / WRONG_UNIT < measured / predicted < WRONG_UNIT:
+    max_ratio = 15.0  # measured over predicted spread of the positions (our choice)
+    if not 1.0 / max_ratio < measured / predicted < max_ratio:
         likely, header = _likely_units(block, chain, measured, predicted)
         read = "".join(f" The file was {note}." for note in block.notes if note.startswith("read as"))
         raise MeasurementError(
@@ -111,7 +111,7 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
             f"header, as in {header}, or look whether this is the right robot",
             block.file,
         )
-    if second < across / WRONG_UNIT and across > MIN_SPREAD:
+    if second < across / max_ratio and across > min_spread:
         raise MeasurementError(
             f"the measured positions lie on a line, within {1e3 * second:.3g} mm, where the robot's joints make it "
             f"move {1e3 * across:.3g} mm across: are two of x, y, z constant or the same column, or were points "

@@ -24,13 +24,7 @@ from calib.robot.chain import Chain, element_length
 from calib.robot.deflection import Deflection
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
-RETRIES = 4
-SPARE = 1.5  # measured numbers per unknown at least (our choice)
-WIDTHS = 3  # updates of a drawn fit's widths
-NARROWEST = 1e-6  # [m, rad]
-IMAGE_PASSES = 20  # at most, until the noise of images settles (our choice)
 CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
-HARDLY = 1e-3  # relative size of a column of a placement that a block hardly tells (our choice)
 
 
 def fit(
@@ -80,7 +74,8 @@ def fit(
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
         return replace(_shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found = cell, None
-    for attempt in range(1 + RETRIES):
+    max_retries = 4
+    for attempt in range(1 + max_retries):
         plausible = np.where(np.isfinite(stated[free]), np.inf, plausible_deviation(cell, free))
         if attempt == 0 and not np.isfinite(plausible).any():
             continue
@@ -96,13 +91,16 @@ def fit(
     return replace(found, start=cell, split=split, candidates=candidates)
 
 
-def _enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
-    """Refuse measurements with less than `SPARE` numbers for each unknown: only what is left over can be judged."""
+def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers: float = 1.5) -> None:
+    """Refuse measurements with less than `min_numbers` numbers for each unknown: only what is left over can be judged.
+
+    `min_numbers`: measured numbers per unknown at least (our choice).
+    """
     parts = [part for block in blocks for part in observe(cell, block, np.array([], dtype=int))]
     numbers = sum(part.value.size - part.nuisances for part in parts)
-    if numbers < SPARE * unknowns:
+    if numbers < min_numbers * unknowns:
         poses = sum(len(block.measured) for block in blocks)
-        needed = math.ceil(SPARE * unknowns * poses / max(numbers, 1))
+        needed = math.ceil(min_numbers * unknowns * poses / max(numbers, 1))
         raise MeasurementError(
             f"{poses} poses are too few: {unknowns} unknowns need at least {needed} such poses, so that the fit can be "
             "judged, too, and a full geometry some 20 to 40; measure more, or ask for a smaller model ('offsets' or "
@@ -144,11 +142,13 @@ def _shrunk_fit(
     prior = plausible_deviation(cell, free)
     nominal = parameter_values(cell)[free]
     found = fit_with_prior(cell, blocks, free, prior, settings=settings)
-    for _ in range(WIDTHS):
+    min_width = 1e-6  # [m, rad]
+    width_updates = 3  # updates of a drawn fit's widths
+    for _ in range(width_updates):
         residual, matrix = _whitened(found)
         moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
         widths = relevance(gram(residual + matrix @ moved, matrix), family, prior).ridge
-        prior = np.where(family >= 0, np.clip(widths, NARROWEST, plausible_deviation(cell, free)), np.inf)
+        prior = np.where(family >= 0, np.clip(widths, min_width, plausible_deviation(cell, free)), np.inf)
         prior = np.minimum(prior, stated)
         found = fit_with_prior(cell, blocks, free, prior, settings=settings)
     return found
@@ -189,7 +189,8 @@ def fit_with_prior(
     weigher = Weigher(settings, nominal or cell, blocks, free, prior)
     state, solution = cell, None
     weigher.update(state, first=True)
-    for _ in range(IMAGE_PASSES if any(weigher.noises) and settings.passes > 1 else settings.passes):
+    image_passes = 20  # at most, until the noise of images settles (our choice)
+    for _ in range(image_passes if any(weigher.noises) and settings.passes > 1 else settings.passes):
         solution = solve(
             weigher.linearise, lambda s, dx: step(s, free, dx), state,
             damping=settings.damping, limit=settings.limit,
@@ -256,14 +257,15 @@ def placed_on(
     """Fit base and tool placement of an arm, deflections included, on a block and nothing else.
 
     Where that does not settle, since the block hardly tells some of it (the turn about a line that is driven), what it
-    tells by less than `HARDLY` stays where it is. Whether that settled is the solution's status.
+    tells by less than `min_column` stays where it is. Whether that settled is the solution's status.
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))
     found = polish_frames(start, [block], replace(settings, limit=CRAWLS), torques)
     if found.solution.status.good:
         return found
-    return polish_frames(found.cell, [block], replace(settings, tolerance=HARDLY), torques)
+    min_column = 1e-3  # relative size of a column of a placement that a block hardly tells (our choice)
+    return polish_frames(found.cell, [block], replace(settings, tolerance=min_column), torques)
 
 
 def without_corrections(

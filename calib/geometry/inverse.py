@@ -21,11 +21,8 @@ from calib.geometry.installation import Installation, Seen, see
 from calib.robot.deflection import evaluate
 from calib.robot.kinematics import joint_jacobian
 
-LENGTH = 0.3  # an orientation counts as its displacement at this distance [m]; as all constants here, our choice
 DONE = 1e-10  # error [m] below which a target is met
-STILL = 1e-12  # step [rad or m] that changes nothing
 FIRST, LAST = 1e-9, 1e4  # damping, in mean squared singular values of J
-CHUNK = 2000  # targets at once: bounds the memory
 BACK = np.geomspace(1e-4, 1.0, 13)  # weights that hold the joints at the start [m/rad]
 
 Torques = Callable[[np.ndarray], np.ndarray] | None
@@ -101,13 +98,15 @@ def reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int = 
         start: (m, n) joint values to start from and to stay near; beyond a limit, the limit.
         iterations: at most.
     """
+    chunk = 2000  # targets at once: bounds the memory
     found = [
-        _reach(goal, targets[k : k + CHUNK], start[k : k + CHUNK], iterations) for k in range(0, len(targets), CHUNK)
+        _reach(goal, targets[k : k + chunk], start[k : k + chunk], iterations) for k in range(0, len(targets), chunk)
     ]
     return np.concatenate(found) if found else np.array(start, dtype=float)
 
 
-def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int) -> np.ndarray:
+def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int, min_step: float = 1e-12) -> np.ndarray:
+    # min_step: step [rad or m] that changes nothing
     q = np.clip(start, goal.lower, goal.upper)
     damping = np.full(len(q), FIRST)
     error, jacobian = _weighted(goal, q, targets)
@@ -124,14 +123,17 @@ def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int) 
         q[won], error[won], jacobian[won] = trial[better], fresh[better], slope[better]
         damping[won] = np.maximum(0.1 * damping[won], FIRST)
         damping[lost] = np.maximum(10.0 * damping[lost], 1e-4)
-        going = going[np.abs(trial - q[going]).max(axis=1) + better > STILL]
+        going = going[np.abs(trial - q[going]).max(axis=1) + better > min_step]
     return q
 
 
-def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return error (m, dof) and Jacobian (m, dof, n), orientations as displacements at `LENGTH` [m]."""
+def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray, lever: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """Return error (m, dof) and Jacobian (m, dof, n), orientations as displacements at `lever` [m].
+
+    `lever`: an orientation counts as its displacement at this distance [m]; as all constants here, our choice.
+    """
     seen = seen_at(goal, q)
-    weight = np.where(np.arange(goal.dof) < 3, 1.0, LENGTH)
+    weight = np.where(np.arange(goal.dof) < 3, 1.0, lever)
     return weight * _differences(seen, targets, goal.dof), weight[:, None] * differences_jacobian(goal, seen)
 
 

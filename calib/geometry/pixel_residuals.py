@@ -22,7 +22,6 @@ from calib.geometry.installation import Installation, Seen
 from calib.geometry.parameters import layout_counts
 from calib.geometry.residuals import Part, parts
 
-CHUNK = 500  # images reduced at once
 STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axis beyond which a corner is taken at it
 
 
@@ -87,8 +86,9 @@ class PixelPart(Part):
         edges = np.append(first, len(self.index))
         width = self.local.shape[2] + 1
         shared = None if self.noise is None else self.shared_errors() if self.shared is None else self.shared
-        for start in range(0, len(images), CHUNK):
-            own = slice(start, min(start + CHUNK, len(images)))
+        chunk = 500  # images reduced at once
+        for start in range(0, len(images), chunk):
+            own = slice(start, min(start + chunk, len(images)))
             rows, counts = slice(edges[own.start], edges[own.stop]), np.diff(edges[own.start : own.stop + 1])
             unit = scale.T[rows, :, None]
             table = np.concatenate([self.local[rows], self.value.T[rows, :, None]], axis=2) / unit

@@ -18,7 +18,6 @@ from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit, Piece
 
-START_IMAGE = 1e-4  # displacement [m] and turn [rad] of an image that a fit begins with (our choice)
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
 
 
@@ -101,12 +100,13 @@ class Weigher:
         robustly = loss != "none"
         self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
         self.noises, self.shared = [None] * len(found), [None] * len(found)
+        first_noise = 1e-4  # displacement [m] and turn [rad] of an image that a fit begins with (our choice)
         for k, part in enumerate(found):
             if isinstance(part, PixelPart):
                 unknowns = len(self.free) // len(found)
                 noise = estimate_noise(part.own_poses(self.sigmas[k]), unknowns, loss, self.settings.loss_scale)
                 if first and not robustly:
-                    noise = replace(noise, displacement=START_IMAGE, turn=START_IMAGE)
+                    noise = replace(noise, displacement=first_noise, turn=first_noise)
                 self.noises[k] = part.spread_over(noise)
                 self.shared[k] = replace(part, noise=self.noises[k]).shared_errors()
                 self.sigmas[k] = noise.factor * self.sigmas[k]

@@ -22,9 +22,6 @@ from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.convex.cone_program import minimise
 
 SIZE = 0.1  # [m] of a body of one kilogram, in whose units the program is written
-LARGEST = 1e4  # of a body in those units: keeps finite what the data do not tell
-BORDER = 1e-4  # of a body's largest moment in those units, below which it counts as on the border
-TOUCHES = 1e-6  # of the gradient, from which on the cone holds the optimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +73,8 @@ class BodyCone:
         free = made.shape[1] - 10 * count
         bodies = np.einsum("ij,krs->irsjk", np.eye(count), pseudo_inertia.UNITS).reshape(count, 4, 4, 10 * count)
         bodies = np.concatenate([bodies, np.zeros((count, 4, 4, free))], axis=3)
-        rows = [-np.einsum("irrj->ij", bodies) / LARGEST]
+        max_trace = 1e4  # of a body in those units: keeps finite what the data do not tell
+        rows = [-np.einsum("irrj->ij", bodies) / max_trace]
         rows.append(np.eye(made.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])
         low, high = np.isfinite(lower), np.isfinite(upper)
         sides = np.vstack([matrix[low], -matrix[high]]) / unit * size
@@ -88,12 +86,14 @@ class BodyCone:
         b = made @ found.values
         # the gradient's part that the cone balances
         held = (R.T @ (R @ b - z) - sides.T @ found.rows[len(offset) - len(edges) :])[:base]
-        if np.abs(held).max() < TOUCHES * max(float(np.abs(R.T @ z).max()), 1e-300):
+        min_multiplier = 1e-6  # of the gradient, from which on the cone holds the optimum
+        if np.abs(held).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
             return None
         normal = np.zeros(p)
         normal[:base] = held
         eigenvalues = np.linalg.eigvalsh(bodies @ found.values)
-        border = eigenvalues[:, 0] < BORDER * np.maximum(eigenvalues[:, -1], BORDER)
+        max_on_border = 1e-4  # of a body's largest moment in those units, below which it counts as on the border
+        border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
         labels = tuple(label for label, near in zip(self.labels, border) if near)
         return _Plane(normal * unit / size, float(normal @ b), labels)
 

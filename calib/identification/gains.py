@@ -27,12 +27,8 @@ from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.rows import pool
 from calib.records import Array
 
-ROUNDS = 60
-EXACT = 1e-9  # sigma of a gain that is set, of it: rounding
-TOLD = 0.3  # sigma of a relative gain, of it, up to which the motion tells it
 LEFT = 1.6  # by which relative gains are further off than noise and blocks of time show: what the model leaves moves
 # them alike all along a recording. 13 gains of a UR10e, of four recordings, are rms 1.6 such sigmas from the maker's
-UNLIKE = 10.0  # factor between gains of one robot's motors beyond which one is not told
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +60,9 @@ class DriveGains:
     def told(self) -> tuple[str, ...]:
         """What each joint's gain is: ``told``, the ``reference`` of the others, or ``not told`` by this motion."""
         sigma = self.sigma
+        rounding = 1e-9  # sigma of a gain that is set, of it: rounding
         return tuple(
-            "not told" if j in self.own else "reference" if sigma[j] < EXACT * self.gains[j] else "told"
+            "not told" if j in self.own else "reference" if sigma[j] < rounding * self.gains[j] else "told"
             for j in range(len(self.gains))
         )
 
@@ -142,7 +139,8 @@ def identify_gains(
         gain = _start(body, load, current)
     x = _parameters(body, load, current, gain, np.ones(n))
     std = np.ones(n)
-    for _ in range(ROUNDS):
+    max_rounds = 60
+    for _ in range(max_rounds):
         torque = body @ x + load
         residual = torque / gain[:, None] - current
         std = np.sqrt(np.sum(residual**2, axis=1) / currents.rows)
@@ -186,10 +184,10 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     """Estimate gains relative to one joint's, and leave at one those that the motion does not tell.
 
     Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
-    which sees part of what the model leaves, times `LEFT`. A gain is told where its sigma is below `TOLD` of it and it
-    is within a factor `UNLIKE` of the others: what links share with one motor at the wrist is little beside friction,
-    and a fit then takes what the model leaves for inertia (our choice). Where the search does not settle, the gain that
-    ran away furthest is not told.
+    which sees part of what the model leaves, times `LEFT`. A gain is told where its sigma is below `max_sigma` of it
+    and it is within a factor `max_factor` of the others: what links share with one motor at the wrist is little beside
+    friction, and a fit then takes what the model leaves for inertia (our choice). Where the search does not settle, the
+    gain that ran away furthest is not told.
 
     Args:
         data: triangles of [W i] by block and joint, group = block · joints + joint.
@@ -198,6 +196,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     """
     blocks = [k for k in range(data.groups // joints) if data.rows[k * joints : (k + 1) * joints].any()]
     own: tuple[int, ...] = ()
+    max_sigma = 0.3  # sigma of a relative gain, of it, up to which the motion tells it
+    max_factor = 10.0  # factor between gains of one robot's motors beyond which one is not told
     while True:
         try:
             found = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=own)
@@ -218,7 +218,7 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
         sigma = LEFT * np.maximum(formal, jackknife)
         free = np.array([j != reference and j not in own for j in range(joints)])
         apart = np.abs(logs - np.median(logs))
-        doubt = np.where(free, np.maximum(sigma / TOLD, apart / np.log(UNLIKE)), 0.0)
+        doubt = np.where(free, np.maximum(sigma / max_sigma, apart / np.log(max_factor)), 0.0)
         if doubt.max() <= 1.0:
             factor = np.where(free & (formal > 0.0), sigma / np.where(formal > 0.0, formal, 1.0), 1.0)
             return replace(found, covariance=frozen(found.covariance * np.outer(factor, factor)))

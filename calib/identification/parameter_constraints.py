@@ -34,7 +34,6 @@ from calib.records import Number
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 LEAST = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
 RAISE, MOST = 10**0.5, 0.4  # factor and limit of the same where an estimate cannot be simulated (our choice)
-FAR = 3.0  # standard deviations by which the data speak against an equality that is told (our choice)
 
 
 def _in_order(value: Any) -> Any:
@@ -219,6 +218,7 @@ class Held:
     def lines(self) -> list[str]:
         """Return what a user should know of constraints that hold the estimate."""
         told = []
+        max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is told (our choice)
         for one in self.binding:
             said = f"the data alone say {one.free:.3g} ± {one.sigma:.2g}"
             if one.name == self.plane:
@@ -232,7 +232,7 @@ class Held:
                     f"an estimate sits on its bound, {one.name}: {said}; the bound may exclude the truth, or the "
                     "estimate is biased"
                 )
-            elif abs(one.free - one.bound) > FAR * one.sigma:
+            elif abs(one.free - one.bound) > max_sigmas * one.sigma:
                 told.append(f"the data speak against {one.name}: {said}")
         if self.postures:
             told.append(

@@ -20,8 +20,6 @@ from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 from calib.identification.cases import Case
 
 BLOCK = 4096  # samples of the full rate at a time
-EDGE = 4  # samples beside a block that differences of its energies reach
-MARGIN = 2  # thinned samples beside a cut between blocks that share a filter window: not judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,16 +140,17 @@ def segments(segment: np.ndarray) -> list[tuple[int, int]]:
 def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
     """Number the time blocks of all cases: contiguous, about `count` in all, at least one per case.
 
-    Samples within `MARGIN` of a cut get -1: the filter's window reaches over it.
+    Samples within `margin` of a cut get -1: the filter's window reaches over it.
     """
     total = sum(len(rows.target) for rows in all_rows)
     result, first = [], 0
+    margin = 2  # thinned samples beside a cut between blocks that share a filter window: not judged
     for rows in all_rows:
         size = len(rows.target)
         own = 1 if len(all_rows) >= count else max(1, round(count * size / max(total, 1)))
         number = first + (np.arange(size) * own) // max(size, 1)
         cut = np.flatnonzero(np.diff(number)) + 1
-        near = np.abs(np.arange(size)[:, None] - cut[None, :]).min(axis=1, initial=size) <= MARGIN
+        near = np.abs(np.arange(size)[:, None] - cut[None, :]).min(axis=1, initial=size) <= margin
         result.append(replace(rows, block=np.where(near, -1, number)))
         first += own
     return result
@@ -224,7 +223,8 @@ def _power_block(
     if not isinstance(model, _HasEnergy):
         raise UsageError("rows = 'power' need a model that knows its energies")
     motion = case.motion
-    near = slice(max(segment.start, part.start - EDGE), min(segment.stop, part.stop + EDGE))
+    edge = 4  # samples beside a block that differences of its energies reach
+    near = slice(max(segment.start, part.start - edge), min(segment.stop, part.stop + edge))
     h = model.energy_columns(motion.q[near], motion.v[near], case.carried)[:, columns]
     rising = slope(h, motion.rate)
     plain = np.gradient(h, 1.0 / motion.rate, axis=0) if len(h) > 1 else np.zeros_like(h)

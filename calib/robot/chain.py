@@ -18,8 +18,6 @@ from calib.errors import RobotError, require
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
-MAX_NUMBER = 1e12  # of masses, moments and lengths [SI] (our choice)
-MAX_GRAVITY = 100.0  # [m/s²] (our choice)
 MIN_LIMIT = 1e-6  # of a speed or effort that a description states [SI]; less is none (our choice)
 
 
@@ -27,9 +25,10 @@ def check_gravity(gravity: np.ndarray, place: str = "") -> None:
     """Refuse a gravity vector (3,) [m/s²] that no robot stands under; `place` begins the message.
 
     Raises:
-        RobotError: for one beyond `MAX_GRAVITY`, or not finite.
+        RobotError: for one beyond `max_gravity`, or not finite.
     """
-    if not math.hypot(*gravity) < MAX_GRAVITY:
+    max_gravity = 100.0  # [m/s²] (our choice)
+    if not math.hypot(*gravity) < max_gravity:
         raise RobotError(f"{place}gravity {gravity.tolist()} is none: expected m/s², some 9.81 in all")
 
 
@@ -133,9 +132,10 @@ class Chain:
         object.__setattr__(self, "tail", frozen(self.tail))
         object.__setattr__(self, "gravity", frozen(self.gravity))
         check_gravity(self.gravity, f"'{self.name}': ")
+        max_number = 1e12  # of masses, moments and lengths [SI] (our choice)
         for what in ("tail", "inertias"):
-            if (value := getattr(self, what)) is not None and not (np.abs(value) < MAX_NUMBER).all():
-                raise RobotError(f"'{self.name}': {what}: found a number that is not finite, or beyond {MAX_NUMBER:g}")
+            if (value := getattr(self, what)) is not None and not (np.abs(value) < max_number).all():
+                raise RobotError(f"'{self.name}': {what}: found a number that is not finite, or beyond {max_number:g}")
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
         for what, names in (("joint", self.joint_names), ("element", self.names)):

@@ -7,10 +7,7 @@ import numpy as np
 from calib.robot.chain import Chain, Joint
 from calib.words import listing
 
-DENSEST = 1000.0  # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
-UNEVEN = 1.0  # share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice)
 TURNS = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
-EMPTY = 1e-6  # of M L²: moments below are rounding
 
 
 def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
@@ -61,7 +58,7 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
 
     A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
     others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass
-    lie within the stretched arm's length L, and the whole arm weighs no more than `DENSEST` L³.
+    lie within the stretched arm's length L, and the whole arm weighs no more than `max_density` L³.
     """
     if chain.inertias is None:
         return ()
@@ -75,13 +72,20 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
     for name, words in found.items():
         same.setdefault(words.partition(" (")[0], []).append(name)
     lines = [f"body behind {listing(names, 4)}: {found[names[0]]}" for names in same.values()]
-    if total > DENSEST * length**3:
+    # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
+    max_density = 1000.0
+    if total > max_density * length**3:
         lines.append(f"its bodies weigh {total:.4g} kg in all where the stretched arm is {length:.3g} m long: grams?")
     return tuple(lines)
 
 
-def _impossible(body: np.ndarray, length: float) -> str:
-    """Return why a body (10,) cannot exist, in words; nothing where it can."""
+def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_excess: float = 1.0) -> str:
+    """Return why a body (10,) cannot exist, in words; nothing where it can.
+
+    `rounding`: of M L²: moments below are rounding.
+
+    `max_excess`: share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice).
+    """
     mass, first = float(body[9]), body[6:9]
     if mass <= 0.0:
         return f"no mass (M = {mass:g} kg)" if mass == 0.0 else f"a negative mass (M = {mass:g} kg)"
@@ -93,8 +97,8 @@ def _impossible(body: np.ndarray, length: float) -> str:
     if moments[2] > mass * length**2:
         reach = np.sqrt(moments[2] / mass)
         return f"an inertia of a body far larger than the arm (radius of gyration {reach:.3g} m: kg mm²?)"
-    if moments[0] < -EMPTY * mass * length**2:
+    if moments[0] < -rounding * mass * length**2:
         return f"a negative moment of inertia ({moments[0]:.3g} kg m² about its centre of mass)"
-    if moments[2] > (1.0 + UNEVEN) * (moments[0] + moments[1]) + EMPTY * mass * length**2:
+    if moments[2] > (1.0 + max_excess) * (moments[0] + moments[1]) + rounding * mass * length**2:
         return f"an inertia that no body has (a moment beyond the sum of the others: {moments[2]:.3g} kg m²)"
     return ""

@@ -54,7 +54,6 @@ from calib.errors import RobotError, one_of, require
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector, word
 
-PARALLEL = 0.05
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
 TOP = ("name", "base", "tip", "gravity", "floor", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
@@ -214,13 +213,13 @@ def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
     ]
 
 
-def _parallel(rows: Iterable[Row]) -> set[int]:
+def _parallel(rows: Iterable[Row], max_sine: float = 0.05) -> set[int]:
     """Return the indices of moving rows whose axis is nearly parallel to the moving one before, at zero joints."""
     found: set[int] = set()
     turned: np.ndarray | None = None
     for row in rows:
         turned = None if turned is None else turned @ _turn(0, row.alpha) @ _turn(1, row.beta or 0.0)
-        if turned is not None and row.kind != "fixed" and np.hypot(turned[0, 2], turned[1, 2]) < PARALLEL:
+        if turned is not None and row.kind != "fixed" and np.hypot(turned[0, 2], turned[1, 2]) < max_sine:
             found.add(row.index)
         if row.kind != "fixed":
             turned = np.eye(3)

@@ -17,10 +17,8 @@ from calib.words import listing
 
 ALWAYS = 0.95
 SAMPLES = 200
-TOUCH = 0.01  # by which a turret may reach into what it stands on [m] (our choice)
 SIZES = {"box": 3, "sphere": 1, "cylinder": 2}
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
-_STEPS = 44  # of the golden section: 0.618^44 is 6e-10 of the line
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +109,8 @@ def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> 
 
     one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     far_one, far_two = far(one), far(two)
-    for _ in range(_STEPS):
+    steps = 44  # of the golden section: 0.618^44 is 6e-10 of the line
+    for _ in range(steps):
         left = far_one < far_two
         low, high = np.where(left, low, one), np.where(left, two, high)
         fresh = np.where(left, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
@@ -158,7 +157,8 @@ def check_reachable(
         RobotError: naming links and things.
     """
     highest, moves = distances.max(axis=0), np.ptp(distances, axis=0) >= 1e-6
-    buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - TOUCH)))
+    max_overlap = 0.01  # by which a turret may reach into what it stands on [m] (our choice)
+    buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - max_overlap)))
     if not len(buried):
         return
     shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)

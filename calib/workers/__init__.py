@@ -22,8 +22,6 @@ from typing import Any
 from calib.errors import TaskLost, UsageError
 from calib.workers.crew import Crew, Stream, streamed
 
-AHEAD = 256  # tasks that may be ahead of the one whose turn it is, where results are wanted in order (our choice)
-
 
 @dataclass(frozen=True)
 class Workers:
@@ -64,7 +62,9 @@ class Workers:
 
     def _in_order(self, lost: list[TaskLost] | None, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
         early, turn, missing = dict[int, tuple[Any, BaseException | None]](), 0, 0
-        with closing(self._stream(function, zip(*items), lambda number: number < turn + AHEAD)) as answers:
+        # tasks that may be ahead of the one whose turn it is, where results are wanted in order (our choice)
+        max_ahead = 256
+        with closing(self._stream(function, zip(*items), lambda number: number < turn + max_ahead)) as answers:
             try:
                 for number, result, error in answers:
                     early[number] = result, error

@@ -18,7 +18,6 @@ from calib.workers.crew import Answer, Died, run_call
 
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
 NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
-CLOSING = 3.0  # [s] for leaving it (our choice)
 
 
 class _Cluster:
@@ -147,8 +146,9 @@ def dask(address: str) -> Iterator[_Cluster]:
     log = logging.getLogger("distributed.client")
     before = log.level
     log.setLevel(logging.CRITICAL)  # what goes wrong is said here, once
+    closing_time = 3.0  # [s] for leaving it (our choice)
     try:
         yield _Cluster(address, client)
     finally:
-        client.close(timeout=CLOSING)
+        client.close(timeout=closing_time)
         log.setLevel(before)

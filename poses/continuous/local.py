@@ -20,11 +20,9 @@ from poses.space import SearchSpace, constraint_gradients, constraint_values, is
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
-LARGE = 300
 """Above so many variables the poses are searched in blocks, the others held: SLSQP's cost rises with their cube."""
 SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
 """The stages of a smoothed search. Our choice: at the last one the smoothing costs at most log(p)/1024 of the merit."""
-PATIENCE = 25
 """Iterations over which a stage has to gain something. Our choice."""
 FEASIBLE = 1e-8
 """What a constraint may be broken by in a result [its own unit]."""
@@ -98,7 +96,7 @@ def improved(
         index: what to improve.
         existing: (k, rows, p) Jacobians of poses already measured.
         evaluations: most evaluations of index and gradient; a search stops by itself long before.
-        tolerance: gain of the merit over `PATIENCE` iterations to stop at; ten times that in all stages but the last.
+        tolerance: gain of the merit over `patience` iterations to stop at; ten times that in all stages but the last.
         seconds: of processor time to end after, whatever was reached by then.
         sharpness: of the stages, for indices with kinks.
         report: called with every improved merit.
@@ -154,7 +152,8 @@ def _search(
     best, value = start, merit_of(space, start, index, existing)[0] if kept else -np.inf
     history, spent, now, interrupted = [value], 0, start, False
     stages = list(sharpness if has_kinks(index) else (np.inf,))
-    blocks = -(-start.size // LARGE)
+    max_block = 300
+    blocks = -(-start.size // max_block)
     while stages and spent < evaluations and time.process_time() < deadline and not interrupted:
         sharp = stages.pop(0)
         for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
@@ -190,7 +189,7 @@ def climb(
     tolerance: float,
     deadline: float = np.inf,
 ) -> tuple[np.ndarray, int, bool]:
-    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `PATIENCE` iterations.
+    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `patience` iterations.
 
     Args:
         space: limits and constraints; its Jacobian and predicate are not looked at.
@@ -218,7 +217,8 @@ def climb(
         nonlocal last
         last = x.reshape(m, n).copy()
         merits.append(latest)
-        stalled = len(merits) > PATIENCE and merits[-1] - merits[-1 - PATIENCE] < tolerance
+        patience = 25
+        stalled = len(merits) > patience and merits[-1] - merits[-1 - patience] < tolerance
         if stalled or count >= evaluations or time.process_time() > deadline:
             raise _Ended
 

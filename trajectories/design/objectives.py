@@ -28,7 +28,6 @@ from trajectories.errors import BadInput, NotExciting
 
 Index = Literal["cond", "logdet", "smallest"]
 Scaling = Literal["raw", "normalised"]
-FLOOR = 1e-15  # eigenvalues below this part of the largest are rounding
 
 
 class Value(NamedTuple):
@@ -126,7 +125,8 @@ class Excitation:
         d = np.broadcast_to(d, diagonal.shape)
         C = M * d * d[:, None]
         eigenvalues, V = np.linalg.eigh(C)
-        eigenvalues = np.maximum(eigenvalues, FLOOR * eigenvalues[-1])
+        rounding = 1e-15  # eigenvalues below this part of the largest are rounding
+        eigenvalues = np.maximum(eigenvalues, rounding * eigenvalues[-1])
         value, slope = self._of_spectrum(eigenvalues)
         exact = value if np.isinf(self.sharpness) else replace(self, sharpness=np.inf)._of_spectrum(eigenvalues)[0]
         by_c = (V * slope) @ V.T

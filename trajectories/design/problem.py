@@ -19,8 +19,6 @@ from trajectories.design.objectives import Excitation, Objective, Observed, Valu
 from trajectories.errors import BadInput, require
 
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
-NEAR = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
-MOST_EXTRA = 150  # instants that are added at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,11 +214,13 @@ def critical_times(
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(problem.family.basis(times).motion(x), factor)
     near = np.zeros(len(times), dtype=bool)
+    near_share = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
     for one in constraints or problem.constraints:
         shares = (one.values(motion) / one.scale).max(axis=1)
-        near |= (shares > -NEAR) & (shares.max() > beyond)
+        near |= (shares > -near_share) & (shares.max() > beyond)
     found = times[near]
-    return found[:: -(-len(found) // MOST_EXTRA) or 1]
+    max_extra = 150  # instants that are added at a time
+    return found[:: -(-len(found) // max_extra) or 1]
 
 
 def _value(one: Objective, motion: SampledMotion, Y: np.ndarray, seen: dict[tuple[int, int], Observed]) -> Value:

@@ -58,10 +58,6 @@ STAGES = (
 """Our choice."""
 S_RANGE = (-4.0, 12.0)
 KEPT = 1e-7  # of a constraint's scale, by which a point that keeps it may break it: rounding
-REPAIR = 30  # evaluations to bring a stage's last motion back inside
-SMALLER = 4  # times that a motion is halved which cannot be brought back inside
-DEEP = 0.02  # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
-RETRIES = 3  # of a stage that ends with such a motion
 
 
 class _Spent(Exception):
@@ -124,8 +120,8 @@ def one_start(
 ) -> SearchResult | Stuck:
     """Search from one random start (its number) or from given variables.
 
-    Where the best motion of a stage breaks a limit between the samples by more than `DEEP`, the stage goes on with the
-    instants where that was, from there or, where that cannot be repaired, from the last motion that did not.
+    Where the best motion of a stage breaks a limit between the samples by more than `max_break`, the stage goes on with
+    the instants where that was, from there or, where that cannot be repaired, from the last motion that did not.
 
     Args:
         evaluations: most, if all of `STAGES` are gone through.
@@ -140,15 +136,17 @@ def one_start(
     else:
         y = np.asarray(start, dtype=float)
         y = np.append(y, np.clip(1.0, *problem.stretch)) if problem.free_period and len(y) == run.basis.p else y
+    repair_evaluations = 30  # evaluations to bring a stage's last motion back inside
+    max_retries = 3  # of a stage that ends with such a motion
     try:
         for number, stage in enumerate(chosen):
             if number:
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
             most = max(2, round(evaluations * stage.share))
-            for again in range(RETRIES, -1, -1):
+            for again in range(max_retries, -1, -1):
                 run.sharpness = stage.sharpness
                 y = run.solve(run.inside(y), most, method, stage.tolerance)
-                y = run.repaired(y, REPAIR)  # SLSQP travels outside, and may have ended there
+                y = run.repaired(y, repair_evaluations)  # SLSQP travels outside, and may have ended there
                 deep = np.zeros(0) if run.best is None else run.broken(run.best)
                 extra = np.union1d(extra, deep)
                 if not len(deep) or not again:
@@ -202,8 +200,10 @@ class StartSearch:
         return self.best if self.best is not None else self.nearest if self.nearest is not None else last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return the times of a motion that breaks limits between the samples by more than `DEEP`; none where not."""
-        return critical_times(self.problem, y, DEEP)
+        """Return the times of a motion that breaks limits between samples by more than `max_break`; none where not."""
+        # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
+        max_break = 0.02
+        return critical_times(self.problem, y, max_break)
 
     def last_unbroken(self) -> np.ndarray:
         """Return the last of the improving points that does not, found by halving; the first one where all do."""
@@ -268,7 +268,8 @@ class StartSearch:
     def inside(self, y: np.ndarray) -> np.ndarray:
         """Return a point that keeps the constraints: repaired, or of a smaller motion where that fails."""
         found = self.repaired(y)
-        for _ in range(SMALLER):
+        max_halvings = 4  # times that a motion is halved which cannot be brought back inside
+        for _ in range(max_halvings):
             if self.least[0] <= KEPT:  # some point keeps the constraints, whether or not the hard goals
                 break
             y = shrunk(self.problem, y, 0.5)

@@ -20,9 +20,6 @@ from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.starts import shrunk
 from trajectories.errors import NothingFeasible
 
-BLOCK = 2000
-EVALUATIONS = 240  # of a search that goes on from a motion, if all its stages are gone through
-
 
 @dataclass(frozen=True)
 class Margin:
@@ -121,6 +118,7 @@ def ensured(
         return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
 
     report = verified(found.x)
+    max_evaluations = 240  # of a search that goes on from a motion, if all its stages are gone through
     for _ in range(rounds):
         if report.feasible:
             return found, report
@@ -129,7 +127,7 @@ def ensured(
         further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
         extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
         tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
-        again = one_start(tighter, EVALUATIONS, "slsqp", found.seed, y, STAGES[2:])
+        again = one_start(tighter, max_evaluations, "slsqp", found.seed, y, STAGES[2:])
         found = replace(found, evaluations=found.evaluations + again.evaluations)
         if isinstance(again, SearchResult):
             found = replace(
@@ -152,8 +150,9 @@ def ensured(
 def _margins(
     family: Family, x: np.ndarray, constraint: MotionConstraint, motion: SampledMotion, step: float, factor: float
 ) -> list[Margin]:
-    starts = range(0, len(motion), BLOCK)
-    values = np.concatenate([constraint.values(motion.part(np.arange(len(motion))[s : s + BLOCK])) for s in starts])
+    block = 2000
+    starts = range(0, len(motion), block)
+    values = np.concatenate([constraint.values(motion.part(np.arange(len(motion))[s : s + block])) for s in starts])
     proved = isinstance(constraint, BoxLimit)
     if isinstance(constraint, BoxLimit):
         curve = family.largest(x, constraint.order + 2) / factor ** (constraint.order + 2)

@@ -23,7 +23,6 @@ from trajectories.timing.path import SAME, Path, through
 
 SAMPLES, MOST, STEPS = 41, 641, 400
 REACHED, KEPT = 1e-9, 1e-6  # [m and rad] of the pose at the samples, and between them
-LARGEST = 0.2  # [rad or m] of a step of any joint
 
 Forward = Callable[[np.ndarray], np.ndarray]
 
@@ -91,6 +90,7 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
 def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, rest: np.ndarray, target: np.ndarray):
     """Return joint values (n,) at a target pose and what is left of the error (6,)."""
     error = np.full(6, np.inf)
+    max_step = 0.2  # [rad or m] of a step of any joint
     for _ in range(STEPS):
         error = _error(forward(q[None]), target[None])[0]
         J = jacobian(q[None])[0]
@@ -99,7 +99,7 @@ def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, rest: np.ndarray,
         pull = rest - q
         step = inverse @ error + pull - inverse @ (J @ pull)
         size = np.abs(step).max()
-        q = q + step * min(1.0, LARGEST / max(size, 1e-300))
+        q = q + step * min(1.0, max_step / max(size, 1e-300))
         if size <= 1e-11:
             break
     return q, _error(forward(q[None]), target[None])[0]

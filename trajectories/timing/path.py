@@ -15,7 +15,6 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from trajectories.errors import BadInput
 
 SAME = 1e-9  # waypoints nearer than this [rad or m] are one
-DENSE = 40  # samples per knot interval where extremes are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +124,8 @@ def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np
 def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return where each joint is lowest and highest, and its values there, two arrays (2, n)."""
     spans = len(path.knots) - 1
-    s = np.interp(np.linspace(0, spans, DENSE * spans + 1), np.arange(spans + 1), path.knots)
+    samples = 40  # samples per knot interval where extremes are looked for
+    s = np.interp(np.linspace(0, spans, samples * spans + 1), np.arange(spans + 1), path.knots)
     s = np.concatenate([s, reversals(path, s)])
     q = path(s)
     peaks = np.array([q.argmin(axis=0), q.argmax(axis=0)])

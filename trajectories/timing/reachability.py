@@ -18,12 +18,6 @@ from trajectories.timing.limits import Law, TimingLimits
 from trajectories.timing.path import Path
 from trajectories.timing.profile import Profile
 
-INSIDE = 1e-6  # of an interval: rows of an end are taken just inside it
-CREEP = 1e-3  # [rad/s or m/s] of the fastest joint: a speed at which friction is Coulomb's alone
-AGREED = 0.1  # relative, of x in two rounds, from where on the tangent is taken
-STEP = 1e-3  # relative, of the difference that gives a tangent
-UNBOUNDED = 100.0  # [rad/s or m/s] of the fastest joint: a bound where no joint has a velocity limit
-
 
 @dataclass(frozen=True, eq=False)
 class _Bounded:
@@ -63,7 +57,8 @@ class ConstraintRows:
     @classmethod
     def of(cls, path: Path, s: np.ndarray, limits: TimingLimits, law: Law | None) -> ConstraintRows:
         steps = np.diff(s)
-        ends = np.concatenate([s[:-1] + INSIDE * steps, s[1:] - INSIDE * steps])
+        inset = 1e-6  # of an interval: rows of an end are taken just inside it
+        ends = np.concatenate([s[:-1] + inset * steps, s[1:] - inset * steps])
         shape = (2, len(steps), path.n)
         geometry = [path(ends, order) for order in range(3)]
         dynamics = [np.zeros_like(geometry[0])] * 3 if law is None else list(law.along(*geometry))
@@ -78,7 +73,8 @@ class ConstraintRows:
         """Return the largest x (K + 1,) that the velocity limits allow: min_j (v_max / Φ')²."""
         with np.errstate(divide="ignore"):
             ends = ((self.limits.velocity * tight / np.abs(self.slope)) ** 2).min(axis=2)
-        return np.minimum(np.minimum(np.append(ends[0], np.inf), np.append(np.inf, ends[1])), self.speed(UNBOUNDED))
+        max_speed = 100.0  # [rad/s or m/s] of the fastest joint: a bound where no joint has a velocity limit
+        return np.minimum(np.minimum(np.append(ends[0], np.inf), np.append(np.inf, ends[1])), self.speed(max_speed))
 
     def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> _Bounded:
         """Return the rows as shares of the limits.
@@ -110,15 +106,18 @@ class ConstraintRows:
         """
         if law is None:
             return np.zeros_like(self.q), np.zeros_like(self.q)
-        creep = np.full(2 * len(self.s) - 2, self.speed(CREEP))
+        creep_speed = 1e-3  # [rad/s or m/s] of the fastest joint: a speed at which friction is Coulomb's alone
+        creep = np.full(2 * len(self.s) - 2, self.speed(creep_speed))
         if x is None:
             value = self._rubbing(law, creep, 0.0)
             return np.zeros_like(self.q), value.reshape(self.q.shape)
         u = np.tile(np.diff(x) / (2 * np.diff(self.s)), 2)
-        near = np.zeros(len(x), dtype=bool) if before is None else np.abs(x - before) <= AGREED * x
+        max_change = 0.1  # relative, of x in two rounds, from where on the tangent is taken
+        near = np.zeros(len(x), dtype=bool) if before is None else np.abs(x - before) <= max_change * x
         tangent = np.concatenate([near[:-1], near[1:]])
         here = np.maximum(np.concatenate([x[:-1], x[1:]]), 2 * creep)
-        low, high = np.where(tangent, (1 - STEP) * here, creep), np.where(tangent, (1 + STEP) * here, here)
+        difference = 1e-3  # relative, of the difference that gives a tangent
+        low, high = np.where(tangent, (1 - difference) * here, creep), np.where(tangent, (1 + difference) * here, here)
         below, above = (self._rubbing(law, place, u) for place in (low, high))
         slope = (above - below) / (high - low)[:, None]
         return slope.reshape(self.q.shape), (below - slope * low[:, None]).reshape(self.q.shape)

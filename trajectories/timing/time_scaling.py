@@ -26,8 +26,6 @@ from trajectories.timing.profile import Profile, Sampled, dense, moved
 from trajectories.timing.reachability import ConstraintRows, fastest
 
 GRID, PER_SPAN, MOST = 400, 200, 2400  # intervals, in all and between two knots
-ROUNDS = 25
-SETTLED = 1e-4  # mean relative change of x at which friction counts as settled
 ACTIVE = 0.01  # of a limit: nearer than that it is active
 
 
@@ -95,21 +93,23 @@ def time_optimal(
     history: list[float] = []
     best = last = x = before = None
     excess: dict[str, np.ndarray] = {}
-    for _ in range(ROUNDS):
+    max_rounds = 25
+    max_change = 1e-4  # mean relative change of x at which friction counts as settled
+    for _ in range(max_rounds):
         profile = _round(rows, law, x, before, tight)
         rounded = profile if rate is None else profile.slower(_whole(profile.duration, rate))
         sampled = dense(path, rounded, None if law is None else law.torque)
         last = Timing(path, rounded, limits, sampled, 0, 0.0)
         excess = {name: _per_interval(values, len(s) - 1) - 1 for name, values in _shares(sampled, limits).items()}
         kept = all(values.max() <= 0 for values in excess.values())
-        settled = x is not None and np.abs(profile.x - x).mean() <= SETTLED * x.mean()
+        settled = x is not None and np.abs(profile.x - x).mean() <= max_change * x.mean()
         history.append(profile.duration)
         x, before = profile.x, x
         if kept and (best is None or rounded.duration < best.duration):
             best = last
         if settled and kept:
             break
-        if settled or len(history) > ROUNDS // 2:
+        if settled or len(history) > max_rounds // 2:
             for name, values in excess.items():
                 tight[name] = tight[name] * np.where(values > 0, 1 - 1.1 * np.clip(values, 1e-6, 0.2), 1.0)
     if best is None and last is not None:

@@ -52,7 +52,6 @@ from calib.data.schema import BOUNDS
 from calib.units import ANGLES, LENGTHS
 
 SUFFIXES = ("", "_target")
-MAX_OUTSIDE = 0.5  # of all rows outside the limits: it is the file, not the row (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +128,13 @@ def read_targets(
     )
 
 
-def _kept_by_most(q: np.ndarray, limits: Limits | None) -> Limits | None:
-    """Return `limits` where most rows of q (m, n) are outside: it is the file then, not the row."""
+def _kept_by_most(q: np.ndarray, limits: Limits | None, max_outside: float = 0.5) -> Limits | None:
+    """Return `limits` where most rows of q (m, n) are outside: it is the file then, not the row.
+
+    `max_outside`: of all rows outside the limits: it is the file, not the row (our choice).
+    """
     if limits is None:
         return None
     lower, upper = (np.asarray(side, dtype=float) for side in limits)
     outside = ((q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)).any(axis=1)
-    return limits if outside.mean() > MAX_OUTSIDE else None
+    return limits if outside.mean() > max_outside else None

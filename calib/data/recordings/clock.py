@@ -29,13 +29,7 @@ from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 
 CLOCKS = ("stamps", "even", "counted")
-GAIN = 0.8  # another clock than the stamps' must bring the roughness below this share
-WHOLE = 0.1  # rms distance of the counted steps from whole numbers
-JUDGED = 0.3  # share of the steps at a speed at which they can be counted
 APART = 0.01  # share by which the rates of stamps and velocities may differ
-DRIFT = 101  # samples over which a drift of the stamps is followed
-STAY = 15  # samples over which it is judged whether the stamps stay late
-LOOK = 20_000  # samples that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +71,22 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     steps = {name: _roughness(recording.q, *clock) for name, clock in clocks.items()}
     rough = {name: value / max(steps["stamps"], 1e-300) for name, value in steps.items()}
     best = min(rough, key=lambda name: rough[name])
-    chosen = kind if kind != "auto" else best if rough[best] < GAIN else "stamps"
+    max_roughness = 0.8  # another clock than the stamps' must bring the roughness below this share
+    chosen = kind if kind != "auto" else best if rough[best] < max_roughness else "stamps"
     t, keep, period = clocks[chosen]
     return Clock(chosen, frozen(t), frozen(keep, bool), period, times, rough)
 
 
-def _even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return even times (N,), all kept, and their step [s]: k T + drift, k counting lost samples; None if not even."""
+def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Return even times (N,), all kept, and their step [s]: k T + drift, k counting lost samples; None if not even.
+
+    `drift_samples`: samples over which a drift of the stamps is followed.
+    """
     step = _step(t)
     k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(_lost(t, step))])
     period, start = np.polyfit(k, t, 1)
     late = t - (start + period * k)
-    even = start + period * k + uniform_filter1d(late, DRIFT, mode="nearest")
+    even = start + period * k + uniform_filter1d(late, drift_samples, mode="nearest")
     if not (np.diff(even) > 0.5 * period).all():
         return None
     return even, np.ones(len(t), dtype=bool), float(period)
@@ -111,13 +109,15 @@ def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.nd
     elapsed = (dq * mean).sum(axis=1) / np.maximum(speed, 1e-300)  # [s], by the motion
     fast = speed > 0.05 * np.quantile(speed, 0.95)
     moved = fast & (elapsed > 0.2 * _step(recording.t))
-    if fast.mean() < JUDGED or not moved.any():
+    min_fast_share = 0.3  # share of the steps at a speed at which they can be counted
+    if fast.mean() < min_fast_share or not moved.any():
         return None
     count = np.round(elapsed / np.median(elapsed[moved]))
     period = float((elapsed * speed)[moved].sum() / (count * speed)[moved].sum())
     same = (dq == 0).all(axis=1) & (np.diff(recording.effort, axis=0) == 0).all(axis=1)
     off = np.sqrt(np.mean((elapsed[fast] / period - count[fast]) ** 2))
-    if off > WHOLE or (count[fast] < 0).any() or ((count == 0) & fast & dq.any(axis=1)).any():
+    max_rounding = 0.1  # rms distance of the counted steps from whole numbers
+    if off > max_rounding or (count[fast] < 0).any() or ((count == 0) & fast & dq.any(axis=1)).any():
         return None
     step = np.diff(recording.t)
     seen = fast & (step < 20 * np.median(step))
@@ -131,11 +131,14 @@ def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.nd
     return t + np.median(recording.t - t), np.concatenate([[True], count > 0]), period, times
 
 
-def _lost(t: np.ndarray, step: float) -> np.ndarray:
-    """Return (N - 1,) how many samples are missing in each step: whole steps by which the stamps stay late after it."""
+def _lost(t: np.ndarray, step: float, late_samples: int = 15) -> np.ndarray:
+    """Return (N - 1,) how many samples are missing in each step: whole steps by which the stamps stay late after it.
+
+    `late_samples`: samples over which it is judged whether the stamps stay late.
+    """
     lost, late = np.zeros(len(t) - 1), t - step * np.arange(len(t))
     for i in np.flatnonzero(np.diff(t) > 1.5 * step) + 1:
-        after, before = late[i : i + STAY], late[max(0, i - STAY) : i]
+        after, before = late[i : i + late_samples], late[max(0, i - late_samples) : i]
         lost[i - 1] = max(0.0, np.round((np.median(after) - np.median(before)) / step))
     return lost
 
@@ -151,9 +154,12 @@ def _step(t: np.ndarray) -> float:
     return float(single.mean()) if np.abs(single - median).max() < 1e-6 * median else median
 
 
-def _roughness(q: np.ndarray, t: np.ndarray, keep: np.ndarray, period: float) -> float:
-    """Return the median over the joints of the rms fourth difference of q on an even grid [rad or m]."""
-    t, q = t[keep][:LOOK], q[keep][:LOOK]
+def _roughness(q: np.ndarray, t: np.ndarray, keep: np.ndarray, period: float, max_samples: int = 20_000) -> float:
+    """Return the median over the joints of the rms fourth difference of q on an even grid [rad or m].
+
+    `max_samples`: samples that are compared.
+    """
+    t, q = t[keep][:max_samples], q[keep][:max_samples]
     grid = t[0] + period * np.arange(min(2 * len(t), int(np.ceil((t[-1] - t[0]) / period))))  # a gap may be of weeks
     fourth = np.diff(CubicSpline(t, q)(grid), 4, axis=0)
     near = np.searchsorted(t, grid[2:-2])  # a bridged gap says nothing

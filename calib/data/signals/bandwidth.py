@@ -21,14 +21,7 @@ from calib.errors import MeasurementError
 
 SHARE = 0.95  # of the acceleration power that is the motion
 LOWEST = 2.0  # [Hz]; friction turns faster than slow trajectories do
-WINDOW = 4.0  # length of the spectra's windows [s]
-ABOVE = 10.0  # a power that stands this far above the floor is seen
-RISE = 30.0  # a power that rises this far again above the motion is a resonance, not a gap between two lines
-ACTIVE = 0.05  # a joint of less than this share of the fastest one's speed says nothing
-HIGHEST = 20.0  # [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend
-SPREAD = 3.0  # a joint this many times above the median of all is taken to vibrate
 USABLE = 0.8  # of the Nyquist frequency
-NOISE = 0.05  # of the acceleration's rms: noise in it that is too much
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +67,8 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     longest = np.bincount(sampled.segment).argmax()
     start, stop = (int(i) for i in np.searchsorted(sampled.segment, [longest, longest + 1]))
     own = slice(start, stop)
-    size = min(stop - start, max(64, int(WINDOW * sampled.rate)))
+    window_length = 4.0  # length of the spectra's windows [s]
+    size = min(stop - start, max(64, int(window_length * sampled.rate)))
     f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
     _, effort = spectrum(sampled.series["effort"][own], sampled.rate, size)
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
@@ -136,7 +130,8 @@ def _position_cutoff(
     """
     band = f <= 2 * dynamics
     signal = (f[:, None] ** 4 * np.maximum(power - floor, 0))[band].sum(axis=0) * (f[1] - f[0])
-    quiet = (5 * NOISE**2 * signal / np.maximum(floor, 1e-300)) ** 0.2
+    max_noise = 0.05  # of the acceleration's rms: noise in it that is too much
+    quiet = (5 * max_noise**2 * signal / np.maximum(floor, 1e-300)) ** 0.2
     quiet = float(np.median(quiet[active])) if active.any() else np.inf
     most = USABLE * rate / 2
     if most <= min(5 * dynamics, quiet):
@@ -147,41 +142,55 @@ def _position_cutoff(
     return (lower, f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration")
 
 
-def _active(q: np.ndarray) -> np.ndarray:
-    """Return (n,) which joints move fast enough to tell of the bandwidth."""
+def _active(q: np.ndarray, min_speed_share: float = 0.05) -> np.ndarray:
+    """Return (n,) which joints move fast enough to tell of the bandwidth.
+
+    `min_speed_share`: a joint of less than this share of the fastest one's speed says nothing.
+    """
     speed = np.quantile(np.abs(np.diff(q, axis=0)), 0.95, axis=0)
-    return speed > ACTIVE * speed.max()
+    return speed > min_speed_share * speed.max()
 
 
-def _choose(per_joint: np.ndarray, stated: float | None) -> tuple[float, str]:
-    """Return f_dyn of the robot [Hz] and why."""
+def _choose(per_joint: np.ndarray, stated: float | None, max_cutoff: float = 20.0) -> tuple[float, str]:
+    """Return f_dyn of the robot [Hz] and why.
+
+    `max_cutoff`: [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend.
+    """
     if stated is not None:
         return stated, f"f_dyn = {stated:.3g} Hz as stated"
     fastest = int(np.argmax(per_joint))
     top, middle = float(per_joint[fastest]), float(np.median(per_joint[per_joint > 0])) if per_joint.any() else 0.0
-    found = min(top, SPREAD * middle)
+    max_spread = 3.0  # a joint this many times above the median of all is taken to vibrate
+    found = min(top, max_spread * middle)
     if found < LOWEST:
         where = f"ends at {found:.2g} Hz" if found else "hardly stands out of the noise"
         return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {where}, but friction turns faster"
-    if found > HIGHEST:
-        return HIGHEST, f"f_dyn = {HIGHEST:g} Hz: joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
+    if found > max_cutoff:
+        return (
+            max_cutoff,
+            f"f_dyn = {max_cutoff:g} Hz: joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid",
+        )
     if found < top:
         return (
             found,
-            f"f_dyn = {found:.3g} Hz, {SPREAD:g} times the median: joint {fastest + 1}'s {top:.3g} Hz stands apart",
+            f"f_dyn = {found:.3g} Hz, {max_spread:g} times the median: joint {fastest + 1}'s {top:.3g} Hz stands apart",
         )
     return found, f"f_dyn = {found:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
 
 
-def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float) -> tuple[float, float]:
-    """Return how far up one joint's motion reaches [Hz], and where a resonance above it stands (NaN: none)."""
+def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float, min_rise: float = 30.0) -> tuple[float, float]:
+    """Return how far up one joint's motion reaches [Hz], and where a resonance above it stands (NaN: none).
+
+    `min_rise`: a power that rises this far again above the motion is a resonance, not a gap between two lines.
+    """
     smooth = uniform_filter1d(power, 5, mode="nearest")
-    peak = int(np.argmax(f**2 * np.maximum(smooth - ABOVE * floor, 0)))
-    sunk = smooth[peak:] < ABOVE * floor
+    min_above_floor = 10.0  # a power that stands this far above the floor is seen
+    peak = int(np.argmax(f**2 * np.maximum(smooth - min_above_floor * floor, 0)))
+    sunk = smooth[peak:] < min_above_floor * floor
     top = peak + (int(np.argmax(sunk)) if sunk.any() else len(sunk) - 1)
     acceleration = f**4 * smooth
     lowest = np.minimum.accumulate(acceleration[peak : top + 1])
-    risen = acceleration[peak : top + 1] > RISE * lowest
+    risen = acceleration[peak : top + 1] > min_rise * lowest
     resonance = np.nan
     if risen.any():
         first = peak + int(np.argmax(risen))

@@ -22,7 +22,6 @@ from calib.errors import MeasurementError, require
 
 KINDS = ("chebyshev", "kaiser")
 SHARE = 0.8  # of the new Nyquist frequency that is kept
-RIPPLE = 0.05  # of one pass of the Chebyshev filter [dB]
 KAISER = 0.1102 * (60.0 - 8.7)  # beta of a window whose stop band is 60 dB down (Kaiser 1974)
 
 
@@ -181,10 +180,11 @@ def _kaiser(factor: int) -> np.ndarray:
     return np.sinc(place / factor) * window
 
 
-def _chebyshev(factor: int) -> np.ndarray:
+def _chebyshev(factor: int, ripple: float = 0.05) -> np.ndarray:
+    # ripple: of one pass of the Chebyshev filter [dB]
     from scipy.signal import cheby1, sosfreqz  # slow to load, and seldom needed
 
-    sos = cheby1(8, RIPPLE, SHARE / factor, output="sos")
+    sos = cheby1(8, ripple, SHARE / factor, output="sos")
     size = 1 << int(np.ceil(np.log2(400 * factor)))
     _, response = sosfreqz(sos, np.linspace(0, np.pi, size // 2 + 1))
     even = np.fft.irfft(np.abs(response) ** 2, size)

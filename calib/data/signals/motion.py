@@ -27,7 +27,6 @@ from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resamp
 from calib.errors import MeasurementError, UsageError
 
 SLOW = 0.01  # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
-LOUD = 0.1  # noise in the accelerations that velocities of the same cut-off can bear, of their rms (our choice)
 FASTER = 5.0  # f_v of f_q at most (our choice)
 CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
 
@@ -239,9 +238,11 @@ def moving(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
 
 
 def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: float) -> np.ndarray:
-    """Return (n,) f_v [Hz]: where noise would reach `LOUD` of each joint's accelerations (N, n), from f_q to 5 f_q."""
+    """Return (n,) f_v [Hz]: where noise reaches `max_noise` of a joint's accelerations (N, n); f_q to 5 f_q."""
     share = cutoffs.acceleration_noise(cutoff, rate) / np.maximum(np.sqrt(np.mean(a**2, axis=0)), 1e-12)
-    wider = (LOUD / np.maximum(share, 1e-12)) ** 0.4  # the noise grows with f_q^2.5
+    # noise in the accelerations that velocities of the same cut-off can bear, of their rms (our choice)
+    max_noise = 0.1
+    wider = (max_noise / np.maximum(share, 1e-12)) ** 0.4  # the noise grows with f_q^2.5
     return np.maximum(np.minimum(cutoff * np.clip(wider, 1.0, FASTER), 0.5 * USABLE * rate), cutoff)
 
 

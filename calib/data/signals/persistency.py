@@ -12,14 +12,9 @@ from calib.arrays import frozen
 from calib.data.signals.filtering import hann
 from calib.data.signals.motion import Motion
 
-LINE = 3e-3  # of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4
 SINE = 0.98  # of the variance: a joint that moves as one sine
-TOGETHER = 0.98  # correlation of two joints that move as one
-FUNCTION = 0.02  # of the largest singular value: a function of time that counts
 STILL = 1e-3  # a joint that goes less far has not moved [rad or m]
-NEAR = 0.05  # a state is met again if it differs by less than this share of the motion's spread, in the rms over all
 MOST = 20_000  # states of a motion that are compared
-LONG = 100_000  # samples beyond which positions are thinned to what their own low-pass filter left: four times f_q
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +55,17 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     """
     longest = int(np.bincount(motion.segment).argmax())
     start, stop = (int(i) for i in np.searchsorted(motion.segment, [longest, longest + 1]))
-    thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > LONG else 1
+    # samples beyond which positions are thinned to what their own low-pass filter left: four times f_q
+    max_samples = 100_000
+    thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > max_samples else 1
     q = motion.q[start:stop:thin] - motion.q[start:stop:thin].mean(axis=0)
     still = np.ptp(q, axis=0) < STILL
     found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate / thin) for j in range(motion.n)]
     unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
     correlation = unit.T @ unit
     singular = np.linalg.svd(unit[:: max(1, len(unit) // MOST)], compute_uv=False)
-    functions = int((singular > FUNCTION * singular[0]).sum())
+    min_share = 0.02  # of the largest singular value: a function of time that counts
+    functions = int((singular > min_share * singular[0]).sum())
     lines, strongest, share = (np.array(part) for part in zip(*found))
     notes = _notes(motion.joint_names, share, strongest, correlation, functions, still)
     seconds = float((~motion.standstill()).sum() / motion.rate)
@@ -99,17 +97,22 @@ def repeats(training: Motion, other: Motion) -> float:
     seen, new = (state / spread for state in states)
     if not len(seen) or not len(new):
         return 0.0
-    limit = NEAR * np.sqrt(seen.shape[1])
+    # a state is met again if it differs by less than this share of the motion's spread, in the rms over all
+    max_distance = 0.05
+    limit = max_distance * np.sqrt(seen.shape[1])
     distance, _ = KDTree(seen).query(new, distance_upper_bound=limit)
     return float(np.isfinite(distance).mean())
 
 
-def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
-    """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains."""
+def _lines(q: np.ndarray, rate: float, min_line_power: float = 3e-3) -> tuple[int, float, float]:
+    """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains.
+
+    `min_line_power`: of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4.
+    """
     window, size = hann(len(q)), int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
     best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, size))
-    return max(1, count_peaks(power, LINE * power.max())), frequency, best
+    return max(1, count_peaks(power, min_line_power * power.max())), frequency, best
 
 
 def count_peaks(power: np.ndarray, least: float) -> int:
@@ -157,10 +160,11 @@ def _notes(
         low, high = strongest[moving].min(), strongest[moving].max()
         hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
         notes.append(f"each joint moves at one frequency ({hertz}): inertia and gravity or stiffness look alike")
-    pairs = [(i, j) for i in moving for j in moving if i < j and abs(correlation[i, j]) > TOGETHER]
+    min_correlation = 0.98  # correlation of two joints that move as one
+    pairs = [(i, j) for i in moving for j in moving if i < j and abs(correlation[i, j]) > min_correlation]
     if pairs:
         told = ", ".join(f"{names[i]}–{names[j]}" for i, j in pairs[:6]) + (" …" if len(pairs) > 6 else "")
-        notes.append(f"joints that move as one (correlation above {TOGETHER:g}): {told}")
+        notes.append(f"joints that move as one (correlation above {min_correlation:g}): {told}")
     if len(moving) > 1 and functions < len(moving):
         notes.append(f"all {len(moving)} moving joints follow {functions} functions of time")
     return tuple(notes)

@@ -14,7 +14,6 @@ from calib.data.recordings.recording import SERIES, Recording, settled
 from calib.errors import MeasurementError
 
 GAP = 0.05  # the longest time without a sample that is bridged [s]; our choice
-SHORTEST = 50  # samples of a segment that is kept
 
 
 @dataclass(frozen=True)
@@ -100,9 +99,10 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     long = step > max(gap, 5 * found.period)
     edges = np.concatenate([[0], np.flatnonzero(long) + 1, [len(t)]])
     spans = list(pairwise(edges))
-    used = [(a, b) for a, b in spans if b - a > SHORTEST and (t[b - 1] - t[a]) / period > SHORTEST]
+    min_samples = 50  # samples of a segment that is kept
+    used = [(a, b) for a, b in spans if b - a > min_samples and (t[b - 1] - t[a]) / period > min_samples]
     if not used:
-        message = f"falls into {len(spans)} parts by gaps in time, none longer than {SHORTEST} samples"
+        message = f"falls into {len(spans)} parts by gaps in time, none longer than {min_samples} samples"
         raise MeasurementError(message, recording.file)
     grids = [t[a] + period * np.arange(int((t[b - 1] - t[a]) / period + 1e-6) + 1) for a, b in used]
     weight = [_weight(t[a:b], grid, found.period) for (a, b), grid in zip(used, grids)]

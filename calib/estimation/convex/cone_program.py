@@ -12,7 +12,6 @@ from calib.arrays import shaped
 from calib.errors import NotConverged
 from calib.estimation.triangles import require_rank
 
-SLACK = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
 ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
 
 
@@ -40,7 +39,8 @@ class Definite:
 
     def satisfied(self, sizes: np.ndarray) -> bool:
         """Say whether smallest eigenvalues (K,), as above `least`, are those of definite matrices."""
-        return bool((sizes >= -SLACK * self.least).all())
+        max_violation = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
+        return bool((sizes >= -max_violation * self.least).all())
 
 
 @dataclass(frozen=True, eq=False)

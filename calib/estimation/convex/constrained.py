@@ -23,12 +23,6 @@ from calib.errors import CalibError, require
 from calib.estimation.convex.cone_program import Definite, minimise, scale
 from calib.estimation.convex.constraint_relations import from_free
 
-ENTER = 8  # matrices that enter at once, the most indefinite (our choice)
-MAX_DROPS = 30  # rounds in which what does not bind may go: rounding could let it come back
-BINDS = 1e-6  # of the scaled problem, multipliers of matrices above which bind
-MAX_MOVE = 1e-3  # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
-CONTRADICT = 1e-8  # of an equality, by which the best point may miss it
-
 
 @dataclass(frozen=True, eq=False)
 class Constrained:
@@ -100,8 +94,11 @@ class _Planes:
         self.free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
         self._require_solvable()
 
-    def _require_solvable(self) -> None:
-        """Refuse equalities that contradict each other or leave nothing."""
+    def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
+        """Refuse equalities that contradict each other or leave nothing.
+
+        `max_contradiction`: of an equality, by which the best point may miss it.
+        """
         if not len(self.equal):
             return
         scaled, wanted = self.fixed.rows, -self.fixed.offset
@@ -109,7 +106,7 @@ class _Planes:
         require(acts.all(), f"equality {int(np.argmin(acts)) + 1} acts on no parameter")
         origin, _, rank, _ = np.linalg.lstsq(scaled, wanted, rcond=1e-10)
         away = np.abs(scaled @ origin - wanted) / np.maximum(np.abs(wanted), max(float(np.abs(origin).max()), 1e-300))
-        require(away.max() <= CONTRADICT, "equalities contradict each other: no point satisfies all of them")
+        require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
         require(rank < len(self.free), f"equalities fix all {rank} parameters: they leave nothing to estimate")
 
     def optimum(self, active: np.ndarray) -> Constrained:
@@ -139,7 +136,8 @@ class _Planes:
         found = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
         exact = self.optimum(found.binding[:c])
         away = np.linalg.norm(self.problem.upper @ ((exact.values - found.values) / self.problem.unit))
-        good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= MAX_MOVE
+        max_move = 1e-3  # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
+        good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= max_move
         return exact if good else found
 
     def definite(self, matrices: Definite) -> Constrained:
@@ -151,21 +149,24 @@ class _Planes:
         problem, fixed = self.problem, self.fixed
         small = Definite(matrices.matrices * problem.unit, matrices.least)
         used = np.zeros(0, dtype=int) if matrices.likely is None else matrices.likely
+        min_multiplier = 1e-6  # of the scaled problem, multipliers of matrices above which bind
+        max_entering = 8  # matrices that enter at once, the most indefinite (our choice)
+        max_drops = 30  # rounds in which what does not bind may go: rounding could let it come back
         for rounds in count():
             if not len(used):
-                used = np.argsort(small.least_eigenvalues(self.free / problem.unit)[0])[:ENTER]
+                used = np.argsort(small.least_eigenvalues(self.free / problem.unit)[0])[:max_entering]
             goal = problem.upper, problem.target, problem.rows, problem.offset
             solved = minimise(*goal, small.matrices[used], small.least, fixed.rows, -fixed.offset)
             b, mu, pushes, rates = solved.values, solved.rows, solved.matrices, solved.equalities
             sizes, normals = small.least_eigenvalues(b)
             traces = np.einsum("kii->k", pushes)
-            bind = traces > BINDS
+            bind = traces > min_multiplier
             left = sizes.copy()
             left[used] = 0.0
             if small.satisfied(left):
                 break
-            worst = np.argsort(left)[:ENTER]
-            used = np.union1d(used[bind] if rounds < MAX_DROPS else used, worst[left[worst] < 0.0])
+            worst = np.argsort(left)[:max_entering]
+            used = np.union1d(used[bind] if rounds < max_drops else used, worst[left[worst] < 0.0])
         held_by = np.einsum("kij,kijp->kp", pushes[bind], small.matrices[used[bind]])
         normals[used[bind]] = held_by / traces[bind, None]
         force = np.zeros(len(small.matrices))

@@ -19,11 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.transforms import invert, orthonormal, pose
 
-ROUNDS = 3  # of leaving the worst images out (our choice, as the next one)
-KEPT = 0.7
 LEVER = 0.3  # what a turn counts as [m/rad] (our choice, as the next two)
-UNTURNED = 0.01  # rms turn [rad] below which it tells no offset of the target
-WAYS = 5  # rounds of rotation and offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +55,11 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
         "Shah": _by_orientations, "Li": _li, "Park-Martin": _park_martin,
     }  # fmt: skip
     best: Placement | None = None
+    kept_share = 0.7
+    rounds = 3  # of leaving the worst images out (our choice)
     for name, method in methods.items():
         keep = np.ones(len(arm), dtype=bool)
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             try:
                 station, tool = method(arm[keep], seen[keep])
             except np.linalg.LinAlgError:
@@ -69,7 +67,7 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
             found = Placement(name, station, tool, misfit(arm, seen, station, tool, lever))
             if best is None or found.error < best.error:
                 best = found
-            keep = found.misfit <= np.quantile(found.misfit, KEPT)
+            keep = found.misfit <= np.quantile(found.misfit, kept_share)
             if keep.sum() < 5:
                 break
     if best is None:
@@ -152,16 +150,18 @@ def _by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.
     return pose(station_rotation, station), pose(tool_rotation, offset)
 
 
-def _by_ways(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _by_ways(arm: np.ndarray, seen: np.ndarray, rounds: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X from what turns and ways from the mean have in common: good for a line driven in one orientation.
 
     log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned alike, and
     y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, turns at a lever of `LEVER`, and t by its linear
     solution, in turns.
+
+    `rounds`: rounds of rotation and offset.
     """
     (a, turns), (b, seen_turns) = (chordal_turns(poses[:, :3, :3]) for poses in (arm, seen))
     station, offset, rotation = np.zeros(3), np.zeros(3), np.eye(3)
-    for _ in range(WAYS):
+    for _ in range(rounds):
         ways = arm[:, :3, 3] + arm[:, :3, :3] @ offset
         one = np.concatenate([ways - ways.mean(axis=0), LEVER * turns])
         two = np.concatenate([seen[:, :3, 3] - seen[:, :3, 3].mean(axis=0), LEVER * seen_turns])
@@ -181,6 +181,7 @@ def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -
     turned, target = rotation @ arm[:, :3, :3], position - arm[:, :3, 3] @ rotation.T
     away = turned - turned.mean(axis=0)
     u, size, vt = np.linalg.svd(away.reshape(-1, 3), full_matrices=False)
-    told = size > UNTURNED * np.sqrt(len(arm))
+    min_turn = 0.01  # rms turn [rad] below which it tells no offset of the target
+    told = size > min_turn * np.sqrt(len(arm))
     offset = vt[told].T @ ((u[:, told].T @ (target - target.mean(axis=0)).reshape(-1)) / size[told])
     return (target - turned @ offset).mean(axis=0), offset

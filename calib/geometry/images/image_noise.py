@@ -18,8 +18,6 @@ import numpy as np
 from calib.arrays import frozen
 from calib.estimation import robust
 
-CLIP = 25.0  # squared residuals beyond so many times their median are taken for it (our choice)
-STEPS = 20
 ALIKE, LEAST = 0.05, 2e-6  # change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
 
 
@@ -91,7 +89,8 @@ def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: fl
     covariance = factor**2 * np.linalg.pinv(found.information, hermitian=True)
     own = np.einsum("kii->ki", covariance)
     square = found.residual**2
-    square = np.minimum(square, CLIP * np.median(square, axis=0)) / share
+    max_ratio = 25.0  # squared residuals beyond so many times their median are taken for it (our choice)
+    square = np.minimum(square, max_ratio * np.median(square, axis=0)) / share
     spread = [_component(square[:, axes], own[:, axes]) for axes in (slice(0, 3), slice(3, 6))]
     total = covariance + np.diag(np.repeat(np.square(spread), 3))
     size = np.sqrt(
@@ -100,10 +99,10 @@ def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: fl
     return ImageNoise(factor, *spread, weight=robust.weights(size, loss, scale))
 
 
-def _component(square: np.ndarray, known: np.ndarray) -> float:
+def _component(square: np.ndarray, known: np.ndarray, max_steps: int = 20) -> float:
     """Return s with E[t²] = s² + known, by the maximum-likelihood score Σ (t² - s² - c) / (s² + c)² = 0."""
     value = max(float(np.mean(square - known)), 1e-3 * float(np.median(square)))
-    for _ in range(STEPS):
+    for _ in range(max_steps):
         weight = 1.0 / (value + known) ** 2
         value = max(float(np.sum(weight * (square - known)) / np.sum(weight)), 0.0)
         if value == 0.0:

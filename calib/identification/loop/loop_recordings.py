@@ -1,7 +1,8 @@
 """Recordings in the loop they came from: reference and controller of every stretch, ready to be simulated.
 
 A stretch is a part of a recording without gaps. The simulation runs along the whole of it and is compared some way
-inside: the filters' ends (2 / f_q), and `SETTLE` for the simulated robot to forget that it started on the reference.
+inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot to forget that it started on the
+reference.
 """
 
 from __future__ import annotations
@@ -28,11 +29,6 @@ from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward
 
-LEAST_RATE = 1000.0  # of a controller whose rate is not stated [Hz] (our choice)
-SETTLE = 0.2  # [s] our choice
-SMOOTH = 4.0  # times f_q: low-pass of the logged reference, against the rounding of its digits (our choice)
-WHOLE = 0.001  # of a control rate that is near a multiple of the log's, by which it is that: clocks are not exact
-FAR = 0.3  # of a joint's motion: a reference that is further off is another one (our choice)
 DEGREES = 180.0 / np.pi
 
 
@@ -134,12 +130,15 @@ def _check_reference(motion: Motion) -> None:
         _compare(motion, motion.q_ref[:, j], int(j))
 
 
-def _compare(motion: Motion, asked: np.ndarray, joint: int) -> None:
-    """Refuse a reference `asked` (N,) that one joint does not follow; say where it looks like another unit."""
+def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
+    """Refuse a reference `asked` (N,) that one joint does not follow; say where it looks like another unit.
+
+    `max_difference`: of a joint's motion: a reference that is further off is another one (our choice).
+    """
     q = motion.q[:, joint]
     spread, size = np.std(q), np.std(asked)
     away = float(np.sqrt(np.mean((q - asked) ** 2)) / spread)
-    if away < FAR:
+    if away < max_difference:
         return
     name = f"{motion.joint_names[joint]} (joint {joint + 1})"
     alike = abs(float(np.corrcoef(q, asked)[0, 1])) > 0.95 if size > 0.0 else False
@@ -157,16 +156,18 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int) -> None:
     )
 
 
-def _make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference, float]:
+def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: float = 4.0) -> tuple[Reference, float]:
     """Return the reference of a motion without gaps at the control rate, and control periods per sample.
 
-    The logged positions are low-passed at `SMOOTH` f_q and joined by a cubic spline, whose slopes are v and a.
+    The logged positions are low-passed at `cutoff_factor` f_q and joined by a cubic spline, whose slopes are v and a.
 
     Raises:
         UsageError: where the control rate is below the motion's.
+
+    `cutoff_factor`: times f_q: low-pass of the logged reference, against the rounding of its digits (our choice).
     """
     every = periods_per_sample(motion, rate)
-    cutoff = min(SMOOTH * float(motion.cutoff.max()), USABLE * motion.rate / 2)
+    cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
     place = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
@@ -180,26 +181,32 @@ def _differenced(reference: Reference) -> Reference:
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
-    """Return how many control periods a sample lasts, whole or not; without a rate, as few as make `LEAST_RATE`.
+    """Return how many control periods a sample lasts, whole or not; without a rate, as few as make `min_rate`.
 
     Raises:
         UsageError: where the control rate is below the motion's.
     """
+    min_rate = 1000.0  # of a controller whose rate is not stated [Hz] (our choice)
     if rate is None:
-        return max(1, int(np.ceil(LEAST_RATE / motion.rate - 1e-6)))
+        return max(1, int(np.ceil(min_rate / motion.rate - 1e-6)))
     every = round(rate / motion.rate)
-    if rate < (1.0 - WHOLE) * motion.rate:
+    # of a control rate that is near a multiple of the log's, by which it is that: clocks are not exact
+    max_rounding = 0.001
+    if rate < (1.0 - max_rounding) * motion.rate:
         raise UsageError(
             f"[loop] rate: {rate:g} Hz is below {motion.rate:.6g} Hz, the rate of {motion.file}: a controller that is "
             "slower than its log? Is it in Hz?"
         )
-    return every if abs(rate / motion.rate - every) <= WHOLE * every else rate / motion.rate
+    return every if abs(rate / motion.rate - every) <= max_rounding * every else rate / motion.rate
 
 
-def _inside(motion: Motion) -> slice:
-    """Return the samples of a stretch that are compared."""
+def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
+    """Return the samples of a stretch that are compared.
+
+    `settling_time`: [s] our choice.
+    """
     edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
-    return slice(max(edge, int(np.ceil(SETTLE * motion.rate))), len(motion) - edge)
+    return slice(max(edge, int(np.ceil(settling_time * motion.rate))), len(motion) - edge)
 
 
 def _controller(

@@ -9,7 +9,6 @@ from calib.errors import RobotError
 from calib.robot.formats.urdf_tree import read
 from calib.robot.formats.yaml_block import block
 
-SAME = 1e-9  # of a rotation matrix, to be one
 HEAD = "# For <calibration_config filename=.../> in the SRDF of the nominal robot; m, unit quaternions.\n"
 
 
@@ -25,11 +24,12 @@ def joint_origins(source: str, edited: str, where: str) -> str:
     """
     before, after = read(source, where), read(edited, where)
     moved = {}
+    max_difference = 1e-9  # of a rotation matrix, to be one
     for name, joint in after.joints.items():
         if np.array_equal(joint.origin, before.joints[name].origin):
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
-        if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > SAME:
+        if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
             raise RobotError(f"{where}: the origin of joint '{name}' is no rotation")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),

@@ -32,9 +32,7 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward
 from calib.transforms import invert, pose, to_xyz_rpy
 
-SAME_ROBOT = 1e-6
 UNCHANGED = 1e-12
-WRITTEN = 1e-9
 
 
 def edit_file(source: str | Path, target: str | Path, nominal: Chain, calibrated: Chain) -> Path:
@@ -73,7 +71,8 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     result = edited(source, changes)
     written = read_tree(result, where)
     error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
-    if error > WRITTEN:
+    max_difference = 1e-9
+    if error > max_difference:
         raise RobotError(
             f"{where}: the edited text does not read back as the calibrated robot (difference {error:.2g})"
         )
@@ -217,8 +216,9 @@ def _base_offset(
         spread = np.abs(seen - seen[:, :1]).max(axis=(1, 2, 3))
         if spread.max() < worst.max():
             worst, best = spread, offset
-    if worst.max() > SAME_ROBOT:
-        k = int(np.argmax(worst > SAME_ROBOT))
+    max_offset = 1e-6
+    if worst.max() > max_offset:
+        k = int(np.argmax(worst > max_offset))
         joint = [joint for joint in path if joint.moves][k]
         raise RobotError(
             f"{tree.where}, line {joint.node.line}: this URDF does not describe the nominal robot '{nominal.name}': at "

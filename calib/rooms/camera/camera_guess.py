@@ -24,17 +24,7 @@ from calib.rooms.camera.board_pose import board_poses
 from calib.transforms import invert, pose, to_quaternion
 from calib.words import counted, listing
 
-ROUNDS = 4  # of leaving corners out
-MEDIAN = 1.1774  # of the length of a vector of two standard normals
-FEWEST = 3  # images that place a camera at all
-ENOUGH = 100  # images that it is placed by (our choice, as the next ones)
-UNLIKE = 3.0  # a mounting is found where the other one's misfit is so many times as large
-PAIRED = 0.25  # of the misfit is left with the rows shifted: they were
-SQUARE = 0.04  # relative error of the board's scale that is refused
 ODD = 8.0  # robust deviations from which on a corner does not fit into its image, and is left out
-AT_ONCE = 500  # images whose corners are looked at together
-NAMED = 3
-FEW = 0.3  # share of images that may contradict the others, and are left out; more are refused
 LOST = 0.2  # median misfit over the distance to the board beyond which nothing is placed
 
 
@@ -98,24 +88,30 @@ def _lens_of(block: Pixels) -> Lens:
     return block.lens
 
 
-def _own_poses(block: Pixels, rows: np.ndarray) -> np.ndarray:
-    """Return the board's poses (k, 4, 4) in the camera at some rows, by each image alone."""
-    own, lens = np.array_split(rows, len(rows) // AT_ONCE + 1), _lens_of(block)
+def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.ndarray:
+    """Return the board's poses (k, 4, 4) in the camera at some rows, by each image alone.
+
+    `max_at_once`: images whose corners are looked at together.
+    """
+    own, lens = np.array_split(rows, len(rows) // max_at_once + 1), _lens_of(block)
     return np.concatenate([board_poses(lens, block.board, block.pixel[each]).poses for each in own])
 
 
-def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
+def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: float = 1.1774) -> Pixels:
     """Return the block without corners that lie far off all others of their image, which its notes name.
 
     A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
+
+    `median_length`: of the length of a vector of two standard normals.
     """
     lens, table, before = _lens_of(block), corners(block.board), block.seen
     off, stale = np.full(before.shape, np.nan), np.arange(len(block))
-    for _ in range(ROUNDS):
+    max_rounds = 4  # of leaving corners out
+    for _ in range(max_rounds):
         point = np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
         flat = lens.project(point.reshape(-1, 3)).reshape(*point.shape[:2], 2)
         off[stale] = np.linalg.norm(block.pixel[stale] - flat, axis=2)
-        gross = off > ODD * np.nanmedian(off) / MEDIAN
+        gross = off > ODD * np.nanmedian(off) / median_length
         gross &= off >= 0.5 * np.nanmax(off, axis=1, keepdims=True, initial=0.0)
         if not gross.any():
             break
@@ -125,7 +121,8 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
     gone = np.argwhere(before & ~block.seen)
     if not len(gone):
         return block
-    named = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), NAMED)
+    max_named = 3
+    named = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), max_named)
     words = f"{len(gone)} of {before.sum()} corners do not fit into their image and are left out: {named}"
     return replace(block, notes=(*block.notes, words))
 
@@ -154,7 +151,8 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
     )
     words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from where all others do: {cause}"
     words += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
-    if len(strange) > FEW * len(block):
+    max_strange = 0.3  # share of images that may contradict the others, and are left out; more are refused
+    if len(strange) > max_strange * len(block):
         raise MeasurementError(f"{len(strange)} of {len(block)} images {words}", block.file)
     return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} left out, they {words}"
 
@@ -183,13 +181,15 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
     Raises:
         MeasurementError: where images and joints do not belong together.
     """
-    rows = np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int))
+    max_images = 100  # images that it is placed by (our choice)
+    rows = np.unique(np.linspace(0, len(block) - 1, max_images).astype(int))
     found = board_poses(_lens_of(block), block.board, block.pixel[rows])
     good = np.flatnonzero(np.isfinite(found.rms))
-    if len(good) < FEWEST:
+    min_images = 3  # images that place a camera at all
+    if len(good) < min_images:
         raise MeasurementError(
-            f"{len(good)} images with a board place no camera: {FEWEST} at least, from different sides; a calibration "
-            "takes some 20 to 40",
+            f"{len(good)} images with a board place no camera: {min_images} at least, from different sides; a "
+            "calibration takes some 20 to 40",
             block.file,
         )
     rows, poses = rows[good], found.poses[good]
@@ -198,9 +198,10 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
     tried = {each: place_robustly(arm[rows], seen_target(each, poses), lever) for each in choices}
     mounting = min(tried, key=lambda each: tried[each].error)
     _check_pairing(block, arm[rows], poses, choices, tried[mounting], lever)
+    min_contrast = 3.0  # a mounting is found where the other one's misfit is so many times as large
     if len(tried) == 2:
         one, other = sorted(each.error for each in tried.values())
-        if other < UNLIKE * one:
+        if other < min_contrast * one:
             raise MeasurementError(
                 f"whether the arm carries the camera or the board cannot be told ({1e3 * one:.1f} against "
                 f"{1e3 * other:.1f} mm): say so in the options, [camera] mounting = 'in hand' or 'to hand'",
@@ -215,11 +216,12 @@ def _check_pairing(
     """Refuse images that belong to other rows of joints, or to none."""
     if placed.error <= 0.01 * lever or len(arm) < 6:
         return
+    max_left = 0.25  # of the misfit is left with the rows shifted: they were
     for shift, mounting in product((-1, 1, -2, 2), mountings):
         seen = seen_target(mounting, poses)
         own = slice(max(shift, 0), len(arm) + min(shift, 0)), slice(max(-shift, 0), len(arm) + min(-shift, 0))
         again = place_robustly(arm[own[0]], seen[own[1]], lever)
-        if again.error < PAIRED * placed.error:
+        if again.error < max_left * placed.error:
             rows = counted(abs(shift), "row")
             raise MeasurementError(
                 f"images and joint values are shifted by {rows}: as they stand the board is off by "
@@ -237,10 +239,12 @@ def _check_pairing(
         )
 
 
-def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement) -> None:
+def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_scale_error: float = 0.04) -> None:
     """Refuse a board of another size than stated: the arm's motion tells the size of a square to a few per cent.
 
     Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
+
+    `max_scale_error`: relative error of the board's scale that is refused.
     """
     placed, count = found.placed, len(arm)
     turn, seen = placed.station[:3, :3], seen_target(found.mounting, found.poses)
@@ -258,7 +262,7 @@ def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement) -> Non
     noise = float(np.linalg.norm(matrix @ solution - wanted)) / np.sqrt(spare)
     sigma = noise * float(np.sqrt(np.linalg.pinv(matrix.T @ matrix)[0, 0]))
     factor = float(solution[0])
-    if rank == 7 and abs(factor - 1.0) > max(SQUARE, 6.0 * sigma) and sigma < 0.1:
+    if rank == 7 and abs(factor - 1.0) > max(max_scale_error, 6.0 * sigma) and sigma < 0.1:
         stated = 1e3 * block.board.square
         raise MeasurementError(
             f"the robot's motion says that a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}), "

@@ -13,13 +13,12 @@ from calib.simulation.loop.closed_loop import Plant, Sensing, sample_ticks, simu
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
-BLOCK = 4096  # instants at a time
-
 
 def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     """Return the torques (N, n) that the believed robot needs along the reference, drives included [N m or N]."""
     model = IdentificationModel(believed.bodies, believed.terms)
-    parts = [slice(k, k + BLOCK) for k in range(0, len(reference.t), BLOCK)]
+    block = 4096  # instants at a time
+    parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
     regressors = (model.regressor(reference.q[part], reference.v[part], reference.a[part]) for part in parts)
     return np.concatenate([regressor @ believed.parameters for regressor in regressors])
 
