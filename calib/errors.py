@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     import numpy as np
@@ -140,6 +140,11 @@ def require(holds: object, message: str, kind: type[Exception] = CalibError, *de
         raise kind(message, *details)
 
 
+def refuse_robot(place: object, words: str) -> NoReturn:
+    """Refuse a robot's description for what stands at a place of it: a file, a line, a joint, a row."""
+    raise RobotError(f"{place}: {words}")
+
+
 def one_of(word: Any, words: Collection[str], what: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
     """Return `word`; one that is none of `words` raises ``what 'word' is none of ... (did you mean ...?)``."""
     if word not in words:
@@ -158,7 +163,7 @@ def refused_as(
     try:
         yield
     except kinds as error:
-        if isinstance(error, CalibError):
+        if kinds is Exception and isinstance(error, CalibError):  # said by ourselves
             raise
         said = getattr(error, "strerror", None) or error
         raise kind(words.replace("{}", str(said)), *details) from error

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import RobotError, require
+from calib.errors import RobotError, refused_as, require
 from calib.records import plain_text
 
 ESTIMATE, COVARIANCE = "estimate.csv", "covariance.csv"
@@ -51,13 +51,15 @@ def read_estimate(folder: Path) -> StoredEstimate:
         RobotError: where it is missing or damaged.
     """
     path = folder / ESTIMATE
-    try:
+    with refused_as(
+        RobotError,
+        (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError),
+        f"{path} cannot be read ({{}}); {AGAIN}",
+    ):
         with path.open(encoding="utf-8", newline="") as file:
             rows = tuple(csv.DictReader(file))
         values, sigma = (np.array([float(row.get(key) or "nan") for row in rows]) for key in ("value", "sigma"))
         names, units = (tuple(plain_text(row[key]) for row in rows) for key in ("name", "unit"))
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise RobotError(f"{path} cannot be read ({error}); {AGAIN}") from error
     return StoredEstimate(names, units, values, sigma, rows)
 
 
@@ -76,12 +78,10 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
         RobotError: where it is missing or damaged.
     """
     path = path / COVARIANCE if path.is_dir() else path
-    try:
+    with refused_as(RobotError, (OSError, UnicodeDecodeError, ValueError), f"{path} cannot be read ({{}}); {AGAIN}"):
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = list(csv.reader(file)) or [[]]
         matrix = np.array([row[1:] for row in rows], dtype=float)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise RobotError(f"{path} cannot be read ({error}); {AGAIN}") from error
     names = tuple(map(plain_text, header[1:]))
     if tuple(plain_text(row[0]) for row in rows if row) != names or matrix.shape != (len(names), len(names)):
         raise RobotError(f"{path}: rows and columns do not name the same parameters; {AGAIN}")

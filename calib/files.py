@@ -20,7 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.errors import CalibError, UsageError, require
+from calib.errors import CalibError, UsageError, refused_as, require
 from calib.records import plain, shielded
 
 if TYPE_CHECKING:  # the commands' help is written without loading it
@@ -44,10 +44,8 @@ def together() -> Iterator[None]:
         yield
         while staged:
             temporary, path = staged[0]
-            try:
+            with refused_as(CalibError, OSError, f"cannot write {path}: {{}}"):
                 os.replace(temporary, path)
-            except OSError as error:
-                raise CalibError(f"cannot write {path}: {error.strerror or error}") from error
             del staged[0]
     finally:
         _staged.reset(token)

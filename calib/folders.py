@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from calib import files
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, refused_as
 
 METRICS, SESSION = "metrics.json", "session.toml"
 """By which results and sessions are known; the metrics are written last: they say that the rest is there."""
@@ -94,10 +94,8 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
 def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
     """Replace the files of an earlier run one by one, the metrics last, since they say that the rest is there."""
     fresh = sorted(path.name for path in staging.iterdir())
-    try:
+    with refused_as(UsageError, OSError, f"cannot write to {out}: {{}}"):
         for name in sorted(fresh, key=lambda name: name == METRICS):
             os.replace(staging / name, out / name)
         for name in set(files_of(out, ours)) - set(fresh):
             (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error

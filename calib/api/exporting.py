@@ -9,7 +9,7 @@ from calib.api.dynamic import DynamicsModel
 from calib.api.given import optional, saved
 from calib.api.kinematic import GeometryFit
 from calib.arguments import checked
-from calib.errors import CalibWarning, RobotError, UsageError
+from calib.errors import CalibWarning, RobotError, UsageError, refused_as
 from calib.procedure.export import delivery, dynamics, geometry
 from calib.procedure.export.identified import is_identified
 from calib.procedure.robot_kinds import MechanismResult, stage_of
@@ -61,7 +61,7 @@ def export(
 def _source_of(place: Path) -> Path:
     """Return the description that a fit's folder says it was made from."""
     source = geometry.read(place).source
-    try:
+    with refused_as(
+        UsageError, RobotError, f"{place} was fitted from {source}, which is not there: name its URDF (urdf)"
+    ):
         return resolve(source)
-    except RobotError as error:
-        raise UsageError(f"{place} was fitted from {source}, which is not there: name its URDF (urdf)") from error

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib.procedure.report.page import Page, Section
 
+from calib.errors import refused_as
+
 WIDTH = 120
 
 
@@ -59,8 +61,6 @@ def data_frame(rows: Iterable[Any], columns: list[str]) -> Any:
     """
     from calib.errors import UsageError
 
-    try:
+    with refused_as(UsageError, ImportError, "to_dataframe needs pandas: pip install pandas; to_dict does without"):
         from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise UsageError("to_dataframe needs pandas: pip install pandas; to_dict does without") from error
     return DataFrame(list(rows), columns=columns)

@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from calib.data.camera.lens import Lens
-from calib.errors import CalibError, RobotError
+from calib.errors import CalibError, RobotError, refused_as
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
 from calib.records import read_record
@@ -131,10 +131,8 @@ def _file(path: str | Path) -> Path:
 
 def _typed(kind: type[T], content: Any, where: str) -> T:
     """Return the tables as a value of `kind`; complains as `RobotError`."""
-    try:
+    with refused_as(RobotError, ValueError, f"{where}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
         return read_record(kind, content)
-    except ValueError as error:
-        raise RobotError(f"{where}: {error}; expected [[...]] tables, each with a name, xyz and rpy") from None
 
 
 def _placed(chain: Chain, found: _Frames, where: str) -> Installation:
@@ -146,10 +144,8 @@ def _placed(chain: Chain, found: _Frames, where: str) -> Installation:
     if tools:
         given |= {"tool_names": tuple(tools), "tools": np.array(list(tools.values()))}
     if found.camera:
-        try:
+        with refused_as(RobotError, CalibError, f"{where}: {{}}"):
             lenses = tuple(Lens(each.model, np.array(each.values), each.size) for each in found.camera)
-        except CalibError as error:
-            raise RobotError(f"{where}: {error}") from None
         shapes = tuple(BoardShape(*list(asdict(each).values())[1:]) for each in found.board)
         names = tuple(each.name for each in found.camera), tuple(each.name for each in found.board)
         given["optics"] = Optics(lenses, names[0], shapes, names[1])

@@ -111,7 +111,7 @@ from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import ROWS, TorqueRows
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, refused_as
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import LoopSettings, check_loop
 from calib.identification.methods.registry import METHODS
@@ -291,8 +291,6 @@ def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOpti
 def _terms(tables: tuple[TermTable, ...], source: str) -> tuple[DriveTerm, ...]:
     result = []
     for number, one in enumerate(tables, 1):
-        try:
+        with refused_as(UsageError, CalibError, f"{source}: [[term]] number {number}: {{}}"):
             result.append(term(one.name, one.shape, one.joint, *one.settings, side=one.side))
-        except CalibError as error:
-            raise UsageError(f"{source}: [[term]] number {number}: {error}") from error
     return tuple(result)

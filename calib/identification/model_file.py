@@ -50,7 +50,7 @@ from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import RobotError, UsageError
+from calib.errors import RobotError, UsageError, refused_as
 from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.calibrated import ROBOT
@@ -82,12 +82,12 @@ def read_table(folder: Path) -> dict[str, Any]:
     Raises:
         RobotError: where the folder holds none.
     """
-    try:
+    with refused_as(
+        RobotError,
+        (OSError, UnicodeDecodeError, json.JSONDecodeError),
+        f"{folder} holds no identified model (dynamics.json): {{}}; give the folder of an identification",
+    ):
         found = json.loads((folder / MODEL).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise RobotError(
-            f"{folder} holds no identified model (dynamics.json): {error}; give the folder of an identification"
-        ) from error
     if not isinstance(found, dict):
         raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it holds no table")
     return found

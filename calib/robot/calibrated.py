@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from calib.arrays import frozen, shaped
-from calib.errors import RobotError
+from calib.errors import RobotError, refuse_robot
 from calib.estimate_files import read_covariance, write_covariance
 from calib.robot import description
 from calib.robot.chain import Chain
@@ -233,7 +233,7 @@ def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
         for key, known in (("element", chain.names), ("joint", chain.joint_names)):
             if entry.get(key) not in known:
-                raise RobotError(f"{where}: {key} {entry.get(key)!r} is none of the robot's")
+                refuse_robot(where, f"{key} {entry.get(key)!r} is none of the robot's")
         source = chain.joint_names.index(entry["joint"])
         terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
         coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))

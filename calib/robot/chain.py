@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import RobotError, require
+from calib.errors import RobotError, refuse_robot, require
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -49,12 +49,12 @@ class Joint:
 
     def __post_init__(self) -> None:
         if self.kind not in ("revolute", "prismatic"):
-            raise RobotError(f"joint '{self.name}': kind '{self.kind}' is neither 'revolute' nor 'prismatic'")
+            refuse_robot(f"joint '{self.name}'", f"kind '{self.kind}' is neither 'revolute' nor 'prismatic'")
         if not self.lower < self.upper:
-            raise RobotError(f"joint '{self.name}': lower limit {self.lower:g} is not below the upper {self.upper:g}")
+            refuse_robot(f"joint '{self.name}'", f"lower limit {self.lower:g} is not below the upper {self.upper:g}")
         for what in ("velocity", "effort"):
             if not getattr(self, what) >= 0.0:
-                raise RobotError(f"joint '{self.name}': {what} {getattr(self, what):g} is no limit: expected 0 or more")
+                refuse_robot(f"joint '{self.name}'", f"{what} {getattr(self, what):g} is no limit: expected 0 or more")
             if getattr(self, what) < MIN_LIMIT:
                 object.__setattr__(self, "unstated", (*self.unstated, f"{what} {getattr(self, what):g}"))
                 object.__setattr__(self, what, np.inf)
@@ -90,7 +90,7 @@ class Element:
 
     def __post_init__(self) -> None:
         if self.axis not in AXES:
-            raise RobotError(f"element '{self.name}': axis '{self.axis}' is none of {', '.join(AXES)}")
+            refuse_robot(f"element '{self.name}'", f"axis '{self.axis}' is none of {', '.join(AXES)}")
         require(np.isfinite(self.value), f"element '{self.name}': value {self.value} is not finite", RobotError)
         if self.placement is not None:
             object.__setattr__(self, "placement", frozen(self.placement))
@@ -141,10 +141,10 @@ class Chain:
         for what, names in (("joint", self.joint_names), ("element", self.names)):
             doubled = {name for name in names if names.count(name) > 1}
             if doubled:
-                raise RobotError(f"robot '{self.name}': {what} name '{sorted(doubled)[0]}' occurs twice")
+                refuse_robot(f"robot '{self.name}'", f"{what} name '{sorted(doubled)[0]}' occurs twice")
         driven = {element.joint for element in self.elements if element.joint is not None}
         if driven != set(range(len(self.joints))):
-            raise RobotError(f"robot '{self.name}': every joint has to move at least one element")
+            refuse_robot(f"robot '{self.name}'", "every joint has to move at least one element")
 
     @property
     def n(self) -> int:

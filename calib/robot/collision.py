@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
-from calib.errors import RobotError
+from calib.errors import refuse_robot
 from calib.robot.capsules import TARGET
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
@@ -189,7 +189,7 @@ def from_urdf(
                 _attach(model, geometry, link.attributes["name"], name, origin(node, place), shape)
     if geometry.ngeoms == 0:
         lost = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
-        raise RobotError(f"{path}: no usable <collision> shape{lost}; give mesh_folders, or use capsules")
+        refuse_robot(path, f"no usable <collision> shape{lost}; give mesh_folders, or use capsules")
     _add_targets(model, geometry, chain, targets)
     planes = [*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls]
     return _finish(model, geometry, chain, planes, obstacles, missing, margin, within, seed)
@@ -302,7 +302,7 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place
     _, coal = _libraries()
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
-        raise RobotError(f"{place}: <collision> without a shape")
+        refuse_robot(place, "<collision> without a shape")
     match kind.tag:
         case "box":
             return coal.Box(*_numbers(kind, "size", 3, place))
@@ -313,7 +313,7 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place
             return maker(*_numbers(kind, "radius", 1, place), *_numbers(kind, "length", 1, place))
         case "mesh":
             return _hull(kind, folders, missing, place)
-    raise RobotError(f"{place}: <{kind.tag}> is none of box, sphere, cylinder, capsule, mesh")
+    refuse_robot(place, f"<{kind.tag}> is none of box, sphere, cylinder, capsule, mesh")
 
 
 def _numbers(node: Node, key: str, count: int, place: str) -> list[float]:
@@ -322,7 +322,7 @@ def _numbers(node: Node, key: str, count: int, place: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not np.isfinite(values).all():
-        raise RobotError(f"{place}: <{node.tag}> in line {node.line} needs {key} with {count} finite number(s)")
+        refuse_robot(place, f"<{node.tag}> in line {node.line} needs {key} with {count} finite number(s)")
     return values
 
 

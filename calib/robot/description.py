@@ -41,7 +41,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import RobotError, require
+from calib.errors import RobotError, refuse_robot, require
 from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector, word
@@ -125,7 +125,7 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
         inertias.append(vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
         links.append(word(entry, "link", place) if "link" in entry else None)
     if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
-        raise RobotError(f"{where}: some joints have an inertia and some have none")
+        refuse_robot(where, "some joints have an inertia and some have none")
     entries = _tables(table, "element", where)
     return Chain(
         name=word(table, "name", where),
@@ -151,7 +151,7 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
     for key, most in (("owner", n), ("joint", n - 1)):
         value = entry.get(key, 0)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-            raise RobotError(f"{where}: {key} {value!r} is not a whole number from 0 to {most}")
+            refuse_robot(where, f"{key} {value!r} is not a whole number from 0 to {most}")
     axis = word(entry, "axis", where)
     sign = number(entry.get("sign", 1.0), f"{where}, sign")
     require(abs(sign) == 1.0, f"{where}: sign {sign:g} is neither 1 nor -1", RobotError)
@@ -196,5 +196,5 @@ def _to_elements(chain: Chain) -> dict[str, Any]:
 def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
     found = table.get(key)
     if not isinstance(found, list) or not found or not all(isinstance(entry, Mapping) for entry in found):
-        raise RobotError(f"{where}: no [[{key}]] tables found")
+        refuse_robot(where, f"no [[{key}]] tables found")
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from calib.errors import RobotError, require, suggestion
+from calib.errors import RobotError, refuse_robot, require, suggestion
 from calib.robot import calibrated, description, library
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -34,7 +34,7 @@ def load(
 def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
     for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
         if wanted is not None and wanted != found:
-            raise RobotError(f"{path}: its {option} is '{found}', not '{wanted}'; base and tip choose links of a URDF")
+            refuse_robot(path, f"its {option} is '{found}', not '{wanted}'; base and tip choose links of a URDF")
     return chain
 
 

@@ -50,7 +50,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import RobotError, one_of, require
+from calib.errors import RobotError, one_of, refuse_robot, require
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector, word
 
@@ -97,10 +97,10 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
     """Return the chain of a parsed table; `where` names it in messages."""
     check_keys(table, TOP, where)
     if not isinstance(proposed := table.get("propose_beta", True), bool):
-        raise RobotError(f"{where}: propose_beta has to be true or false, found {proposed!r}")
+        refuse_robot(where, f"propose_beta has to be true or false, found {proposed!r}")
     rows: list[Row] = []
     if not isinstance(table.get("joint"), list) or not table["joint"]:
-        raise RobotError(f"{where}: no [[joint]] rows found; an MDH table needs one per axis")
+        refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
     for position, entry in enumerate(table["joint"]):
         rows.append(_row(entry, rows[-1].index + 1 if rows else 1, f"{where}, [[joint]] number {position + 1}"))
     return chain(
@@ -145,7 +145,7 @@ def chain(
         owner += row.kind != "fixed"
     known = [row.inertia is not None for row in moving]
     if any(known) and not all(known):
-        raise RobotError(f"robot '{name}': row '{moving[known.index(False)].name}' has no inertia while others have")
+        refuse_robot(f"robot '{name}'", f"row '{moving[known.index(False)].name}' has no inertia while others have")
     return Chain(
         name=name,
         joints=tuple(Joint(row.name, row.kind, row.lower, row.upper, row.velocity, row.effort) for row in moving),
@@ -241,10 +241,10 @@ def _turn(axis: int, angle: float) -> np.ndarray:
 def _row(entry: Any, index: int, where: str) -> Row:
     """Return the row of one [[joint]] table."""
     if not isinstance(entry, Mapping):
-        raise RobotError(f"{where}: expected a table, found {entry!r}")
+        refuse_robot(where, f"expected a table, found {entry!r}")
     index = entry.get("index", index)
     if isinstance(index, bool) or not isinstance(index, int) or index < 0:
-        raise RobotError(f"{where}: index {index!r} is not a whole number from 0 on")
+        refuse_robot(where, f"index {index!r} is not a whole number from 0 on")
     name = word(entry, "name", where, f"joint{index}")
     where = f"{where} ('{name}')"
     check_keys(entry, _ROW, where)
@@ -254,7 +254,7 @@ def _row(entry: Any, index: int, where: str) -> Row:
     if kind == "prismatic":
         quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
     if kind == "fixed" and (extra := [key for key in (*_LIMITS, "inertia") if key in entry]):
-        raise RobotError(f"{where}: a fixed row has no '{extra[0]}'")
+        refuse_robot(where, f"a fixed row has no '{extra[0]}'")
     numbers = {key: number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
     inertia = tuple(vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
     return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)

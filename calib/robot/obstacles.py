@@ -12,7 +12,7 @@ from functools import reduce
 
 import numpy as np
 
-from calib.errors import RobotError
+from calib.errors import RobotError, refuse_robot
 from calib.words import listing
 
 ALWAYS = 0.95
@@ -37,12 +37,10 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         if self.kind not in SIZES:
-            raise RobotError(f"obstacle '{self.name}': kind '{self.kind}' is none of {', '.join(SIZES)}")
+            refuse_robot(f"obstacle '{self.name}'", f"kind '{self.kind}' is none of {', '.join(SIZES)}")
         count = SIZES[self.kind]
         if len(self.size) != count or min(self.size) <= 0:
-            raise RobotError(
-                f"obstacle '{self.name}': a {self.kind} has {count} positive sizes, not {tuple(self.size)}"
-            )
+            refuse_robot(f"obstacle '{self.name}'", f"a {self.kind} has {count} positive sizes, not {tuple(self.size)}")
 
 
 @dataclass(frozen=True, eq=False)

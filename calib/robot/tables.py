@@ -16,7 +16,7 @@ import tomlkit
 
 from calib import config, config_types
 from calib.config_types import shown
-from calib.errors import RobotError
+from calib.errors import RobotError, refuse_robot
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 _PI = {math.pi: "pi", -math.pi: "-pi", math.pi / 2: "pi/2", -math.pi / 2: "-pi/2"}
@@ -34,9 +34,9 @@ def word(table: Mapping[str, Any], key: str, where: str, default: str | None = N
     """
     value = table.get(key, default)
     if value is None:
-        raise RobotError(f"{where}: '{key}' is missing")
+        refuse_robot(where, f"'{key}' is missing")
     if not isinstance(value, str) or not value:
-        raise RobotError(f"{where}: '{key}' has to be text, found {shown(value)}")
+        refuse_robot(where, f"'{key}' has to be text, found {shown(value)}")
     return value
 
 
@@ -48,7 +48,7 @@ def vector(value: Any, count: int, where: str, quantity: str = "") -> np.ndarray
 def placement(table: Any, where: str) -> np.ndarray:
     """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows)."""
     if not isinstance(table, Mapping):
-        raise RobotError(f"{where}: expected xyz and rpy, or matrix; found {shown(table)}")
+        refuse_robot(where, f"expected xyz and rpy, or matrix; found {shown(table)}")
     check_keys(table, ("xyz", "rpy", "matrix"), where)
     if "matrix" not in table:
         zero = [0.0, 0.0, 0.0]
@@ -56,12 +56,12 @@ def placement(table: Any, where: str) -> np.ndarray:
         return from_xyz_rpy(xyz, vector(table.get("rpy", zero), 3, f"{where}, rpy", "angle"))
     rows = table["matrix"]
     if not isinstance(rows, (list, tuple)) or len(rows) not in (3, 4):
-        raise RobotError(f"{where}: matrix needs three or four rows")
+        refuse_robot(where, "matrix needs three or four rows")
     result = np.eye(4)
     result[: len(rows)] = [vector(row, 4, f"{where}, matrix") for row in rows]
     error = np.abs(result[:3, :3].T @ result[:3, :3] - np.eye(3)).max()
     if not error < 1e-6 or np.linalg.det(result[:3, :3]) < 0:
-        raise RobotError(f"{where}: the rotation in matrix is no rotation (R'R - 1 = {error:.2g})")
+        refuse_robot(where, f"the rotation in matrix is no rotation (R'R - 1 = {error:.2g})")
     return result
 
 

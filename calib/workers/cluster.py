@@ -13,7 +13,7 @@ from queue import Empty, SimpleQueue
 from threading import Lock
 from typing import Any
 
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, refused_as
 from calib.workers.crew import Answer, Died, run_call
 
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
@@ -133,16 +133,12 @@ async def _answers(address: str) -> None:
 
 @contextmanager
 def dask(address: str) -> Iterator[_Cluster]:
-    try:
+    with refused_as(UsageError, ImportError, "a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'"):
         from distributed import Client  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise UsageError("a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'") from error
-    try:
+    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}"):
         with ThreadPoolExecutor(1) as aside:  # a notebook has a loop of its own
             aside.submit(asyncio.run, _answers(address)).result()
         client: Any = Client(address, timeout=ANSWER, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
     log = logging.getLogger("distributed.client")
     before = log.level
     log.setLevel(logging.CRITICAL)  # what goes wrong is said here, once

@@ -15,7 +15,7 @@ import numpy as np
 from calib import files
 from calib.config_types import shown
 from calib.data.camera.lens import Lens
-from calib.errors import CalibError, MeasurementError, require, suggestion
+from calib.errors import CalibError, MeasurementError, refused_as, require, suggestion
 
 FILE = "camera.yaml"
 MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
@@ -48,10 +48,8 @@ def read_lens(path: str | Path) -> Lens:
     if len(bend) not in allowed:
         raise MeasurementError(f"distortion_model {name} has {allowed[-1]} coefficients, found {len(bend)}", path)
     full = np.concatenate([bend, np.zeros(5 - len(bend))]) if name == "plumb_bob" else bend
-    try:
+    with refused_as(MeasurementError, CalibError, "{}", path):
         return Lens(MODELS[name], np.concatenate([matrix[[0, 4, 2, 5]], full]), size)
-    except CalibError as error:
-        raise MeasurementError(str(error), path) from error
 
 
 def _whole(found: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> int:

@@ -28,7 +28,7 @@ from calib.data.recordings.recording_options import (
     scale,
     stem_of,
 )
-from calib.errors import MeasurementError, UsageError, suggestion
+from calib.errors import MeasurementError, UsageError, refused_as, suggestion
 
 
 def read_log(
@@ -162,10 +162,8 @@ def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> n
     if own and stated and own != stated:
         message = f"its header says [{own}], the options say {stated}: take one of them away"
         raise MeasurementError(message, table.file, column=table.header[place])
-    try:
+    with refused_as(MeasurementError, UsageError, "{}", table.file, None, table.header[place]):
         return cells * scale(ours, own or stated)
-    except UsageError as error:
-        raise MeasurementError(str(error), table.file, column=table.header[place]) from error
 
 
 def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:

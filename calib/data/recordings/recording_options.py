@@ -33,7 +33,7 @@ from typing import Annotated, Any
 from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
 from calib.data.recordings.recording import Joints, named
-from calib.errors import MeasurementError, UsageError, require, suggestion
+from calib.errors import MeasurementError, UsageError, refused_as, require, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
@@ -110,19 +110,15 @@ class RecordingOptions:
     def __post_init__(self) -> None:
         if self.kind not in ("", "torque", "current"):
             raise UsageError(f"kind: expected 'torque' or 'current', found '{self.kind}'")
-        try:
+        with refused_as(UsageError, ValueError, "{}"):
             _ours(self.names)
             _known(self.units)
-        except ValueError as wrong:
-            raise UsageError(str(wrong)) from None
 
 
 def scale(name: str, unit: str) -> float:
     """Return the factor from `unit` to SI for one of our names; "" is SI."""
-    try:
+    with refused_as(UsageError, ValueError, "{}"):
         _known({name: unit})
-    except ValueError as wrong:
-        raise UsageError(str(wrong)) from None
     return SCALES[name][unit.lower()] if unit else 1.0
 
 

@@ -17,7 +17,7 @@ from calib.data.recordings.csv_logs import read_positions
 from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, joint_order, scale
 from calib.data.signals.motion import Motion
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, refused_as
 from calib.files import check_regular
 
 
@@ -45,20 +45,20 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
 
 
 def _is_archive(path: Path) -> bool:
-    try:
+    with refused_as(MeasurementError, OSError, "cannot be read: {}", path):
         check_regular(path)
         with open(path, "rb") as file:
             return file.read(2) == b"PK"
-    except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror}", path) from error
 
 
 def _archive(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            members = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise MeasurementError(f"is no archive of plain arrays ({error})", path) from error
+    with (
+        refused_as(
+            MeasurementError, (ValueError, OSError, zipfile.BadZipFile), "is no archive of plain arrays ({})", path
+        ),
+        np.load(path, allow_pickle=False) as archive,
+    ):
+        members = {name: archive[name] for name in archive.files}
     name = {
         ours: options.names.get(ours) or next((one for one in SYNONYMS[ours] if one in members), "")
         for ours in ("t", "q_ref", "q")

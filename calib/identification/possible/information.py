@@ -16,7 +16,7 @@ import numpy as np
 
 from calib import files
 from calib.arrays import frozen
-from calib.errors import RobotError
+from calib.errors import RobotError, refused_as
 from calib.estimate_files import read_covariance, read_estimate
 from calib.estimation.triangles import combine, retriangulate
 from calib.identification.model_file import read_dynamics, read_table
@@ -126,7 +126,11 @@ def read(folder: str | Path) -> Information:
     groups = read_table(folder).get("regrouping")
     if groups is None:
         raise RobotError(f"{folder}/dynamics.json does not say how parameters regroup; identify again")
-    try:
+    with refused_as(
+        RobotError,
+        (OSError, KeyError, ValueError),
+        f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}",
+    ):
         estimate = read_estimate(folder)
         names, units, values = estimate.names, estimate.units, estimate.values
         covariance = read_covariance(folder)[1]
@@ -135,8 +139,6 @@ def read(folder: str | Path) -> Information:
         factor = _numbers(folder / INFORMATION) if rested else whitened(values, covariance)
         if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
             raise ValueError("files of different sizes")
-    except (OSError, KeyError, ValueError) as error:
-        raise RobotError(f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {error}") from error
     return Information(chain, dynamics, names, units, values, covariance, transform, factor, rested)
 
 

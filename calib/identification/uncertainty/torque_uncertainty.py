@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.dynamics.base import standard_name
 from calib.dynamics.idim import friction_states
-from calib.errors import UsageError
+from calib.errors import UsageError, refused_as
 from calib.identification.model_file import read_covariance
 from calib.identification.prediction import Dynamics
 from trajectories.timing.profile import Sampled
@@ -83,8 +83,6 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
     if found is None:
         return None
     names, covariance = found
-    try:
+    with refused_as(UsageError, ValueError, f"{folder}/covariance.csv does not fit dynamics.json beside it: {{}}"):
         columns = estimated_columns(dynamics, names)
-    except ValueError as error:
-        raise UsageError(f"{folder}/covariance.csv does not fit dynamics.json beside it: {error}") from error
     return Uncertainty(dynamics, tuple(carried), columns, covariance)

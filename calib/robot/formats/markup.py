@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from calib.errors import RobotError
+from calib.errors import RobotError, refused_as
 
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
@@ -46,19 +46,15 @@ def text(path: str | Path) -> tuple[str, str]:
     Raises:
         RobotError: where it cannot be read or decoded.
     """
-    try:
+    with refused_as(RobotError, OSError, f"cannot read {path}: {{}}"):
         data = Path(path).read_bytes()
-    except OSError as error:
-        raise RobotError(f"cannot read {path}: {error.strerror or error}") from error
     declared = _DECLARED.match(data)
     encoding = declared[1].decode() if declared else "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
-    try:
+    with refused_as(RobotError, (LookupError, UnicodeError), f"{path}: not readable as {encoding}: {{}}"):
         found = data.decode(encoding)
         for way in ("utf-8", encoding):  # Python knows encodings that are no way back
             found.encode(way)
         return found, encoding
-    except (LookupError, UnicodeError) as error:
-        raise RobotError(f"{path}: not readable as {encoding}: {error}") from error
 
 
 def parse(source: str, where: str) -> Node:

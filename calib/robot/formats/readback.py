@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import RobotError
+from calib.errors import RobotError, refused_as
 from calib.robot.chain import Chain
 
 
@@ -29,10 +29,8 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     import pinocchio
 
     pin: Any = pinocchio  # its names come from C++, where no type checker sees them
-    try:
+    with refused_as(RobotError, (ValueError, RuntimeError), "Pinocchio cannot read the URDF: {}"):
         model: Any = pin.buildModelFromXML(source)
-    except (ValueError, RuntimeError) as error:
-        raise RobotError(f"Pinocchio cannot read the URDF: {error}") from error
     data = model.createData()
     base, tip = model.getFrameId(chain.base), model.getFrameId(chain.tip)
     result = np.empty((len(q), 4, 4))

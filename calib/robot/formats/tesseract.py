@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.errors import RobotError
+from calib.errors import refuse_robot
 from calib.robot.formats.urdf_tree import read
 from calib.robot.formats.yaml_block import block
 
@@ -30,7 +30,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
         if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
-            raise RobotError(f"{where}: the origin of joint '{name}' is no rotation")
+            refuse_robot(where, f"the origin of joint '{name}' is no rotation")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),
             "orientation": dict(zip("xyzw", turn.tolist())),

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.errors import RobotError, require, suggestion
+from calib.errors import RobotError, refuse_robot, require, suggestion
 from calib.robot.chain import AXES, Chain, Element
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import JointTag, Mimic, UrdfTree, transform_body
@@ -75,7 +75,7 @@ def ends(
     """
     if base is None:
         if len(tree.roots) > 1:
-            raise RobotError(f"{tree.where}: several roots: {', '.join(tree.roots)}; choose one as base (--base)")
+            refuse_robot(tree.where, f"several roots: {', '.join(tree.roots)}; choose one as base (--base)")
         base = tree.roots[0]
     tree.link(base, "base")
     if tip is None:
@@ -154,7 +154,7 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
         name = mimic.leader
         if name in seen or name not in tree.joints:
             what = "a circle" if name in seen else f"'{name}', which is no joint{suggestion(name, tree.joints)}"
-            raise RobotError(f"{tree.where}, line {joint.node.line}, joint '{joint.name}': it mimics {what}")
+            refuse_robot(f"{tree.where}, line {joint.node.line}, joint '{joint.name}'", f"it mimics {what}")
         seen.add(name)
         mimic = tree.joints[name].mimic
     return name, ratio, offset
@@ -164,38 +164,40 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
     """Refuse paths that are no serial arm, or not the arm the measurements were taken with."""
     actuated = [joint.name for joint in path if joint.actuated]
     if not actuated:
-        raise RobotError(f"{tree.where}: no actuated joint between '{base}' and '{tip}'; choose another base or tip")
+        refuse_robot(tree.where, f"no actuated joint between '{base}' and '{tip}'; choose another base or tip")
     passed: set[str] = set()
     for joint in path:
         place = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
         if joint.kind in ("floating", "planar"):
-            raise RobotError(f"{place}: type '{joint.kind}' cannot be part of an arm; choose a base behind it (--base)")
+            refuse_robot(place, f"type '{joint.kind}' cannot be part of an arm; choose a base behind it (--base)")
         passed.add(joint.name)
         if not joint.moves or joint.actuated:
             continue
         leader, ratio, _ = drive(tree, joint)
         if leader not in passed:
             side = "comes after it" if leader in actuated else f"is not between '{base}' and '{tip}'"
-            raise RobotError(f"{place}: the joint it mimics, '{leader}', {side}; choose another base or tip")
+            refuse_robot(place, f"the joint it mimics, '{leader}', {side}; choose another base or tip")
         if ratio == 0.0 or tree.joints[leader].kind == "fixed":
-            raise RobotError(f"{place}: it mimics '{leader}' but can never move; make it fixed")
+            refuse_robot(place, f"it mimics '{leader}' but can never move; make it fixed")
     if joint_names and (extra := [name for name in actuated if name not in joint_names]):
-        raise RobotError(
-            f"{tree.where}: between '{base}' and '{tip}' there are joints the measurements do not name: "
-            f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value"
+        refuse_robot(
+            tree.where,
+            f"between '{base}' and '{tip}' there are joints the measurements do not name: "
+            f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value",
         )
     if joint_names and (absent := [name for name in joint_names if name not in actuated]):
         held = ", ".join(actuated)
-        raise RobotError(
-            f"{tree.where}: joint '{absent[0]}' is not between '{base}' and '{tip}'{suggestion(absent[0], actuated)} "
-            f"(found there: {held})"
+        refuse_robot(
+            tree.where,
+            f"joint '{absent[0]}' is not between '{base}' and '{tip}'{suggestion(absent[0], actuated)} "
+            f"(found there: {held})",
         )
 
 
 def _longest(tree: UrdfTree, base: str) -> str:
     """Return the last moving link of the chain with most actuated joints."""
     if not any(joint.actuated for joint in tree.joints.values()):
-        raise RobotError(f"{tree.where}: no actuated joint (revolute, continuous or prismatic) found")
+        refuse_robot(tree.where, "no actuated joint (revolute, continuous or prismatic) found")
     grippers = _gripper_joints(tree)
     best: dict[str, int] = {}
     todo = [(base, base, 0)]
@@ -212,9 +214,10 @@ def _longest(tree: UrdfTree, base: str) -> str:
     found = [link for link, count in best.items() if count == most]
     found = [link for link in found if not any(_hangs(tree, other, link) for other in found if other != link)]
     if len(found) > 1:
-        raise RobotError(
-            f"{tree.where}: several chains with {most} actuated joints, to the links {', '.join(found)}; "
-            f"choose one as tip (--tip), or a base (--base)"
+        refuse_robot(
+            tree.where,
+            f"several chains with {most} actuated joints, to the links {', '.join(found)}; "
+            f"choose one as tip (--tip), or a base (--base)",
         )
     return found[0]
 
@@ -241,7 +244,7 @@ def _last_named(tree: UrdfTree, base: str, joint_names: Sequence[str]) -> str:
     for name in joint_names:
         if name not in tree.joints:
             known = ", ".join(joint.name for joint in tree.joints.values() if joint.actuated)
-            raise RobotError(f"{tree.where}: no joint '{name}'{suggestion(name, tree.joints)} (joints: {known})")
+            refuse_robot(tree.where, f"no joint '{name}'{suggestion(name, tree.joints)} (joints: {known})")
     return max((tree.joints[name].child for name in joint_names), key=lambda link: len(tree.ancestry(link)))
 
 

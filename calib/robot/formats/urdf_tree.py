@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.errors import RobotError, require, suggestion
+from calib.errors import RobotError, refuse_robot, require, suggestion
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.robot.formats.markup import Node, parse
 from calib.transforms import from_xyz_rpy
@@ -98,9 +98,7 @@ class UrdfTree:
         """
         if name not in self.bodies:
             known = ", ".join(self.bodies)
-            raise RobotError(
-                f"{self.where}: no link '{name}' for the {role}{suggestion(name, self.bodies)} (links: {known})"
-            )
+            refuse_robot(self.where, f"no link '{name}' for the {role}{suggestion(name, self.bodies)} (links: {known})")
         return name
 
     def ancestry(self, link: str) -> list[JointTag]:
@@ -121,7 +119,7 @@ class UrdfTree:
         link = tip
         while link != base:
             if link not in self.above:
-                raise RobotError(f"{self.where}: link '{tip}' does not hang on '{base}'; choose another base or tip")
+                refuse_robot(self.where, f"link '{tip}' does not hang on '{base}'; choose another base or tip")
             result.append(self.above[link])
             link = result[-1].parent
         return result[::-1]
@@ -145,9 +143,9 @@ def read(source: str, where: str) -> UrdfTree:
     """
     root = parse(source, where)
     if root.tag != "robot":
-        raise RobotError(f"{where}, line {root.line}: the root element is <{root.tag}>, a URDF has <robot>")
+        refuse_robot(f"{where}, line {root.line}", f"the root element is <{root.tag}>, a URDF has <robot>")
     if macro := next((node for node in root.children if _is_macro(node)), None):
-        raise RobotError(f"{where}, line {macro.line}: found <{macro.tag}>: this is a xacro file; {XACRO}")
+        refuse_robot(f"{where}, line {macro.line}", f"found <{macro.tag}>: this is a xacro file; {XACRO}")
     bodies = {}
     for node in root.all("link"):
         name = _fresh(node, bodies, where)
@@ -162,7 +160,7 @@ def read(source: str, where: str) -> UrdfTree:
         if joint.child in above:
             both = f"'{above[joint.child].name}' and '{joint.name}'"
             place = f"{where}, line {joint.node.line}"
-            raise RobotError(f"{place}: link '{joint.child}' has two parents, joints {both}; a URDF is a tree")
+            refuse_robot(place, f"link '{joint.child}' has two parents, joints {both}; a URDF is a tree")
         above[joint.child] = joint
         below[joint.parent].append(joint)
     name, remarks = root.attributes.get("name", "robot"), _large_angles(joints, where)
@@ -183,8 +181,8 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
         if node is not None and (np.abs(_floats(node, "rpy", "0 0 0", where)) > TURN).any():
             found.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
     if len(found) > 1:
-        raise RobotError(
-            f"{where}: {listing(found, 3)}: beyond a full turn: degrees? A URDF's angles are radians; convert them"
+        refuse_robot(
+            where, f"{listing(found, 3)}: beyond a full turn: degrees? A URDF's angles are radians; convert them"
         )
     return tuple(f"{one} is beyond a full turn: degrees? A URDF's angles are radians" for one in found)
 
@@ -225,7 +223,7 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     name, kind = node.attributes["name"], node.attributes.get("type", "")
     place = f"{where}, line {node.line}, joint '{name}'"
     if kind not in KINDS:
-        raise RobotError(f"{place}: type '{kind}' is none of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
+        refuse_robot(place, f"type '{kind}' is none of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
     ends = [_end(node, role, links, place) for role in ("parent", "child")]
     lower, upper, velocity, effort, unstated = _limits(node, kind, place)
     return JointTag(
@@ -249,9 +247,9 @@ def _end(node: Node, role: str, links: Iterable[str], place: str) -> str:
     """Return the parent or child link of a joint."""
     child = node.first(role)
     if child is None or not (link := child.attributes.get("link")):
-        raise RobotError(f"{place}: no <{role} link=.../>")
+        refuse_robot(place, f"no <{role} link=.../>")
     if link not in links:
-        raise RobotError(f"{place}: its {role} '{link}' is no link of this file{suggestion(link, list(links))}")
+        refuse_robot(place, f"its {role} '{link}' is no link of this file{suggestion(link, list(links))}")
     return link
 
 
@@ -279,7 +277,7 @@ def _mimic(node: Node, place: str) -> Mimic | None:
     if found is None:
         return None
     if not (leader := found.attributes.get("joint")):
-        raise RobotError(f"{place}: <mimic> without a joint to follow")
+        refuse_robot(place, "<mimic> without a joint to follow")
     return Mimic(leader, _float(found, "multiplier", 1.0, place), _float(found, "offset", 0.0, place))
 
 
@@ -297,7 +295,7 @@ def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, flo
             lower, upper = _float(found, "lower", 0.0, place), _float(found, "upper", 0.0, place)
             if not lower < upper:
                 found_limits = f"lower limit {lower:g} is not below the upper {upper:g}"
-                raise RobotError(f"{place}: {found_limits}; correct them, or make the joint fixed or continuous")
+                refuse_robot(place, f"{found_limits}; correct them, or make the joint fixed or continuous")
         velocity, effort = _float(found, "velocity", np.inf, place), _float(found, "effort", np.inf, place)
         sizes = {"velocity": velocity, "effort": effort}
         unstated = [f"{what} {size:g}" for what, size in sizes.items() if size < MIN_LIMIT]
@@ -331,7 +329,7 @@ def _floats(node: Node, key: str, default: str, place: str) -> np.ndarray:
     if len(values) != 3 or not np.isfinite(values).all():
         found = node.attributes.get(key)
         what = f'{key}="{found}" of <{node.tag}> in line {node.line}'
-        raise RobotError(f"{place}: {what} is not three finite numbers{_expand(found)}")
+        refuse_robot(place, f"{what} is not three finite numbers{_expand(found)}")
     return values
 
 
@@ -343,7 +341,7 @@ def _float(node: Node, key: str, default: float, place: str) -> float:
         value = np.nan
     if np.isnan(value):
         what = f'{key}="{found}" of <{node.tag}> in line {node.line}'
-        raise RobotError(f"{place}: {what} is not a number{_expand(found)}")
+        refuse_robot(place, f"{what} is not a number{_expand(found)}")
     return value
 
 
@@ -360,5 +358,5 @@ def _check_loops(tree: UrdfTree) -> None:
         reached.add(link)
         todo += [joint.child for joint in tree.below[link]]
     if lost := [link for link in tree.bodies if link not in reached]:
-        raise RobotError(f"{tree.where}: links {', '.join(lost)} hang on each other in a loop; a URDF is a tree")
+        refuse_robot(tree.where, f"links {', '.join(lost)} hang on each other in a loop; a URDF is a tree")
     require(tree.bodies, f"{tree.where}: no <link> found", RobotError)

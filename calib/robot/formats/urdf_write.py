@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import files
-from calib.errors import RobotError
+from calib.errors import RobotError, refuse_robot
 from calib.robot.chain import AXES, Chain, Element, Joint, random_joints
 from calib.robot.formats.markup import edited, insert_child, set_attributes, text
 from calib.robot.formats.urdf import drive, ends
@@ -73,9 +73,7 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
     max_difference = 1e-9
     if error > max_difference:
-        raise RobotError(
-            f"{where}: the edited text does not read back as the calibrated robot (difference {error:.2g})"
-        )
+        refuse_robot(where, f"the edited text does not read back as the calibrated robot (difference {error:.2g})")
     return result
 
 
@@ -99,7 +97,7 @@ def write_new(chain: Chain) -> str:
             continue
         main = k in first
         if main and element.ratio != 1.0:
-            raise RobotError(f"element '{element.name}': a URDF joint moves by q itself, not by {element.ratio:g} q")
+            refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q itself, not by {element.ratio:g} q")
         child = _link_name(chain, k, element.joint, main)
         lines += _link_lines(child, chain.inertias[element.joint] if main and chain.inertias is not None else None)
         lines += _joint_lines(chain, element, chain.joints[element.joint], main, parent, child, before)
@@ -187,9 +185,10 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
     found = tuple(joint.name for joint in path if joint.actuated)
     moving = sum(element.joint is not None for element in nominal.elements)
     if len(found) != nominal.n or (named and found != names) or sum(joint.moves for joint in path) != moving:
-        raise RobotError(
-            f"{tree.where}: its joints to '{tip}' are {', '.join(found)}; the nominal robot '{nominal.name}' has "
-            f"{', '.join(names)}: not the same arm"
+        refuse_robot(
+            tree.where,
+            f"its joints to '{tip}' are {', '.join(found)}; the nominal robot '{nominal.name}' has "
+            f"{', '.join(names)}: not the same arm",
         )
     while not path[0].moves:
         path = path[1:]
@@ -220,10 +219,11 @@ def _base_offset(
     if worst.max() > max_offset:
         k = int(np.argmax(worst > max_offset))
         joint = [joint for joint in path if joint.moves][k]
-        raise RobotError(
-            f"{tree.where}, line {joint.node.line}: this URDF does not describe the nominal robot '{nominal.name}': at "
+        refuse_robot(
+            f"{tree.where}, line {joint.node.line}",
+            f"this URDF does not describe the nominal robot '{nominal.name}': at "
             f"joint '{joint.name}' the link moves against the chain's frame by up to {worst[k]:.3g} (m or rad) over "
-            f"random postures; give the URDF of the same nominal robot, with the same base, joint signs and lengths"
+            f"random postures; give the URDF of the same nominal robot, with the same base, joint signs and lengths",
         )
     return best
 
@@ -256,9 +256,10 @@ def _tip_origin(
         return {}
     place = max(k for k, joint in enumerate(path) if joint.moves) + 1
     if place == len(path):
-        raise RobotError(
-            f"{tree.where}: the calibrated chain differs behind the last joint, where the URDF has no fixed joint to "
-            f"'{nominal.tip}' that could take it; add one, or leave the elements of the tool to the tool"
+        refuse_robot(
+            tree.where,
+            "the calibrated chain differs behind the last joint, where the URDF has no fixed joint to "
+            f"'{nominal.tip}' that could take it; add one, or leave the elements of the tool to the tool",
         )
     rest = np.eye(4)
     for joint in path[place + 1 :]:

@@ -11,8 +11,10 @@ import numpy as np
 from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import KINDS, Board
+from calib.data.camera.corner_file import Found
+from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
 from calib.data.poses.pixels import JOINTS
-from calib.errors import CalibError, MeasurementError, UsageError, require
+from calib.errors import CalibError, MeasurementError, UsageError, refused_as, require
 from calib.procedure.measuring.image_findings import coverage_words
 from calib.rooms.camera.corner_file import Found
 from calib.rooms.camera.image_folders import find_corners, joint_table, problem_words, read_own_board
@@ -47,14 +49,12 @@ def make(
     if square < SMALLEST:
         raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
     usual, share, across = USUAL[kind]
-    try:
+    with refused_as(UsageError, ValueError, "this board cannot be: {}"):
         side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
         made = Board(kind, columns or across, rows, side, between, words or usual).checked()
         if (count := len(boards.corners(made))) < FEWEST:
             raise UsageError(f"a {made.words} has {count} corners; an image counts from {FEWEST} on: more squares")
         size = board_print.page_size(made, (paper or "").lower())
-    except ValueError as error:
-        raise UsageError(f"this board cannot be: {error}") from None
     there = out / boards.FILE
     if not overwrite and there.exists() and not _as_printed(out):
         raise UsageError(

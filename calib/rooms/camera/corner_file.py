@@ -14,7 +14,7 @@ import numpy as np
 
 from calib import files
 from calib.data.camera.board import Board, corners
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, refused_as
 
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
 USUAL = 0.1  # sigma where a file states none [px]; our choice
@@ -73,17 +73,18 @@ def read_corners(path: Path, board: Board) -> Found:
     import csv
 
     count, images, size = len(corners(board)), dict[str, Detection](), (0, 0)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, restkey="further cells", restval=""))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeasurementError(f"cannot be read as a table ({error})", path) from error
+    kinds = (OSError, UnicodeDecodeError, csv.Error)
+    readable = refused_as(MeasurementError, kinds, "cannot be read as a table ({})", path)
+    with readable, path.open(encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file, restkey="further cells", restval=""))
     for number, row in enumerate(rows, 1):
         if "further cells" in row:
             raise MeasurementError("has more cells than the header names columns", path, number)
         cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
         name, problem = cells.get("image", ""), cells.get("problem", "")
-        try:
+        with refused_as(
+            MeasurementError, (KeyError, ValueError, OverflowError), "expected image, corner, u, v ({})", path, number
+        ):
             if not name and problem:
                 size = int(float(cells["u"])), int(float(cells["v"]))
                 continue
@@ -94,8 +95,6 @@ def read_corners(path: Path, board: Board) -> Found:
             if problem or not cells.get("corner"):
                 continue
             k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
-        except (KeyError, ValueError, OverflowError) as error:
-            raise MeasurementError(f"expected image, corner, u, v ({error})", path, number) from error
         if not 0 <= k < count:
             raise MeasurementError(f"corner {k}: the board ({board.words}) has {count}", path, number, "corner")
         images[name].pixel[k], images[name].sigma[k] = place, float(cells.get("sigma") or USUAL)

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.errors import MeasurementError, require
+from calib.errors import MeasurementError, refused_as, require
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
@@ -23,10 +23,10 @@ def read_image(path: Path) -> np.ndarray:
     Raises:
         MeasurementError: for a file that is missing, empty or damaged.
     """
-    try:
+    with refused_as(
+        MeasurementError, (OSError, ValueError), "cannot be read as an image ({}): was it copied whole?", path
+    ):
         return decode(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise MeasurementError(f"cannot be read as an image ({error}): was it copied whole?", path) from error
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from calib import files
-from calib.errors import CalibError, UsageError, require, suggestion
+from calib.errors import CalibError, UsageError, refused_as, require, suggestion
 from calib.rooms.studies.trial import COLUMNS, STATUSES, TrialRow
 
 JOURNAL, WHOLE, LOCK = "rows.csv", "rows.parquet", "study.lock"
@@ -165,12 +165,12 @@ def _read_journal(path: Path) -> tuple[list[TrialRow], int, int]:
     _check_columns(path, lines[0].split(","))
     rows = []
     for number, cells in enumerate(csv.reader(lines[1:]), 2):
-        try:
+        with refused_as(
+            UsageError,
+            ValueError,
+            f"{path}: line {number} is damaged ({{}}); delete that line, and its trial is run again",
+        ):
             rows.append(_row(cells[1:]))
-        except ValueError as error:
-            raise UsageError(
-                f"{path}: line {number} is damaged ({error}); delete that line, and its trial is run again"
-            ) from error
     return rows, good, int(good < len(data))
 
 
@@ -230,15 +230,15 @@ def _parquet(rows: Iterable[TrialRow]) -> bytes:
 def _read_whole(path: Path) -> list[TrialRow]:
     if not path.exists():
         return []
-    try:
+    with refused_as(UsageError, ImportError, f"{path} needs pyarrow: pip install 'armature-calib[study]'"):
         import pyarrow
         from pyarrow import parquet
-    except ImportError as error:
-        raise UsageError(f"{path} needs pyarrow: pip install 'armature-calib[study]'") from error
-    try:
+    with refused_as(
+        UsageError,
+        (pyarrow.ArrowException, OSError),
+        f"{path} is damaged: {{}}; delete it, and its trials are run again",
+    ):
         table = parquet.read_table(path)
-    except (pyarrow.ArrowException, OSError) as error:
-        raise UsageError(f"{path} is damaged: {error}; delete it, and its trials are run again") from error
     store = (table.schema.metadata or {}).get(b"store", b"").decode()
     _check_columns(path, [store, *table.column_names])
     rows = [TrialRow(**row) for row in table.to_pylist()]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import CalibError, UsageError, command_line
+from calib.errors import CalibError, UsageError, command_line, refused_as
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames
 from calib.rooms.viewer import scene as viewing
@@ -39,13 +39,13 @@ def available() -> bool:
 
 
 def _rerun() -> Any:
-    try:
+    with refused_as(
+        UsageError,
+        ImportError,
+        "this needs Rerun, which is not installed here (there is none for Macs with Intel processors): "
+        "pip install rerun-sdk",
+    ):
         import rerun
-    except ImportError as error:
-        raise UsageError(
-            "this needs Rerun, which is not installed here (there is none for Macs with Intel processors): "
-            "pip install rerun-sdk"
-        ) from error
     return rerun
 
 
@@ -95,10 +95,10 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     scene = viewing.read(folder, robot)
     rr = _rerun()
     recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
-    try:
+    with refused_as(
+        CalibError, Exception, "Rerun's window did not open ({}); calib view --save FILE.rrd writes a file"
+    ):
         recording.spawn(default_blueprint=_blueprint(scene))
-    except Exception as error:
-        raise CalibError(f"Rerun's window did not open ({error}); calib view --save FILE.rrd writes a file") from error
     _send(recording, scene)
     recording.flush()
     return scene

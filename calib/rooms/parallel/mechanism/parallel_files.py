@@ -37,7 +37,7 @@ import numpy as np
 
 from calib import files
 from calib.config_types import shown
-from calib.errors import RobotError, suggestion
+from calib.errors import RobotError, refuse_robot, suggestion
 from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, spelled, vector, word
@@ -74,12 +74,12 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
     gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
     own, place = table.get("platform"), f"{where}, [platform]"
     if not isinstance(own, Mapping):
-        raise RobotError(f"{where}: no [platform] table found")
+        refuse_robot(where, "no [platform] table found")
     check_keys(own, _PLATFORM, place)
     freedom = _words(own.get("freedom"), f"{place}, freedom")
     legs = table.get("leg")
     if not isinstance(legs, list) or not legs or not all(isinstance(leg, Mapping) for leg in legs):
-        raise RobotError(f"{where}: no [[leg]] tables found; a parallel robot needs one per leg")
+        refuse_robot(where, "no [[leg]] tables found; a parallel robot needs one per leg")
     return ParallelRobot(
         name=word(table, "name", where),
         legs=tuple(_leg(leg, k, gravity, where) for k, leg in enumerate(legs)),
@@ -127,7 +127,7 @@ def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str
     chain = _based(mdh.from_table(rows, place), placement(entry.get("base", {}), f"{place}, base"))
     home = entry.get("home", [0.0] * chain.n)
     if not isinstance(home, list) or len(home) != chain.n:
-        raise RobotError(f"{place}: home needs one value per joint, {chain.n}; found {shown(home)}")
+        refuse_robot(place, f"home needs one value per joint, {chain.n}; found {shown(home)}")
     kinds = ["angle" if joint.kind == "revolute" else "length" for joint in chain.joints]
     return Leg(
         name,
@@ -150,13 +150,13 @@ def _actuated(entry: Mapping[str, Any], chain: Chain, place: str) -> tuple[int, 
     for one in named:
         if one not in chain.joint_names:
             near = suggestion(one, chain.joint_names)
-            raise RobotError(f"{place}: actuated '{one}' is none of its joints{near}: {', '.join(chain.joint_names)}")
+            refuse_robot(place, f"actuated '{one}' is none of its joints{near}: {', '.join(chain.joint_names)}")
     return tuple(sorted(chain.joint_names.index(one) for one in dict.fromkeys(named)))
 
 
 def _words(value: Any, where: str) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
-        raise RobotError(f"{where}: expected a list of names, found {shown(value)}")
+        refuse_robot(where, f"expected a list of names, found {shown(value)}")
     return tuple(value)
 
 
@@ -164,9 +164,7 @@ def _box(table: Mapping[str, Any], key: str, freedom: tuple[str, ...], place: st
     """Return one bound per coordinate of the platform."""
     values = table.get(key)
     if not isinstance(values, list) or len(values) != len(freedom):
-        raise RobotError(
-            f"{place}: {key} needs a value per coordinate of freedom, {len(freedom)}; found {shown(values)}"
-        )
+        refuse_robot(place, f"{key} needs a value per coordinate of freedom, {len(freedom)}; found {shown(values)}")
     kinds = ["angle" if name in COORDINATES[3:] else "length" for name in freedom]
     return np.array([number(value, f"{place}, {key}", kind) for value, kind in zip(values, kinds)])
 

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import RobotError
+from calib.errors import RobotError, refuse_robot
 from calib.robot.chain import GRAVITY, Chain, Joint
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
@@ -101,22 +101,24 @@ class ParallelRobot:
             object.__setattr__(self, "platform", frozen(self.platform))
         names = [leg.name for leg in self.legs]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise RobotError(f"robot '{self.name}': two legs are called '{twice[0]}'")
+            refuse_robot(f"robot '{self.name}'", f"two legs are called '{twice[0]}'")
         unknown = [name for name in self.freedom if name not in COORDINATES]
         if unknown or not self.freedom or len(set(self.freedom)) < len(self.freedom):
-            raise RobotError(
-                f"robot '{self.name}': freedom {', '.join(self.freedom) or 'is empty'}; it names the platform's "
-                f"independent coordinates, each once, of {', '.join(COORDINATES)}"
+            refuse_robot(
+                f"robot '{self.name}'",
+                f"freedom {', '.join(self.freedom) or 'is empty'}; it names the platform's "
+                f"independent coordinates, each once, of {', '.join(COORDINATES)}",
             )
         if self.n < self.r:
-            raise RobotError(
-                f"robot '{self.name}': {self.n} actuated joints cannot hold a platform of {self.r} freedoms "
-                f"({', '.join(self.freedom)})"
+            refuse_robot(
+                f"robot '{self.name}'",
+                f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({', '.join(self.freedom)})",
             )
         if self.lower.shape != (self.r,) or self.upper.shape != (self.r,) or not (self.lower < self.upper).all():
-            raise RobotError(
-                f"robot '{self.name}': the platform's limits need one lower and one higher upper value per coordinate "
-                f"({', '.join(self.freedom)}); found {self.lower.tolist()} and {self.upper.tolist()}"
+            refuse_robot(
+                f"robot '{self.name}'",
+                "the platform's limits need one lower and one higher upper value per coordinate "
+                f"({', '.join(self.freedom)}); found {self.lower.tolist()} and {self.upper.tolist()}",
             )
 
     @property

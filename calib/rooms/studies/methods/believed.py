@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import CalibError, CannotSimulate, UsageError
+from calib.errors import CalibError, CannotSimulate, UsageError, refused_as
 from calib.identification.cases import Case
 from calib.identification.methods.method import IdentificationProblem
 from calib.simulation.loop.closed_loop import Plant
@@ -70,10 +70,8 @@ def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot
         CannotSimulate: for friction that the simulator does not know, or an exact sign.
     """
     model, columns = with_friction(problem, serial_arm(problem, method))
-    try:
+    with refused_as(CannotSimulate, CalibError, "{}"):
         plant = Plant(model.bodies, model.terms, np.zeros(model.p))
-    except CalibError as error:
-        raise CannotSimulate(str(error)) from error
     return BelievedRobot(model, columns, plant)
 
 
