@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import IO
+from typing import IO, NoReturn
 
 import numpy as np
 
@@ -58,13 +58,15 @@ class Table:
     def __contains__(self, name: str) -> bool:
         return name in self.header
 
+    def fail(self, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
+        """Refuse the table, a column of it, or the cell in a row (from 0)."""
+        raise MeasurementError(message, self.file, None if row is None else int(self.rows[row]), column)
+
     def index(self, name: str) -> int:
         """Return the place of column `name`; one that is not there is refused with the nearest one that is."""
         if name not in self.header:
             found = ", ".join(self.header)
-            raise MeasurementError(
-                f"column '{name}' is missing{suggestion(name, self.header)}; found: {found}", self.file
-            )
+            self.fail(f"column '{name}' is missing{suggestion(name, self.header)}; found: {found}")
         return self.header.index(name)
 
     def texts(self, name: str) -> list[str]:
@@ -92,25 +94,25 @@ class Table:
         cells = self.cells[column]
         if cells.dtype != float:
             row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-            raise MeasurementError(_not_a_number(cells[row]), self.file, int(self.rows[row]), name)
+            self.fail(_not_a_number(cells[row]), name, row)
         wrong = np.isinf(cells) if gaps else ~np.isfinite(cells)
         if wrong.any():
             row = int(np.argmax(wrong))
             found = "an empty or NaN cell" if np.isnan(cells[row]) else f"{cells[row]}"
             message = f"found {found} where a number is needed; leave the row out, or measure it again"
-            raise MeasurementError(message, self.file, int(self.rows[row]), name)
+            self.fail(message, name, row)
         return cells * self._factor(column, dimension, unit)
 
     def _factor(self, column: int, dimension: str, unit: str) -> float:
         name, own = self.header[column], self.units[column]
         if own and unit and own != unit:
             message = f"its header says [{own}], the options say {unit}: take one of them away"
-            raise MeasurementError(message, self.file, column=name)
+            self.fail(message, name)
         unit = own or unit
         known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
         if unit and unit.lower() not in known:
             expected = ", ".join(name for name in known if name.isascii())
-            raise MeasurementError(f"unit [{unit}] is none of {expected}", self.file, column=name)
+            self.fail(f"unit [{unit}] is none of {expected}", name)
         return known[unit.lower()] if unit else 1.0
 
     def where(self, keep: np.ndarray) -> Table:

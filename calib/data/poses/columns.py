@@ -61,7 +61,7 @@ class Sheet:
 
     def fail(self, message: str, column: str | None = None) -> NoReturn:
         """Refuse the file, or a column of it."""
-        raise MeasurementError(message, self.table.file, column=column)
+        self.table.fail(message, column)
 
     def find(self, name: str) -> str:
         """Return the file's name of the column that we call `name`; "" where it has none."""

@@ -13,7 +13,6 @@ from calib.data.csv_table import Table
 from calib.data.poses.columns import DISTANCE, SIGMA_DISTANCE, Layout, Sheet
 from calib.data.poses.measurements import Bars, Distances, GroupedMeasurements, Planes, Sockets
 from calib.data.schema import refuse
-from calib.errors import MeasurementError
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -68,12 +67,12 @@ def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequenc
         first, last = members[0], members[-1]
         if len(members) != 2:
             message = f"pair '{name}' has {len(members)} rows; a distance joins two"
-            raise MeasurementError(message, table.file, int(table.rows[last]), layout.group[-1])
+            table.fail(message, layout.group[-1], last)
         if abs(distance[first] - distance[last]) > 1e-9:
             message = (
                 f"pair '{name}' has {distance[last]:g} m here and {distance[first]:g} m in row {table.rows[first]}"
             )
-            raise MeasurementError(message, table.file, int(table.rows[last]), layout.distance[0])
+            table.fail(message, layout.distance[0], last)
 
 
 def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:

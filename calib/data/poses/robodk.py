@@ -105,7 +105,7 @@ def _with_quaternion(table: Table, options: FileOptions) -> tuple[Table, tuple[s
         if np.abs(angles).max() < 1.001 * np.pi:
             message = "all angles are within ±3.15: deg as RoboDK's manual says, or rad as its macro takes them?"
             message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
-            raise MeasurementError(message, table.file, int(table.rows[0]), "w")
+            table.fail(message, "w", 0)
         angles = np.deg2rad(angles)
     euler = options.euler or "wpr"
     meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}.get(euler, euler)

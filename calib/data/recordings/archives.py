@@ -16,9 +16,11 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 from pathlib import Path
-from typing import IO
+from typing import IO, NoReturn
 
 import numpy as np
 from numpy.lib import format as npy
@@ -33,9 +35,9 @@ from calib.data.recordings.recording_options import (
     joint_order,
     scale,
 )
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, refused_as, require
 
-MEMBERS, LARGEST = 1000, 8_000_000_000  # of an archive, and bytes of a member (our choices)
+MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)
 Ends = tuple[float | None, float | None]
 
 
@@ -43,56 +45,123 @@ def read_archive(
     path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
 ) -> Recording:
     """Return the rows of a NumPy archive (.npz) from ends[0] to ends[1] [s], unchecked but for their shapes."""
-    options = options or RecordingOptions()
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _from_archive(archive, path, joints, options, ends)
-    except (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, UnicodeError) as error:
-        raise MeasurementError(f"is a damaged archive ({error}): was it copied whole?", path) from error
-    except (RuntimeError, NotImplementedError) as error:  # zipfile's words for a password, and for unknown compression
-        raise MeasurementError(f"cannot be unpacked ({error}): save it with np.savez", path) from error
-    except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror or error}", path) from error
+    damaged = (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, UnicodeError)
+    with (
+        refused_as(MeasurementError, OSError, "cannot be read: {}", path),
+        # zipfile's words for a password, and for unknown compression
+        refused_as(
+            MeasurementError,
+            (RuntimeError, NotImplementedError),
+            "cannot be unpacked ({}): save it with np.savez",
+            path,
+        ),
+        refused_as(MeasurementError, damaged, "is a damaged archive ({}): was it copied whole?", path),
+        zipfile.ZipFile(path) as archive,
+    ):
+        return _recording(_Archive(archive, path), joints, options or RecordingOptions(), ends)
 
 
-def _from_archive(
-    archive: zipfile.ZipFile, path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends
-) -> Recording:
-    if len(archive.infolist()) > MEMBERS:
-        raise MeasurementError(f"has {len(archive.infolist())} members: is this a recording?", path)
-    members = {name.removesuffix(".npy"): name for name in archive.namelist()}
-    found = find_names(tuple(members), options, path)
-    count = _shape(archive, members[found["q"]], path)[0]
-    t = _stamps(archive, members, found, options, count, path)
-    rows, notes = _range(archive, members, t, options, ends, path)
-    q = _member(archive, members[found["q"]], path, rows)
+@dataclass(frozen=True)
+class _Archive:
+    """The open file, and where it is."""
+
+    file: zipfile.ZipFile
+    path: Path
+
+    @cached_property
+    def members(self) -> dict[str, str]:
+        """Member → its name in the file."""
+        return {name.removesuffix(".npy"): name for name in self.file.namelist()}
+
+    def fail(self, message: str, name: str | None = None) -> NoReturn:
+        """Refuse the archive, or a member of it."""
+        raise MeasurementError(message, self.path, column=name)
+
+    def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
+        """Open a member behind its header; return it with shape, order and type."""
+        member, kinds = self.members[name], (ValueError, TypeError, KeyError, SyntaxError, tokenize.TokenError)
+        stream = self.file.open(member)
+        with refused_as(
+            MeasurementError, (*kinds, RecursionError, OverflowError), "is no NumPy array ({})", self.path, None, name
+        ):
+            version = npy.read_magic(stream)
+            read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+            shape, fortran, dtype = read(stream)
+        size = prod(shape) * dtype.itemsize
+        if dtype.hasobject:
+            self.fail("holds Python objects, which are not read (they could run code): save plain arrays", name)
+        if any(length < 0 for length in shape) or size > self.file.getinfo(member).file_size:
+            self.fail(f"says that it is {shape}, which is more than there is: was it copied whole?", name)
+        if size > MAX_BYTES:
+            self.fail(f"holds {size / 1e9:.3g} GB, more than {MAX_BYTES / 1e9:g}: cut the recording", name)
+        return stream, shape, fortran, dtype
+
+    def read(self, name: str, rows: slice | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
+        """Return the `rows` of a member as floats (with `exact` in its own type) without holding the others.
+
+        Args:
+            kinds: of numpy's types that are what it should hold.
+        """
+        stream, shape, fortran, dtype = self.header(name)
+        with stream:
+            if dtype.kind not in kinds:
+                self.fail(f"holds {dtype}, expected {'texts' if 'U' in kinds else 'numbers'}", name)
+            if fortran or not shape or rows is None:
+                rows = slice(0, shape[0] if shape else 1) if rows is None else rows
+                values = np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
+                values = values[rows] if shape else values
+            else:
+                size = dtype.itemsize * int(np.prod(shape[1:]))
+                _skip(stream, rows.start * size)
+                values = np.frombuffer(stream.read((rows.stop - rows.start) * size), dtype).reshape(-1, *shape[1:])
+            _skip(stream, 1 << 62)  # to its end: the sum that tells damage is checked there
+        return values if exact else values.astype(float)
+
+    def few(self, name: str, count: int) -> np.ndarray | None:
+        """Return a member of `count` finite numbers; None where there is none of that name."""
+        if name not in self.members:
+            return None
+        values = self.read(name, kinds="fiu").ravel()
+        if len(values) != count or not np.isfinite(values).all():
+            shown = np.array2string(values, threshold=8, edgeitems=3)
+            self.fail(f"expected {count} finite number(s), found {shown[:100]}", name)
+        return values
+
+
+def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptions, ends: Ends) -> Recording:
+    count, path = len(archive.file.infolist()), archive.path
+    require(count <= MAX_MEMBERS, f"has {count} members: is this a recording?", MeasurementError, path)
+    found = find_names(tuple(archive.members), options, path)
+    stream, shape, _, _ = archive.header(found["q"])
+    stream.close()
+    t = _stamps(archive, found, options, (shape or (0,))[0])
+    rows, notes = _range(archive, t, options, ends)
+    q = archive.read(found["q"], rows)
     if q.ndim != 2:
-        raise MeasurementError(f"has shape {q.shape}, expected (samples, joints)", path, column=found["q"])
+        archive.fail(f"has shape {q.shape}, expected (samples, joints)", found["q"])
     kind = "current" if "current" in found else "torque"
-    names = _names(archive, members, path)
-    order, names = joint_order(names, joints, q.shape[1], path)
+    order, names = joint_order(_names(archive), joints, q.shape[1], path)
     series = {}
     for ours, theirs in found.items():
         if ours in ("t", "q"):
             continue
-        values = _member(archive, members[theirs], path, rows)
+        values = archive.read(theirs, rows)
         if values.shape != q.shape:
-            message = f"has shape {values.shape} where {found['q']} has {q.shape} (samples, joints)"
-            raise MeasurementError(message, path, column=theirs)
+            archive.fail(f"has shape {values.shape} where {found['q']} has {q.shape} (samples, joints)", theirs)
         series["effort" if ours == kind else ours] = _arrange(values, order, scale(ours, options.units.get(ours, "")))
-    gain = _few(archive, members, "drive_gain", path, q.shape[1])
+    gain = archive.few("drive_gain", q.shape[1])
     if gain is not None and (gain == 0.0).any():
-        raise MeasurementError("has a gain of zero: no current makes a torque there", path, column="drive_gain")
-    factor = scale(kind, options.units.get(kind, ""))
+        archive.fail("has a gain of zero: no current makes a torque there", "drive_gain")
     variance = f"variance_{found.get(kind, '')}"
-    unused = [name for name in members if name not in (*found.values(), *OWN, *RATES, "periods", variance)]
+    unused = [name for name in archive.members if name not in (*found.values(), *OWN, *RATES, "periods", variance)]
+    noise = _variance(archive, variance, q.shape, rows)
     return Recording(
         t[rows],
         _arrange(q, order, scale("q", options.units.get("q", ""))),
         kind=kind,
         joint_names=names,
         drive_gain=None if gain is None else gain[order],
-        effort_variance=_variance(archive, members, variance, path, q.shape, rows, order, factor),
+        effort_variance=None if noise is None else noise[order] * scale(kind, options.units.get(kind, "")) ** 2,
         file=str(path),
         rows=np.arange(rows.start, rows.stop) + 1,
         notes=(*notes, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
@@ -100,144 +169,62 @@ def _from_archive(
     )
 
 
-def _variance(
-    archive: zipfile.ZipFile, members: Mapping[str, str], name: str, path: Path, shape: tuple[int, ...], rows: slice,
-    order: list[int], factor: float,
-) -> np.ndarray | None:  # fmt: skip
+def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: slice) -> np.ndarray | None:
     """Return the mean variance (n,) of the averaged effort: that of one sample over the number of periods."""
-    if name not in members or "periods" not in members:
+    periods = archive.few("periods", 1)
+    if name not in archive.members or periods is None:
         return None
-    values = _member(archive, members[name], path, rows)
+    values = archive.read(name, rows)
     if values.shape != shape:
-        raise MeasurementError(f"has shape {values.shape}, expected {shape} (samples, joints)", path, column=name)
-    (periods,) = _few(archive, members, "periods", path, 1)  # type: ignore[misc]  # it is there
-    if not (periods >= 1 and np.isfinite(values).all() and (values >= 0).all()):
-        message = f"expected variances, finite and not negative, over one period or more; periods is {periods:g}"
-        raise MeasurementError(message, path, column=name)
-    return np.asarray(values.mean(axis=0)[order] * factor**2 / periods)
+        archive.fail(f"has shape {values.shape}, expected {shape} (samples, joints)", name)
+    if not (periods[0] >= 1 and np.isfinite(values).all() and (values >= 0).all()):
+        archive.fail(
+            f"expected variances, finite and not negative, over one period or more; periods is {periods[0]:g}", name
+        )
+    return np.asarray(values.mean(axis=0) / periods[0])
 
 
-def _stamps(
-    archive: zipfile.ZipFile,
-    members: Mapping[str, str],
-    found: Mapping[str, str],
-    options: RecordingOptions,
-    count: int,
-    path: Path,
-) -> np.ndarray:
+def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
     """Return all stamps (N,) [s] from the first, or the counts of the samples over a stated rate."""
     if "t" not in found:
-        stated = next((name for name in RATES if name in members), "")
-        own = _few(archive, members, stated, path, 1) if stated and not options.rate else None
+        stated = next((name for name in RATES if name in archive.members), "")
+        own = archive.few(stated, 1) if not options.rate else None
         rate = options.rate or (0.0 if own is None else float(own[0]))
         if not rate > 0:
             wanted = f"{', '.join(SYNONYMS['t'])}, or {', '.join(RATES)}"
-            raise MeasurementError(f"has neither stamps nor a rate ({wanted}); found: {', '.join(members)}", path)
+            archive.fail(f"has neither stamps nor a rate ({wanted}); found: {', '.join(archive.members)}")
         return np.arange(count) / rate
-    t = _member(archive, members[found["t"]], path, exact=True, kinds="fiu").ravel()
+    t = archive.read(found["t"], exact=True, kinds="fiu").ravel()
     if len(t) != count:
-        raise MeasurementError(f"has {len(t)} stamps where q has {count} samples", path, column=found["t"])
+        archive.fail(f"has {len(t)} stamps where q has {count} samples", found["t"])
     return (t - t[0] if len(t) else t).astype(float) * scale("t", options.units.get("t", ""))
 
 
-def _range(
-    archive: zipfile.ZipFile,
-    members: Mapping[str, str],
-    t: np.ndarray,
-    options: RecordingOptions,
-    ends: Ends,
-    path: Path,
-) -> tuple[slice, list[str]]:
+def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[slice, list[str]]:
     """Return the rows to read: of the cut, else of the file's use_range, else all."""
     if ends != (None, None):
         ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
         first, end = span(ordered, *ends)
         if first >= end:
-            Recording(t, np.zeros((len(t), 0)), np.zeros((len(t), 0)), "torque", (), file=str(path)).cut(*ends)
+            empty = np.zeros((len(t), 0))
+            Recording(t, empty, empty, "torque", (), file=str(archive.path)).cut(*ends)
         return slice(first, end), []
-    stated = _few(archive, members, "use_range", path, 2) if options.use_range else None
+    stated = archive.few("use_range", 2) if options.use_range else None
     if stated is None:
         return slice(0, len(t)), []
     first, end = (int(value) for value in np.clip(stated, -1, len(t) + 1))
     if not 0 <= first < end <= len(t):
-        raise MeasurementError(f"is {first} to {end}, but there are {len(t)} samples", path, column="use_range")
+        archive.fail(f"is {first} to {end}, but there are {len(t)} samples", "use_range")
     whole = first == 0 and end == len(t)
     return slice(first, end), [] if whole else [f"rows {first + 1} to {end} of {len(t)} are used: its use_range"]
 
 
-def _few(archive: zipfile.ZipFile, members: Mapping[str, str], name: str, path: Path, count: int) -> np.ndarray | None:
-    """Return a member of `count` finite numbers; None where there is none of that name."""
-    if name not in members:
-        return None
-    values = _member(archive, members[name], path, kinds="fiu").ravel()
-    if len(values) != count or not np.isfinite(values).all():
-        shown = np.array2string(values, threshold=8, edgeitems=3)
-        raise MeasurementError(f"expected {count} finite number(s), found {shown[:100]}", path, column=name)
-    return values
-
-
-def _names(archive: zipfile.ZipFile, members: Mapping[str, str], path: Path) -> list[str]:
+def _names(archive: _Archive) -> list[str]:
     """Return the joints' names; none where the archive has none."""
-    if "joint_names" not in members:
+    if "joint_names" not in archive.members:
         return []
-    values = _member(archive, members["joint_names"], path, exact=True, kinds="US").ravel()
+    values = archive.read("joint_names", exact=True, kinds="US").ravel()
     return [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in values.tolist()]
-
-
-def _header(archive: zipfile.ZipFile, member: str, path: Path) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
-    """Open a member behind its header; returns it with shape, order and type."""
-    stream, column = archive.open(member), member.removesuffix(".npy")
-    try:
-        version = npy.read_magic(stream)
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, fortran, dtype = read(stream)
-    except (ValueError, TypeError, KeyError, SyntaxError, tokenize.TokenError, RecursionError, OverflowError) as error:
-        stream.close()
-        raise MeasurementError(f"is no NumPy array ({error})", path, column=column) from error
-    message, size = "", prod(shape) * dtype.itemsize
-    if dtype.hasobject:
-        message = "holds Python objects, which are not read (they could run code): save plain arrays"
-    elif any(length < 0 for length in shape) or size > archive.getinfo(member).file_size:
-        message = f"says that it is {shape}, which is more than there is: was it copied whole?"
-    elif size > LARGEST:
-        message = f"holds {size / 1e9:.3g} GB, more than {LARGEST / 1e9:g}: cut the recording"
-    if message:
-        stream.close()
-        raise MeasurementError(message, path, column=column)
-    return stream, shape, fortran, dtype
-
-
-def _shape(archive: zipfile.ZipFile, member: str, path: Path) -> tuple[int, ...]:
-    stream, shape, _, _ = _header(archive, member, path)
-    stream.close()
-    return shape or (0,)
-
-
-def _member(
-    archive: zipfile.ZipFile, member: str, path: Path, rows: slice | None = None, exact: bool = False,
-    kinds: str = "fiub",
-) -> np.ndarray:  # fmt: skip
-    """Return the `rows` of a member as floats (with `exact` in its own type) without holding the others.
-
-    Args:
-        kinds: of numpy's types that are what it should hold.
-    """
-    stream, shape, fortran, dtype = _header(archive, member, path)
-    if dtype.kind not in kinds:
-        stream.close()
-        wanted = "texts" if "U" in kinds else "numbers"
-        raise MeasurementError(f"holds {dtype}, expected {wanted}", path, column=member.removesuffix(".npy"))
-    with stream:
-        if fortran or not shape or rows is None:
-            rows = slice(0, shape[0] if shape else 1) if rows is None else rows
-            values = np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
-            values = values[rows] if shape else values
-        else:
-            size = dtype.itemsize * int(np.prod(shape[1:]))
-            _skip(stream, rows.start * size)
-            values = np.frombuffer(stream.read((rows.stop - rows.start) * size), dtype).reshape(-1, *shape[1:])
-        _skip(stream, 1 << 62)  # to its end: the sum that tells damage is checked there
-    return values if exact else values.astype(float)
 
 
 def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:

@@ -110,7 +110,7 @@ def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dic
             found[ours] = places
         elif ours in options.names:
             message = f"no column begins with '{options.names[ours]}'{suggestion(options.names[ours], table.header)}"
-            raise MeasurementError(f"{message}; found: {', '.join(table.header)}", table.file)
+            table.fail(f"{message}; found: {', '.join(table.header)}")
     return found
 
 
@@ -158,10 +158,10 @@ def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> n
     cells, own, stated = table.cells[place], table.units[place], options.units.get(ours, "")
     if cells.dtype != float:
         values = table.numbers(table.header[place])  # raises, with the row
-        raise MeasurementError(f"expected numbers, found {values}", table.file, column=table.header[place])
+        table.fail(f"expected numbers, found {values}", table.header[place])
     if own and stated and own != stated:
         message = f"its header says [{own}], the options say {stated}: take one of them away"
-        raise MeasurementError(message, table.file, column=table.header[place])
+        table.fail(message, table.header[place])
     with refused_as(MeasurementError, UsageError, "{}", table.file, None, table.header[place]):
         return cells * scale(ours, own or stated)
 
@@ -174,4 +174,4 @@ def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions
         return np.arange(len(table)) / options.rate
     wanted = ", ".join(SYNONYMS["t"])
     message = f"has no column of stamps ({wanted}), and the options state no rate; found: {', '.join(table.header)}"
-    raise MeasurementError(message, table.file)
+    table.fail(message)
