@@ -145,6 +145,16 @@ def refuse_robot(place: object, words: str) -> NoReturn:
     raise RobotError(f"{place}: {words}")
 
 
+def refuse_data(file: object, words: str, column: str | None = None, row: int | None = None) -> NoReturn:
+    """Refuse measured data: a file (or a block of that name), a column of it, or a row (from 1)."""
+    raise MeasurementError(words, str(file) if file else None, row, column)
+
+
+def refuse_option(place: object, words: str) -> NoReturn:
+    """Refuse an option, a command or an options file for what stands at a place of it."""
+    raise UsageError(f"{place}: {words}")
+
+
 def one_of(word: Any, words: Collection[str], what: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
     """Return `word`; one that is none of `words` raises ``what 'word' is none of ... (did you mean ...?)``."""
     if word not in words:

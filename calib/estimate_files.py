@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import RobotError, refused_as, require
+from calib.errors import RobotError, refuse_robot, refused_as, require
 from calib.records import plain_text
 
 ESTIMATE, COVARIANCE = "estimate.csv", "covariance.csv"
@@ -84,6 +84,6 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
         matrix = np.array([row[1:] for row in rows], dtype=float)
     names = tuple(map(plain_text, header[1:]))
     if tuple(plain_text(row[0]) for row in rows if row) != names or matrix.shape != (len(names), len(names)):
-        raise RobotError(f"{path}: rows and columns do not name the same parameters; {AGAIN}")
+        refuse_robot(path, f"rows and columns do not name the same parameters; {AGAIN}")
     require(np.isfinite(matrix).all(), f"{path}: not a table of finite numbers; {AGAIN}", RobotError)
     return names, matrix

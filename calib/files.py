@@ -20,7 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.errors import CalibError, UsageError, refused_as, require
+from calib.errors import CalibError, UsageError, refuse_option, refused_as, require
 from calib.records import plain, shielded
 
 if TYPE_CHECKING:  # the commands' help is written without loading it
@@ -176,7 +176,7 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     check_writable(out.absolute().parent, out)
     check_not_input([out], inputs)
     if suffixes and out.suffix not in suffixes:
-        raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
+        refuse_option(out, f"give a file with the suffix {' or '.join(suffixes)}")
 
 
 def check_writable(folder: Path, target: Path | None = None) -> None:

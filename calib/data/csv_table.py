@@ -22,7 +22,7 @@ from typing import IO, NoReturn
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import MeasurementError, require, suggestion
+from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.files import check_regular
 from calib.records import plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
@@ -60,7 +60,7 @@ class Table:
 
     def fail(self, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
         """Refuse the table, a column of it, or the cell in a row (from 0)."""
-        raise MeasurementError(message, self.file, None if row is None else int(self.rows[row]), column)
+        refuse_data(self.file, message, column, None if row is None else int(self.rows[row]))
 
     def index(self, name: str) -> int:
         """Return the place of column `name`; one that is not there is refused with the nearest one that is."""
@@ -136,7 +136,7 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
         if not doubles and len(set(names)) < len(names):
             name = next(name for i, name in enumerate(names) if name in names[:i])
             places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
-            raise MeasurementError(f"stands in the header more than once (columns {places})", path, column=name)
+            refuse_data(path, f"stands in the header more than once (columns {places})", name)
         cells = _read_columns(lines, separator, names, path)
     require(len(cells[0]), "has a header but no data rows", MeasurementError, path)
     rows = frozen(np.arange(1, len(cells[0]) + 1), int)
@@ -175,7 +175,7 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
         comment, place = "", 0
         for line in iter(partial(file.readline, LONGEST), ""):
             if len(line) == LONGEST:
-                raise MeasurementError(f"has a line of more than {LONGEST} letters: this is no table", path)
+                refuse_data(path, f"has a line of more than {LONGEST} letters: this is no table")
             text = line.strip()
             if text.startswith("#"):
                 comment = text
@@ -196,13 +196,13 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
         raise _not_utf8(error, path) from error
     except (csv.Error, StopIteration) as error:
         raise MeasurementError(f"is no CSV: {error}", path) from error
-    raise MeasurementError("is empty: no header and no rows", path)
+    refuse_data(path, "is empty: no header and no rows")
 
 
 def _headless(cells: Sequence[str], path: str | Path) -> bool:
     """Tell whether a first line is one of numbers."""
     if sum(bool(_DECIMAL_COMMA.match(cell)) for cell in cells) > len(cells) / 2:
-        raise MeasurementError(_not_a_number(cells[0]), path, 1)
+        refuse_data(path, _not_a_number(cells[0]), row=1)
     return sum(_is_number(cell) for cell in cells) > len(cells) / 2
 
 
@@ -234,7 +234,7 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
         f"has no header: its first line is numbers, {width} cells. Add a first line that names the columns "
         "(q1,q2,...,x,y,z), or give `format` in the options where the file is of a known headerless form"
     )
-    raise MeasurementError(message, path)
+    refuse_data(path, message)
 
 
 def _split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -300,7 +300,7 @@ def _read_cells(
         while chunk := list(islice(rows, _CHUNK)):
             ragged = next((i for i, row in enumerate(chunk) if len(row) != len(names)), None)
             if ragged is not None:
-                raise MeasurementError(_ragged(chunk[ragged], names, separator), path, done + ragged + 1)
+                refuse_data(path, _ragged(chunk[ragged], names, separator), row=done + ragged + 1)
             for part, column in zip(parts, zip(*chunk)):
                 part.append(_convert(column))
             done += len(chunk)

@@ -24,8 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.data.poses.pixels import Pixels
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, refuse_data
 from calib.extensions import needed
+from calib.geometry.images.camera_guess import place_camera, seen_target
 from calib.geometry.images.hand_eye import average_pose, chordal_turns, place_pose
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
@@ -105,18 +106,18 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
     if not 1.0 / max_ratio < measured / predicted < max_ratio:
         likely, header = _likely_units(block, chain, measured, predicted)
         read = "".join(f" The file was {note}." for note in block.notes if note.startswith("read as"))
-        raise MeasurementError(
+        refuse_data(
+            block.file,
             f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
             f"{predicted:.4g} m, {measured / predicted:.3g} times as much{likely}{read} State the unit in the "
             f"header, as in {header}, or look whether this is the right robot",
-            block.file,
         )
     if second < across / max_ratio and across > min_spread:
-        raise MeasurementError(
+        refuse_data(
+            block.file,
             f"the measured positions lie on a line, within {1e3 * second:.3g} mm, where the robot's joints make it "
             f"move {1e3 * across:.3g} mm across: are two of x, y, z constant or the same column, or were points "
             "repeated? Measure poses all over the workspace",
-            block.file,
         )
 
 
@@ -198,13 +199,13 @@ def _optics(measured: Sequence[PoseMeasurements]) -> Optics:
         if not isinstance(block, Pixels):
             continue
         if block.lens is None or not block.mounting:
-            raise MeasurementError("lens and mounting of the camera are not known (see complete_camera)", block.file)
+            refuse_data(block.file, "lens and mounting of the camera are not known (see complete_camera)")
         lens = lenses.setdefault(block.camera, block.lens)
         if lens.size != block.lens.size or lens.model != block.lens.model:
-            raise MeasurementError(
+            refuse_data(
+                block.file,
                 f"camera '{block.camera}' took images of {lens.size} and of {block.lens.size} pixels: are these two "
                 "cameras? Give --tools each (a camera in the hand) or --stations each, or name them in the options",
-                block.file,
             )
         boards.setdefault(block.target, BoardShape())
         for name in block.free:
@@ -229,10 +230,10 @@ def _guess_from_sockets(
 
 def _enough(block: PoseMeasurements, rows: np.ndarray, needed: int) -> None:
     if rows.sum() < needed:
-        raise MeasurementError(
+        refuse_data(
+            block.file,
             f"{int(rows.sum())} usable rows: placing the instrument and the target takes at least {needed} different "
             "poses, and a calibration some 20 or more; measure more poses",
-            block.file,
         )
 
 

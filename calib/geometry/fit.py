@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import MeasurementError, Unidentifiable
+from calib.errors import Unidentifiable, refuse_data
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
 from calib.estimation.relevance import gram, relevance
@@ -101,11 +101,11 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers:
     if numbers < min_numbers * unknowns:
         poses = sum(len(block.measured) for block in blocks)
         needed = math.ceil(min_numbers * unknowns * poses / max(numbers, 1))
-        raise MeasurementError(
+        refuse_data(
+            blocks[0].measured.file,
             f"{poses} poses are too few: {unknowns} unknowns need at least {needed} such poses, so that the fit can be "
             "judged, too, and a full geometry some 20 to 40; measure more, or ask for a smaller model ('offsets' or "
             "'frames')",
-            blocks[0].measured.file,
         )
 
 

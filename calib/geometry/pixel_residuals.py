@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.data.camera.board import corners
 from calib.data.poses.pixels import IN_HAND, Pixels
-from calib.errors import MeasurementError, UsageError
+from calib.errors import refuse_data, refuse_option
 from calib.geometry.images.image_noise import ImageNoise, OwnPoses
 from calib.geometry.images.optics import View, shape_slopes
 from calib.geometry.installation import Installation, Seen
@@ -156,9 +156,10 @@ def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
 def view_of(cell: Installation, measured: Pixels, free: np.ndarray) -> View:
     """Return the lens and the board that images are predicted with, and which of their values are free."""
     if measured.camera not in cell.optics.lens_names or measured.target not in cell.optics.board_names:
-        raise UsageError(
-            f"{measured.file}: camera '{measured.camera}' with board '{measured.target}' is not part of the "
-            f"installation, which has {', '.join(cell.optics.lens_names) or 'no camera'}"
+        refuse_option(
+            measured.file,
+            f"camera '{measured.camera}' with board '{measured.target}' is not part of the "
+            f"installation, which has {', '.join(cell.optics.lens_names) or 'no camera'}",
         )
     start = sum(layout_counts(cell)[:3])
     wanted = start + cell.optics.place(measured.camera, measured.target)
@@ -176,7 +177,7 @@ def view_of(cell: Installation, measured: Pixels, free: np.ndarray) -> View:
 def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = y - π(point), see the module."""
     if seen.view is None:
-        raise MeasurementError("no camera is known for these images", measured.file)
+        refuse_data(measured.file, "no camera is known for these images")
     view, in_hand = seen.view, measured.mounting == IN_HAND
     image, corner = np.nonzero(measured.seen)
     place, bend = shape_slopes(measured.board, view.shape, corners(measured.board))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasurements, Poses, Positions, Sockets
-from calib.errors import MeasurementError
+from calib.errors import refuse_data
 from calib.geometry.installation import Seen
 
 
@@ -85,7 +85,7 @@ def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
     Raises:
         MeasurementError: for a type without one.
     """
-    raise MeasurementError(f"no residual is registered for measurements of kind '{measured.kind}'", measured.file)
+    refuse_data(measured.file, f"no residual is registered for measurements of kind '{measured.kind}'")
 
 
 @parts.register
@@ -125,9 +125,7 @@ def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
     if np.any(counts != 2):
         odd = groups[counts != 2][0]
         row = int(measured.rows[measured.group == odd][0])
-        raise MeasurementError(
-            f"pair {odd} has {counts[counts != 2][0]} rows; a distance needs two", measured.file, row
-        )
+        refuse_data(measured.file, f"pair {odd} has {counts[counts != 2][0]} rows; a distance needs two", row=row)
     return order[0::2], order[1::2]
 
 

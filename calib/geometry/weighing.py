@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.errors import MeasurementError, UsageError
+from calib.errors import UsageError, refuse_data
 from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution, covariance
@@ -90,10 +90,10 @@ class Weigher:
         rows = sum(part.value.size for part in found)
         unknown = len(self.free) + sum(part.nuisances for part in found)
         if rows < unknown and self.prior is None:
-            raise MeasurementError(
+            refuse_data(
+                self.blocks[0].measured.file,
                 f"{rows} measured numbers cannot determine {unknown} unknowns; measure more poses, or fit a smaller "
                 "model ('frames' or 'offsets')",
-                self.blocks[0].measured.file,
             )
         share = max(1.0 - unknown / rows, 0.05)
         loss = "none" if self.settings.loss == "auto" else self.settings.loss

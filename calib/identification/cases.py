@@ -10,7 +10,7 @@ import numpy as np
 from calib.arrays import frozen
 from calib.data.signals.motion import Motion, moving
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
-from calib.errors import MeasurementError, UsageError
+from calib.errors import UsageError, refuse_data
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +61,10 @@ def make_case(
     """
     effort = np.array(motion.effort) if gains is None else motion.effort * gains
     if rows.sensed and motion.tau_link is None:
-        raise MeasurementError(
+        refuse_data(
+            motion.file,
             f"rows '{rows.name}' need torques of sensors behind the gear (columns tau_l1 …, tau_sensor1 …) beside "
             "motors'",
-            motion.file,
         )
     target = rows.target(effort, motion.tau_link, motion.q, motion.v)
     known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)

@@ -16,7 +16,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel, States
 from calib.dynamics.torque_rows import POWER
-from calib.errors import MeasurementError, UsageError, require
+from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
 from calib.identification.cases import Case
@@ -325,16 +325,16 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
         )
     for case in cases:
         if case.noise is None:
-            raise MeasurementError(
+            refuse_data(
+                case.motion.file,
                 'has no variances of its torques (variance_tau and periods), which weights = "repeats" needs: average '
                 'repeats with calib recall DIR LOG --out avg.npz, or take weights = "residuals"',
-                case.motion.file,
             )
         if not (case.noise > 0).all():
             silent = case.motion.joint_names[int(np.argmin(case.noise))]
-            raise MeasurementError(
-                f'joint {silent} has no variance over the periods: it cannot be weighed; take weights = "residuals"',
+            refuse_data(
                 case.motion.file,
+                f'joint {silent} has no variance over the periods: it cannot be weighed; take weights = "residuals"',
             )
     squares = np.array([case.noise**2 for case in cases if case.noise is not None])
     return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
@@ -391,9 +391,7 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
 def _require_motion(cases: Sequence[Case]) -> None:
     """Refuse cases to learn from in which the robot stands (our choice: less than a milliradian or millimetre)."""
     if all((np.ptp(case.motion.q, axis=0) < 1e-3).all() for case in cases):
-        raise MeasurementError(
-            "no joint moves: that tells of gravity in one pose, and nothing else", cases[0].motion.file
-        )
+        refuse_data(cases[0].motion.file, "no joint moves: that tells of gravity in one pose, and nothing else")
 
 
 def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:

@@ -50,7 +50,7 @@ from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import RobotError, UsageError, refused_as
+from calib.errors import RobotError, refuse_option, refused_as
 from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.calibrated import ROBOT
@@ -102,10 +102,11 @@ def refuse_currents(folder: Path, task: str) -> None:
     """
     unit = read_table(folder).get("unit", TORQUE)
     if unit != TORQUE:
-        raise UsageError(
-            f"{folder}: torques are {without_gains(unit)}; {task} needs N m: state "
+        refuse_option(
+            folder,
+            f"torques are {without_gains(unit)}; {task} needs N m: state "
             "gains = [...] (N m/A) in the options file, or identify them with [gain_identification] (runs without and "
-            "with a load of known mass), and run calib identify again"
+            "with a load of known mass), and run calib identify again",
         )
 
 

@@ -16,7 +16,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
-from calib.errors import UsageError, require
+from calib.errors import UsageError, refuse_option, require
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.robot.chain import Chain
@@ -146,5 +146,5 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
     """Return n values from one or n."""
     if len(values) not in (1, n):
-        raise UsageError(f"{name}: {len(values)} values for {n} joints; give one, or one per joint")
+        refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
     return tuple(values) * n if len(values) == 1 else tuple(values)

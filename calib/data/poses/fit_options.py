@@ -54,7 +54,7 @@ from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread  # fmt: skip
 from calib.data.poses.choices import FINEST, Loss, Model
 from calib.data.poses.measurements import KINDS
-from calib.errors import UsageError, suggestion
+from calib.errors import refuse_option, suggestion
 from calib.units import ANGLES, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
@@ -169,10 +169,10 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptio
     """Return the options that a parsed TOML table holds; `source` is for messages."""
     found = replace(parse(FitOptions, inherited(table, FileOptions), source), source=source)
     if "free" in table and not found.free:
-        raise UsageError(f"{source}: free: names no parameter; leave the key out to free all")
+        refuse_option(source, "free: names no parameter; leave the key out to free all")
     both = set(found.fix) & set(found.free)
     if both:
-        raise UsageError(f"{source}: '{min(both)}' stands in fix and in free; take it out of one")
+        refuse_option(source, f"'{min(both)}' stands in fix and in free; take it out of one")
     return found
 
 
@@ -182,5 +182,5 @@ def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
     for name in options.files:
         wanted = Path(name).parts
         if not any(Path(path).parts[-len(wanted) :] == wanted for path in paths):
-            message = f'{options.source}: files."{name}" is none of the files given{suggestion(name, names)}'
-            raise UsageError(f"{message}: {', '.join(names)}")
+            near = suggestion(name, names)
+            refuse_option(options.source, f'files."{name}" is none of the files given{near}: {", ".join(names)}')

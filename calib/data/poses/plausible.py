@@ -14,7 +14,7 @@ from calib.data.poses.columns import POSITION, QUATERNION, SIGMA, TURNS, Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.schema import BOUNDS, Column, Rows, check_travel, joint_unit, max_travel, refuse
-from calib.errors import MeasurementError, require
+from calib.errors import MeasurementError, refuse_data, require
 from calib.units import ANGLES, DEG
 
 Limits = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
@@ -41,7 +41,7 @@ def check_joints(
     _check_joint_units(sheet, columns, kinds, stated)
     if len(q) > 1 and np.ptp(q, axis=0).max() < BOUNDS.min_travel:
         message = f"all {len(q)} rows have the same joint values: one pose tells nothing of the robot"
-        raise MeasurementError(message, table.file, int(table.rows[-1]), columns[0])
+        refuse_data(table.file, message, columns[0], int(table.rows[-1]))
     lower, upper = np.asarray(limits if limits is not None else [np.full(len(joints), np.nan)] * 2, dtype=float)
     bounded = np.isfinite(lower) & np.isfinite(upper)
 

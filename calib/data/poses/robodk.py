@@ -31,7 +31,7 @@ from calib.arrays import frozen
 from calib.data.csv_table import Table, read_header, read_table, row_width
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.plausible import turns
-from calib.errors import MeasurementError, require
+from calib.errors import MeasurementError, refuse_data, require
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 _POSE_MARKS = ("w", "rx", "r", "a")
@@ -53,12 +53,12 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
     """Read RoboDK's CSV into a table that the plain reader understands, with the options to read it and notes."""
     found = read_header(path)[0]
     if not recognises(found):
-        raise MeasurementError(f"is no RoboDK file: its header begins {', '.join(found[:7])}, not J1 to J6", path)
+        refuse_data(path, f"is no RoboDK file: its header begins {', '.join(found[:7])}, not J1 to J6")
     require(joints == 6, f"RoboDK's form has 6 joints, the robot has {joints}", MeasurementError, path)
     pose = len(found) == 18 or (len(found) == 12 and _plain(found[9]) in _POSE_MARKS)
     if len(found) not in (9, 12, 18):
         message = f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18"
-        raise MeasurementError(message, path)
+        refuse_data(path, message)
     raw = read_table(path, doubles=True)
     measured = 12 if pose else 9
     tcp = tuple(f"TCP {name}" for name in "xyzwpr"[: len(found) - measured])
@@ -81,7 +81,7 @@ def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
     padding = width - 9 - joints
     if padding < 0:
         message = f"has {width} columns; three reflectors and {joints} joints need {9 + joints}"
-        raise MeasurementError(message, path)
+        refuse_data(path, message)
     names = (*targets, *(f"padding {i + 1}" for i in range(padding)), *(f"q{i + 1}" for i in range(joints)))
     raw = read_table(path, header=names)
     cells = list(raw.cells)

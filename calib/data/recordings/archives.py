@@ -35,7 +35,7 @@ from calib.data.recordings.recording_options import (
     joint_order,
     scale,
 )
-from calib.errors import MeasurementError, refused_as, require
+from calib.errors import MeasurementError, refuse_data, refused_as, require
 
 MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)
 Ends = tuple[float | None, float | None]
@@ -75,7 +75,7 @@ class _Archive:
 
     def fail(self, message: str, name: str | None = None) -> NoReturn:
         """Refuse the archive, or a member of it."""
-        raise MeasurementError(message, self.path, column=name)
+        refuse_data(self.path, message, name)
 
     def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
         """Open a member behind its header; return it with shape, order and type."""

@@ -19,7 +19,7 @@ import numpy as np
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.errors import MeasurementError, brief, require, suggestion
+from calib.errors import MeasurementError, brief, refuse_data, require, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
@@ -50,14 +50,14 @@ def _connections(reader: Any, options: RecordingOptions, path: Path) -> list[Any
     found = {c.topic for c in reader.connections if c.msgtype in JOINT_STATE}
     if not found:
         topics = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)) or "none"
-        raise MeasurementError(f"has no topic of sensor_msgs/JointState; found: {topics}", path)
+        refuse_data(path, f"has no topic of sensor_msgs/JointState; found: {topics}")
     topic = options.topic or (min(found) if len(found) == 1 else "/joint_states")
     if topic not in found:
         known = ", ".join(sorted(found))
         message = f"there are joint states on {known}: say which (topic = '...')"
         if options.topic:
             message = f"has no joint states on '{topic}'{suggestion(topic, sorted(found))}; found: {known}"
-        raise MeasurementError(message, path)
+        refuse_data(path, message)
     return [c for c in reader.connections if c.topic == topic and c.msgtype in JOINT_STATE]
 
 
@@ -94,7 +94,7 @@ def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        raise MeasurementError(f"the message has no {ours} of its joints, others do", path, missing[0] + 1, ours)
+        refuse_data(path, f"the message has no {ours} of its joints, others do", ours, missing[0] + 1)
     return np.array(values)
 
 
@@ -105,7 +105,7 @@ def _refuse_joints(names: Sequence[str], seen: Sequence[tuple[str, ...]], path: 
     what = (
         f"no joint '{missing[0]}'{suggestion(missing[0], known)}" if missing else "no message with all joints at once"
     )
-    raise MeasurementError(f"has {what}; found: {', '.join(known)}", path)
+    refuse_data(path, f"has {what}; found: {', '.join(known)}")
 
 
 def _assemble(

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.schema import BOUNDS, check_travel, max_travel, refuse
-from calib.errors import MeasurementError, require
+from calib.errors import MeasurementError, refuse_data, require
 from calib.units import DEG
 
 
@@ -177,9 +177,7 @@ def _check_time(recording: Recording) -> None:
             (unit for unit, factor in units.items() if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate), ""
         )
         hint = f"the stamps look like {likely}; if so, say so (units: t = '{likely}')" if likely else "check the stamps"
-        raise MeasurementError(
-            f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", recording.file, column="t"
-        )
+        refuse_data(recording.file, f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", "t")
 
 
 def _check_size(recording: Recording, joints: Joints | None = None) -> None:
@@ -208,7 +206,7 @@ def _check_speed(recording: Recording) -> None:
         for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
                 message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, say so in the header or the units"
-                raise MeasurementError(message, recording.file, column=_columns(recording, "v")[j])
+                refuse_data(recording.file, message, _columns(recording, "v")[j])
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
@@ -248,7 +246,7 @@ def _still(recording: Recording) -> list[str]:
     for j, dead in enumerate(np.ptp(recording.effort, axis=0) == 0):
         if dead and not still[j]:
             message = f"is {recording.effort[0, j]:g} in all {len(recording)} rows while the joint moves: was it logged"
-            raise MeasurementError(message + "?", recording.file, column=_columns(recording, "effort")[j])
+            refuse_data(recording.file, message + "?", _columns(recording, "effort")[j])
         if still[j]:
             travel = (
                 "is one number"
@@ -279,7 +277,7 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
             f"{LIMITS.max_effort:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header "
             "'tau_1 [Nmm]', or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
-        raise MeasurementError(message, recording.file, column=_columns(recording, "effort")[j])
+        refuse_data(recording.file, message, _columns(recording, "effort")[j])
     high = known & (most > 1.2 * np.where(known, limit, np.inf))
     notes = [
         f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: another unit?"

@@ -28,7 +28,7 @@ from calib.data.recordings.recording_options import (
     scale,
     stem_of,
 )
-from calib.errors import MeasurementError, UsageError, refused_as, suggestion
+from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, suggestion
 
 
 def read_log(
@@ -44,7 +44,7 @@ def read_log(
     for ours, columns in found.items():
         if ours != "t" and len(columns) != n:
             message = f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q"
-            raise MeasurementError(message, path)
+            refuse_data(path, message)
         check_units(ours, [table.units[place] for place in columns], joints, path)
     kind = "current" if "current" in found else "torque"
     series: dict[str, Any] = {
@@ -86,7 +86,7 @@ def read_positions(
     if ours not in found:
         wanted = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
         message = f"has no positions that were asked for ({wanted}, with the joints' numbers or names)"
-        raise MeasurementError(f"{message}; found: {', '.join(table.header)}", path)
+        refuse_data(path, f"{message}; found: {', '.join(table.header)}")
     q = np.column_stack([_values(table, place, ours, options) for place in found[ours]])
     return _stamps(table, found, options), q
 

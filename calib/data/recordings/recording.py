@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import MeasurementError, UsageError, one_of
+from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
@@ -44,7 +44,7 @@ class Joints:
             value = getattr(self, name)
             object.__setattr__(self, name, frozen(np.full(n, np.nan) if value is None else value))
             if getattr(self, name).shape != (n,):
-                raise UsageError(f"{name}: expected {n} values, one per joint, found {getattr(self, name).shape}")
+                refuse_option(name, f"expected {n} values, one per joint, found {getattr(self, name).shape}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class Recording:
                 object.__setattr__(self, name, settled(value))
                 if getattr(self, name).shape != shape:
                     found = getattr(self, name).shape
-                    raise MeasurementError(f"{name} has shape {found}, expected {shape} (samples, joints)", self.file)
+                    refuse_data(self.file, f"{name} has shape {found}, expected {shape} (samples, joints)")
         object.__setattr__(self, "t", settled(self.t))
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
         rows = np.arange(1, shape[0] + 1) if self.rows is None else self.rows
@@ -130,7 +130,7 @@ class Recording:
         if first >= end:
             low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
             last = f"{self.t[-1]:.4g} s" if len(self) else "nothing"
-            raise MeasurementError(f"the cut @{low}:{high} leaves no sample; the recording ends at {last}", self.file)
+            refuse_data(self.file, f"the cut @{low}:{high} leaves no sample; the recording ends at {last}")
         return self.take(slice(first, end))
 
     def take(self, index: slice | np.ndarray) -> Recording:
@@ -166,7 +166,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
     inside = (t >= recording.t[0]) & (t <= recording.t[-1]) if len(t) else np.zeros(0, bool)
     if not inside.any():
         message = f"torques {lag:g} s late leave no sample of {recording.duration:.3g} s"
-        raise MeasurementError(message, recording.file)
+        refuse_data(recording.file, message)
     moved = {
         name: np.column_stack([np.interp(t, recording.t, own) for own in value.T])
         for name in LATE
@@ -202,11 +202,9 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
             raise UsageError(message) from error
     start, stop = ends
     if start is not None and start < 0.0:
-        raise UsageError(
-            f"{text}: the cut starts at {start:g} s, before the recording does; seconds count from its start"
-        )
+        refuse_option(text, f"the cut starts at {start:g} s, before the recording does; seconds count from its start")
     if start is not None and stop is not None and not start < stop:
-        raise UsageError(f"{text}: the cut ends at {stop:g} s, before it starts at {start:g} s")
+        refuse_option(text, f"the cut ends at {stop:g} s, before it starts at {start:g} s")
     return match["file"], start, stop
 
 

@@ -11,7 +11,7 @@ from calib.data.recordings.checks import check_recording
 from calib.data.recordings.csv_logs import read_log
 from calib.data.recordings.recording import Joints, Recording, earlier, parse_cut
 from calib.data.recordings.recording_options import RecordingOptions, check_units
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, refuse_data
 from calib.files import check_regular
 
 Reader = Callable[[Path, Joints | None, RecordingOptions, Ends], Recording]
@@ -47,7 +47,7 @@ def _check_names(recording: Recording, joints: Joints) -> None:
             f"has {recording.n} joints ({', '.join(recording.joint_names)}), the robot has {len(joints.names)} "
             f"({', '.join(joints.names)}): is this another robot's recording?"
         )
-        raise MeasurementError(message, recording.file)
+        refuse_data(recording.file, message)
 
 
 def _reader(path: Path) -> Reader:
@@ -65,10 +65,10 @@ def _reader(path: Path) -> Reader:
     if head[:2] == b"PK":
         return read_archive
     if head and path.suffix == ".npz":
-        raise MeasurementError("is no NumPy archive, whatever its name says: was it written by np.savez?", path)
+        refuse_data(path, "is no NumPy archive, whatever its name says: was it written by np.savez?")
     if not head or b"\0" in head:
         found = "is empty" if not head else "is neither a NumPy archive, a bag nor text"
-        raise MeasurementError(f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder", path)
+        refuse_data(path, f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
-        raise MeasurementError("has a first line of more than 64 kB: this is no table", path)
+        refuse_data(path, "has a first line of more than 64 kB: this is no table")
     return read_log

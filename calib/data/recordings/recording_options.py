@@ -33,7 +33,7 @@ from typing import Annotated, Any
 from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
 from calib.data.recordings.recording import Joints, named
-from calib.errors import MeasurementError, UsageError, refused_as, require, suggestion
+from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, require, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
@@ -129,7 +129,7 @@ def check_units(name: str, units: Sequence[str], joints: Joints | None, path: st
     for joint, kind, unit in zip(joints.names, joints.kinds, units):
         if unit and (unit.lower() in TURNED) == (kind == "prismatic"):
             message = f"the unit [{unit}] of {name} does not suit {joint}, a {kind} joint: is it what the file is in?"
-            raise MeasurementError(message, path)
+            refuse_data(path, message)
 
 
 def stem_of(name: str) -> tuple[str, int | None]:
@@ -160,7 +160,7 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
         if ours in options.names:
             if options.names[ours] not in members:
                 message = f"there is no '{options.names[ours]}'{suggestion(options.names[ours], members)}"
-                raise MeasurementError(f"{message}; found: {', '.join(members)}", path)
+                refuse_data(path, f"{message}; found: {', '.join(members)}")
             found[ours] = options.names[ours]
         elif name := next((plain[own] for synonym in synonyms if (own := stem_of(synonym)[0]) in plain), ""):
             found[ours] = name
@@ -174,7 +174,7 @@ def one_effort(
     if "q" not in found:
         wanted = ", ".join(SYNONYMS["q"])
         message = f"has no joint positions ({wanted}); found: {', '.join(members)}"
-        raise MeasurementError(message + _cure(found, members), path)
+        refuse_data(path, message + _cure(found, members))
     kinds = [kind for kind in ("torque", "current") if kind in found]
     if not kinds and options.sensors:
         kinds = _two_torques(found, options, members, path)
@@ -184,7 +184,7 @@ def one_effort(
     if not kinds:
         wanted = ", ".join((*SYNONYMS["torque"], *SYNONYMS["current"]))
         message = f"has no torques and no currents ({wanted}); found: {', '.join(members)}"
-        raise MeasurementError(message + _cure(found, members), path)
+        refuse_data(path, message + _cure(found, members))
     kind = options.kind or kinds[0]
     if kind not in found:  # the options say that what is called a torque is a current
         found[kind] = found.pop(kinds[0])
@@ -212,7 +212,7 @@ def _two_torques(found: dict[str, str], options: RecordingOptions, members: tupl
         what = "two torques, of motors and of sensors" if options.motors else "torques of sensors"
         message = f"rows '{options.rows}' need {what} behind the gear"
         wanted_names = f"{', '.join(SYNONYMS['tau_motor'])}; {', '.join(SYNONYMS['tau_link'])}"
-        raise MeasurementError(f"{message} ({wanted_names}); found: {', '.join(members)}", path)
+        refuse_data(path, f"{message} ({wanted_names}); found: {', '.join(members)}")
     found["torque"] = found[own]
     if own == "tau_motor":
         del found[own]
@@ -222,12 +222,12 @@ def _two_torques(found: dict[str, str], options: RecordingOptions, members: tupl
 def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Path) -> tuple[list[int], tuple[str, ...]]:
     """Return where the robot's joints stand among the file's, and their names; the file may hold more joints."""
     if names and len(names) != n:
-        raise MeasurementError(f"joint_names has {len(names)} names for {n} columns", path)
+        refuse_data(path, f"joint_names has {len(names)} names for {n} columns")
     if joints is None or not names:
         known = joints.names if joints is not None and len(joints.names) == n else names
         return list(range(n)), named(known, n)
     missing = [name for name in joints.names if name not in names]
     if missing:
         message = f"has no joint '{missing[0]}'{suggestion(missing[0], names)}; found: {', '.join(names)}"
-        raise MeasurementError(message, path)
+        refuse_data(path, message)
     return [names.index(name) for name in joints.names], joints.names

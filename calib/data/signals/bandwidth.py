@@ -17,7 +17,7 @@ from calib.arrays import frozen
 from calib.data.signals.decimation import factor_for
 from calib.data.signals.filtering import hann
 from calib.data.signals.resampling import Resampled
-from calib.errors import MeasurementError
+from calib.errors import refuse_data
 
 SHARE = 0.95  # of the acceleration power that is the motion
 LOWEST = 2.0  # [Hz]; friction turns faster than slow trajectories do
@@ -118,7 +118,7 @@ def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
             f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency, {rate / 2:g} Hz at {rate:g} Hz: "
             f"choose at most {USABLE * rate / 2:.4g} Hz"
         )
-        raise MeasurementError(message, file)
+        refuse_data(file, message)
 
 
 def _position_cutoff(

@@ -24,7 +24,7 @@ from calib.data.signals.decimation import KINDS as DECIMATORS
 from calib.data.signals.decimation import Decimator, decimate, design_decimator, factor_for, kept, too_short
 from calib.data.signals.filtering import ORDER, border, curvature, low_pass, slope
 from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resample
-from calib.errors import MeasurementError, UsageError
+from calib.errors import UsageError, refuse_data
 
 SLOW = 0.01  # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
 FASTER = 5.0  # f_v of f_q at most (our choice)
@@ -274,7 +274,7 @@ def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file
     if not inside.any():
         why = "the filters' ends" if options.borders is None else f"borders = {options.borders:g}"
         message = f"no part without a gap is longer than {2 * edge / sampled.rate:.3g} s, which {why} take away"
-        raise MeasurementError(f"{message}: record longer, or lower the borders", file)
+        refuse_data(file, f"{message}: record longer, or lower the borders")
     return inside
 
 
@@ -295,10 +295,10 @@ def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, fil
         return design_decimator(rate, cutoffs.factor, options.decimator)
     if not 0 < options.band < rate / 2:
         message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
-        raise MeasurementError(message, file)
+        refuse_data(file, message)
     if (factor := factor_for(rate, options.band)) > len(sampled.t):
         message = f"an identification band of {options.band:g} Hz keeps one sample of {factor}, of {len(sampled.t)}"
-        raise MeasurementError(f"{message} there are: raise the band, or leave it to the data", file)
+        refuse_data(file, f"{message} there are: raise the band, or leave it to the data")
     return design_decimator(rate, factor_for(rate, options.band), options.decimator)
 
 

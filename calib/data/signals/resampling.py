@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from calib.arrays import frozen
 from calib.data.recordings.clock import APART, find_clock
 from calib.data.recordings.recording import SERIES, Recording, settled
-from calib.errors import MeasurementError
+from calib.errors import refuse_data
 
 GAP = 0.05  # the longest time without a sample that is bridged [s]; our choice
 
@@ -103,7 +103,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     used = [(a, b) for a, b in spans if b - a > min_samples and (t[b - 1] - t[a]) / period > min_samples]
     if not used:
         message = f"falls into {len(spans)} parts by gaps in time, none longer than {min_samples} samples"
-        raise MeasurementError(message, recording.file)
+        refuse_data(recording.file, message)
     grids = [t[a] + period * np.arange(int((t[b - 1] - t[a]) / period + 1e-6) + 1) for a, b in used]
     weight = [_weight(t[a:b], grid, found.period) for (a, b), grid in zip(used, grids)]
     steps = np.diff(recording.t) / found.period

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses
-from calib.errors import MeasurementError
+from calib.errors import refuse_data
 from calib.geometry.images.hand_eye import place_pose
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -49,10 +49,10 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     for words, quaternion in readings.items():
         angle, distance = _misfit(arm, position, quaternion)
         if angle < RIGHT and distance < NEAR:
-            raise MeasurementError(
+            refuse_data(
+                block.file,
                 f"the orientations do not turn with the arm (as x y z w they are off by {found:.0f}° in the median, "
                 f"wherever instrument and tool are placed); {words}",
-                block.file,
             )
 
 

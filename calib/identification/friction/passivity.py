@@ -9,7 +9,7 @@ import numpy as np
 from calib.data.signals.motion import moving
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import Joined
-from calib.errors import MeasurementError
+from calib.errors import refuse_data
 from calib.identification.cases import Case
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import term_columns
@@ -88,9 +88,9 @@ def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
     found = np.flatnonzero(share < LEAST)
     if len(found) and 2 * len(found) > np.count_nonzero(share):
         named = ", ".join(str(joint + 1) for joint in found)
-        raise MeasurementError(
+        refuse_data(
+            cases[0].motion.file,
             f"friction would drive the robot instead of braking it (joints {named}): the torques' sign is reversed, or "
             "positions and torques are not of the same joints; turn the sign (gains = [-1]), or check the columns",
-            cases[0].motion.file,
         )
     return tuple(int(joint) for joint in found)

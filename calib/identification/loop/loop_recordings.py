@@ -19,7 +19,7 @@ from calib.data.signals.decimation import Decimator
 from calib.data.signals.filtering import border, low_pass
 from calib.data.signals.motion import ROWS, Motion
 from calib.dynamics.bodies import Bodies
-from calib.errors import MeasurementError, NotConverged, UsageError
+from calib.errors import NotConverged, UsageError, refuse_data
 from calib.identification.cases import Case
 from calib.identification.loop.controller import IdentifiedController, identify_controller
 from calib.identification.loop.loop_settings import LoopSettings
@@ -91,7 +91,7 @@ def close_loops(
         if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
     ]
     if not stretches:
-        raise MeasurementError("no stretch without gaps is long enough to be simulated", cases[0].motion.file)
+        refuse_data(cases[0].motion.file, "no stretch without gaps is long enough to be simulated")
     controller, identified, notes = _controller(loop, max((s[1:3] for s in stretches), key=lambda s: len(s[0].motion)))
     design = loop.per_joint("design", bodies.n) if loop.design else None
     pairs = []
@@ -114,17 +114,17 @@ def take(case: Case, part: slice) -> Case:
 def _check_reference(motion: Motion) -> None:
     """Refuse a motion without a reference, or with one that is not its own (or is in degrees)."""
     if motion.q_ref is None:
-        raise MeasurementError(
+        refuse_data(
+            motion.file,
             "holds no reference (columns q_ref1 …, also q_des, q_cmd; or [recording] names = { q_ref = '…' }), and the "
             "simulation of the closed loop needs the positions that were asked for: log them, or state a file, "
             "[loop] reference = '…'; without them use wls or irls",
-            motion.file,
         )
     finite = np.isfinite(motion.q_ref).all(axis=0)
     if not finite.all():
         joint = int(np.argmin(finite))
-        raise MeasurementError(
-            f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere", motion.file
+        refuse_data(
+            motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
         _compare(motion, motion.q_ref[:, j], int(j))
@@ -143,16 +143,16 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     name = f"{motion.joint_names[joint]} (joint {joint + 1})"
     alike = abs(float(np.corrcoef(q, asked)[0, 1])) > 0.95 if size > 0.0 else False
     if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
-        raise MeasurementError(
+        refuse_data(
+            motion.file,
             f"the reference of {name} is {size / spread:.3g} times its position: it looks like deg; if so, say so (a "
             f"header 'q_ref{joint + 1} [deg]', or [recording] units = {{ q_ref = 'deg' }})",
-            motion.file,
         )
-    raise MeasurementError(
+    refuse_data(
+        motion.file,
         f"{name} is {away:.2g} times its own travel (rms) away from its reference, "
         + (f"which is {size / spread:.3g} times as large" if alike else "and does not move with it")
         + ": is this the reference of this recording, joint by joint and from the same instant?",
-        motion.file,
     )
 
 
@@ -244,7 +244,7 @@ def _fed_forward(
         return controller
     if loop.feedforward == "recording":
         if motion.tau_ff is None:
-            raise MeasurementError("[loop] feedforward: the recording has no column tau_ff", motion.file)
+            refuse_data(motion.file, "[loop] feedforward: the recording has no column tau_ff")
         grid = np.arange(len(motion))
         return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
     if cad is None:

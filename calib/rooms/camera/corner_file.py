@@ -14,7 +14,7 @@ import numpy as np
 
 from calib import files
 from calib.data.camera.board import Board, corners
-from calib.errors import MeasurementError, refused_as
+from calib.errors import MeasurementError, refuse_data, refused_as
 
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
 USUAL = 0.1  # sigma where a file states none [px]; our choice
@@ -79,7 +79,7 @@ def read_corners(path: Path, board: Board) -> Found:
         rows = list(csv.DictReader(file, restkey="further cells", restval=""))
     for number, row in enumerate(rows, 1):
         if "further cells" in row:
-            raise MeasurementError("has more cells than the header names columns", path, number)
+            refuse_data(path, "has more cells than the header names columns", row=number)
         cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
         name, problem = cells.get("image", ""), cells.get("problem", "")
         with refused_as(
@@ -96,6 +96,6 @@ def read_corners(path: Path, board: Board) -> Found:
                 continue
             k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
         if not 0 <= k < count:
-            raise MeasurementError(f"corner {k}: the board ({board.words}) has {count}", path, number, "corner")
+            refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
         images[name].pixel[k], images[name].sigma[k] = place, float(cells.get("sigma") or USUAL)
     return Found(images, size)

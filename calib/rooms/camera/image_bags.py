@@ -18,8 +18,10 @@ import numpy as np
 from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import Board
+from calib.data.camera.corner_file import Found
+from calib.data.poses.image_folders import JOINTS
 from calib.data.poses.pixels import CORNERS, JOINTS
-from calib.errors import MeasurementError, require, suggestion
+from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.rooms.camera import corner_file
 from calib.rooms.camera.corner_file import Found
 from calib.rooms.camera.detection import detected
@@ -95,11 +97,11 @@ def _topic(reader: Any, kinds: tuple[str, ...], wanted: str, what: str, path: Pa
     """Return the connections of the one topic of some kinds, or of the one wanted."""
     known = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
     if not known:
-        raise MeasurementError(f"has no topic of {what} ({' or '.join(kinds[:2])})", path)
+        refuse_data(path, f"has no topic of {what} ({' or '.join(kinds[:2])})")
     if wanted and wanted not in known:
-        raise MeasurementError(f"has no {what} on '{wanted}'{suggestion(wanted, known)}; on {', '.join(known)}", path)
+        refuse_data(path, f"has no {what} on '{wanted}'{suggestion(wanted, known)}; on {', '.join(known)}")
     if not wanted and len(known) > 1:
-        raise MeasurementError(f"has {what} on {', '.join(known)}: say on which (--image-topic, --joint-topic)", path)
+        refuse_data(path, f"has {what} on {', '.join(known)}: say on which (--image-topic, --joint-topic)")
     return [c for c in reader.connections if c.topic == (wanted or known[0]) and c.msgtype in kinds]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.data.camera.board import Board, corners
 from calib.data.camera.lens import Lens
-from calib.errors import CalibError, MeasurementError
+from calib.errors import CalibError, MeasurementError, refuse_data
 from calib.rooms.camera.board_pose import board_poses
 from calib.words import counted
 
@@ -61,34 +61,34 @@ def estimate_lens(
     """
     good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
     if len(good) < FEWEST:
-        raise MeasurementError(
+        refuse_data(
+            file,
             f"{counted(len(good), 'image')} with a board: a lens takes {FEWEST} at least, tilted "
             "differently, and a good one 15; take more, or give the lens (camera.yaml)",
-            file,
         )
     good = good[np.unique(np.linspace(0, len(good) - 1, MOST).astype(int))]
     own = pixel[good]
     found, rms, matrix = _fitted(board, own, size, model)
     if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:
-        raise MeasurementError(
+        refuse_data(
+            file,
             f"a fisheye lens explains these images to {other:.2f} px, a pinhole's to {rms:.2f} px only: state "
             "[camera] model = 'fisheye' in the options, or give the lens (camera.yaml)",
-            file,
         )
     if not rms < WRONG:
-        raise MeasurementError(
+        refuse_data(
+            file,
             f"no {model} lens explains these images: {rms:.1f} px remain with the best one. Were they all taken with "
             "one camera, at one focus, of this board?",
-            file,
         )
     loose = _focal_sigma(found, matrix, rms)
     if not loose < LOOSE:
         told = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
-        raise MeasurementError(
+        refuse_data(
+            file,
             f"the focal length is told {told}: the images see the board from too few "
             "directions; tilt it (or the camera) by 20 to 45° both ways in a dozen images, or give the lens "
             "(camera.yaml)",
-            file,
         )
     return LensGuess(found, rms, loose)
 

@@ -14,7 +14,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.base import expressions
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, refuse_option
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
 from calib.identification.cases import Case, case_names, make_case
@@ -254,7 +254,7 @@ def _cases(
         motion = read_motion(each, robot.joints, own, before[0].motion if before else None)
         gains = None if own.gains is None else np.array(per_joint(own.gains, model.n, "gains"))
         if motion.kind == "current" and gains is None and motion.drive_gain is None:
-            raise UsageError(f"{name}: currents without drive gains; state gains = [...] (N m/A) in the options file")
+            refuse_option(name, "currents without drive gains; state gains = [...] (N m/A) in the options file")
         gains = motion.drive_gain if gains is None and motion.kind == "current" else gains
         try:
             cases.append(make_case(name, motion, model.torque_rows, gains=gains, carried=own.payload))

@@ -21,7 +21,7 @@ import numpy as np
 
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
-from calib.errors import CalibError, MeasurementError, UsageError, suggestion
+from calib.errors import CalibError, MeasurementError, UsageError, refuse_data, refuse_option, suggestion
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict, limit
@@ -254,7 +254,7 @@ def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tup
     names = [one.name for one in loop_parameters(known)]
     for name in options.fix:
         if name not in names:
-            raise UsageError(f"{options.source}: fix '{name}' is no constant of the loops{suggestion(name, names)}")
+            refuse_option(options.source, f"fix '{name}' is no constant of the loops{suggestion(name, names)}")
     return options.fix
 
 
@@ -262,13 +262,13 @@ def _refuse_others(table: Table, robot: ParallelRobot, path: Path) -> None:
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for name in table.header:
         if name in passive:
-            raise MeasurementError(
-                f"column '{name}' is of a passive joint, whose encoder the fit does not know yet; leave it out", path
+            refuse_data(
+                path, f"column '{name}' is of a passive joint, whose encoder the fit does not know yet; leave it out"
             )
         if name in COORDINATES and name not in robot.freedom:
-            raise MeasurementError(
-                f"column '{name}' is none of the platform's coordinates ({', '.join(robot.freedom)}); leave it out",
+            refuse_data(
                 path,
+                f"column '{name}' is none of the platform's coordinates ({', '.join(robot.freedom)}); leave it out",
             )
 
 
@@ -285,7 +285,7 @@ def _stacked(parts: Sequence[_Rows], paths: Sequence[Path]) -> _Rows:
 def _check_alike(rows: _Rows, unseen: Mapping[str, _Rows]) -> None:
     for name, own in unseen.items():
         if (own.coordinates is None) != (rows.coordinates is None):
-            raise UsageError(f"{name}: platform coordinates are in it or in the fitted files, not in both")
+            refuse_option(name, "platform coordinates are in it or in the fitted files, not in both")
 
 
 def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: _Rows) -> np.ndarray:

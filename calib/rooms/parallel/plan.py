@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from calib.data.csv_table import read_table
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, refuse_data, refuse_option
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.motion_bounds import MotionBounds
@@ -193,10 +193,8 @@ def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
     if any(name in table for name in known.robot.freedom):
         return read_coordinates(table, known.robot)
     if not any(name in table for name in known.robot.joint_names):
-        raise MeasurementError(
-            f"neither the platform's coordinates ({', '.join(known.robot.freedom)}) nor the actuators "
-            f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}", path
-        )  # fmt: skip
+        refuse_data(path, f"neither the platform's coordinates ({', '.join(known.robot.freedom)}) nor the actuators "
+            f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}")  # fmt: skip
     try:
         return coordinates_of(known, known.locate(read_rows(path, known.robot).readings))
     except NoPosture as error:
@@ -219,8 +217,8 @@ def _law(
         )
     model, values = read_model(robot, folder)
     if unknown := sorted(set(settings.payloads) - set(model.payloads)):
-        raise UsageError(
-            f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(model.payloads) or 'none'}"
+        refuse_option(
+            folder, f"no payload '{unknown[0]}' was identified; it knows {', '.join(model.payloads) or 'none'}"
         )
     terms = tuple(replace(one, settings=(SHARP,)) if one.shape == "sign" else one for one in model.terms)
     return _PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()

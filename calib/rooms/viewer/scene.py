@@ -16,7 +16,7 @@ from calib.config import read_toml
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.plans import read_poses
 from calib.dynamics.torque_rows import MOTOR, ROWS
-from calib.errors import CalibError, UsageError, require
+from calib.errors import CalibError, UsageError, refuse_option, require
 from calib.geometry import installation_file
 from calib.geometry.installation import Installation, see
 from calib.identification import model_file
@@ -162,7 +162,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
 def _of_poses(path: Path, robot: str | None) -> Scene:
     """Return a scene of chosen poses, or of a run through them."""
     if robot is None:
-        raise UsageError(f"{path}: say whose poses these are: --robot")
+        refuse_option(path, "say whose poses these are: --robot")
     chain, source = load(robot), resolve(robot)
     meshes, notes = _meshes(chain, source)
     if is_run(path):

@@ -37,7 +37,7 @@ import numpy as np
 
 from calib import files
 from calib.config_types import shown
-from calib.errors import RobotError, refuse_robot, suggestion
+from calib.errors import refuse_robot, suggestion
 from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, spelled, vector, word
@@ -68,8 +68,8 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
     """Return the robot of a parsed table; `where` names it in messages."""
     check_keys(table, TOP, where)
     if table.get("kind") != KIND:
-        raise RobotError(
-            f'{where}: kind is {shown(table.get("kind"))}; a robot of legs and a platform says kind = "parallel"'
+        refuse_robot(
+            where, f'kind is {shown(table.get("kind"))}; a robot of legs and a platform says kind = "parallel"'
         )
     gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
     own, place = table.get("platform"), f"{where}, [platform]"
