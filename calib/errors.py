@@ -145,9 +145,9 @@ def refuse_robot(place: object, words: str) -> NoReturn:
     raise RobotError(f"{place}: {words}")
 
 
-def refuse_data(file: object, words: str, column: str | None = None, row: int | None = None) -> NoReturn:
+def refuse_data(file: str | Path, words: str, column: str | None = None, row: int | None = None) -> NoReturn:
     """Refuse measured data: a file (or a block of that name), a column of it, or a row (from 1)."""
-    raise MeasurementError(words, str(file) if file else None, row, column)
+    raise MeasurementError(words, file, row, column)
 
 
 def refuse_option(place: object, words: str) -> NoReturn:
