@@ -24,9 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.data.poses.pixels import Pixels
-from calib.errors import MeasurementError, refuse_data
+from calib.errors import refuse_data
 from calib.extensions import needed
-from calib.geometry.images.camera_guess import place_camera, seen_target
 from calib.geometry.images.hand_eye import average_pose, chordal_turns, place_pose
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation

@@ -11,8 +11,6 @@ import numpy as np
 from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import KINDS, Board
-from calib.data.camera.corner_file import Found
-from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
 from calib.data.poses.pixels import JOINTS
 from calib.errors import CalibError, MeasurementError, UsageError, refused_as, require
 from calib.procedure.measuring.image_findings import coverage_words

@@ -18,8 +18,6 @@ import numpy as np
 from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import Board
-from calib.data.camera.corner_file import Found
-from calib.data.poses.image_folders import JOINTS
 from calib.data.poses.pixels import CORNERS, JOINTS
 from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.rooms.camera import corner_file

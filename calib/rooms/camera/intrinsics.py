@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.data.camera.board import Board, corners
 from calib.data.camera.lens import Lens
-from calib.errors import CalibError, MeasurementError, refuse_data
+from calib.errors import CalibError, refuse_data
 from calib.rooms.camera.board_pose import board_poses
 from calib.words import counted
 
