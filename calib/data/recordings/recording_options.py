@@ -33,7 +33,7 @@ from typing import Annotated, Any
 from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
 from calib.data.recordings.recording import Joints, named
-from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, require, suggestion
+from calib.errors import UsageError, refuse_data, refused_as, require, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
