@@ -41,7 +41,17 @@ app = typer.Typer(
     epilog=EXIT_CODES,
 )
 
-_FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames", "--overwrite")
+_FLAGS = (
+    "--debug",
+    "--help",
+    "--line",
+    "--plots",
+    "--no-plots",
+    "--refit-frames",
+    "--no-refit-frames",
+    "--overwrite",
+    "--verbose",
+)
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
 for _group in (geometry.app, dynamics.app, motion.app, session.app, *offered("commands")):

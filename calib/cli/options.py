@@ -28,6 +28,7 @@ class Common:
         tip: URDF: the link the arm ends at.
         workers: local processes, or the address of a Dask scheduler.
         plots: draw figures, or leave them out.
+        verbose: print the tables, and all that was noticed.
         overwrite: replace files, whatever they hold; without: those of an earlier run.
     """
 

@@ -17,6 +17,7 @@ import typer
 PIPED = 160  # columns of tables that no terminal bounds
 
 Out = Annotated[Path, typer.Option()]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose")]
 Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
 
 

@@ -12,6 +12,7 @@ from rich.text import Text as RichText
 from calib.procedure.findings import LEVELS
 from calib.procedure.report.page import Block, Section, Table, Text
 
+MAX_LINES = 16
 COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
 
 
@@ -42,6 +43,15 @@ def _rich_table(table: Table) -> RichTable:
         else:
             result.add_row(*map(RichText, row), style="bold" if number in table.strong else "")
     return result
+
+
+def brief(shown: Iterable[RenderableType]) -> list[str | RichText]:
+    """Return what a command prints by default: the lines without the tables, `MAX_LINES` at most, the verdict last."""
+    lines = [one for one in shown if isinstance(one, str | RichText)]
+    if len(lines) > MAX_LINES:
+        more = f"… {len(lines) - MAX_LINES + 1} more lines, and the tables, with -v and in the report"
+        lines[MAX_LINES - 2 : -1] = [RichText(more)]
+    return lines
 
 
 def section(shown: Section) -> Iterator[RenderableType]:

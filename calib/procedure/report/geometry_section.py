@@ -65,10 +65,12 @@ def read_blocks(inputs: Inputs) -> list[Block]:
 def outcome_section(metrics: FitMetrics) -> Section:
     """Return what a fit came to as the console says it: ladder, errors, repeated poses, what to know, verdict."""
     blocks: list[Block] = [_ladder_table(metrics), _error_table(metrics)]
-    blocks += [Text("", _repeated_sentences(metrics)), Text("", metrics.not_identifiable, "identifiability")]
-    blocks += [Text("", metrics.warnings, "note"), Text("", _outlier_sentences(metrics), "outliers")]
+    sizes = [f"{label}: {_rms_words(found)}" for label, found in _sets(metrics)]
+    blocks.append(Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
     if metrics.advice and not any(metrics.advice in line for line in metrics.warnings):
         blocks.append(Text("", [metrics.advice], "what to do"))
+    blocks += [Text("", _repeated_sentences(metrics)), Text("", _outlier_sentences(metrics), "outliers")]
+    blocks += [Text("", metrics.warnings, "note"), Text("", metrics.not_identifiable, "identifiability")]
     return Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
@@ -156,11 +158,18 @@ def _errors(rows: ComparedRows, arm: str, key: str) -> ErrorStatistics | None:
     return None if found is None else getattr(found, key)
 
 
+def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
+    """Return the sets of rows with what they are called."""
+    unseen = [
+        (f"{'unseen' if found.unseen else 'NOT unseen'}: {name}, {found.poses} poses", found)
+        for name, found in metrics.validation.items()
+    ]
+    return [(f"fitted: {metrics.fit.poses} poses", metrics.fit), *unseen]
+
+
 def _error_table(metrics: FitMetrics) -> Table:
     """Return errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
-    sets = [(f"fitted: {metrics.fit.poses} poses", metrics.fit)]
-    for name, found in metrics.validation.items():
-        sets.append((f"{'unseen' if found.unseen else 'NOT unseen'}: {name}, {found.poses} poses", found))
+    sets = _sets(metrics)
     rows: list[Sequence[str]] = []
     strong = set()
     for label, found in sets:
@@ -217,9 +226,12 @@ def parameter_words(metrics: FitMetrics) -> str:
 
 def error_words(metrics: FitMetrics) -> str:
     """Return the rms errors on the fitted poses in a line."""
-    arms = {ARMS[arm]: getattr(metrics.fit, arm) for arm in ARMS}
-    sizes = [f"{found.main.rms:.3f} mm {arm}" for arm, found in arms.items() if found and found.main]
-    return f"rms {', '.join(sizes)} on {metrics.fit.poses} fitted poses"
+    return f"{_rms_words(metrics.fit)} on {metrics.fit.poses} fitted poses"
+
+
+def _rms_words(rows: ComparedRows) -> str:
+    arms = {ARMS[arm]: getattr(rows, arm) for arm in ARMS}
+    return f"rms {', '.join(f'{one.main.rms:.3f} mm {arm}' for arm, one in arms.items() if one and one.main)}"
 
 
 def _parameter_table(report: Report) -> Table:
