@@ -21,7 +21,7 @@ from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.convex.cone_program import minimise
 
-SIZE = 0.1  # [m] of a body of one kilogram, in whose units the program is written
+UNIT_LENGTH = 0.1  # [m] of a body of one kilogram, in whose units the program is written
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class BodyCone:
         unit = np.linalg.norm(factor[:p, :p], axis=0)
         size = max(1.0, float(np.linalg.norm(factor[:p, p])))
         R, z = factor[:p, :p] / unit, factor[:p, p] / size  # β = size · b / unit
-        root = np.diag([SIZE, SIZE, SIZE, 1.0])
+        root = np.diag([UNIT_LENGTH, UNIT_LENGTH, UNIT_LENGTH, 1.0])
         block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T  # of the unknowns' pseudo-inertia
         made = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
         made = np.asarray(

@@ -3,7 +3,7 @@
 A row is lower <= aᵀ β <= upper over the columns that are estimated. A standard parameter, or a weighted sum of several,
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
-over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `LEAST`, S making the mean diagonal one.
+over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `MIN_EIGENVALUE`, S making the mean diagonal one.
 Bodies that can exist are a cone (`calib.identification.body_cone`), which M(q) > 0 follows from.
 """
 
@@ -32,8 +32,11 @@ from calib.identification.body_cone import BodyCone, cone_of
 from calib.records import Number
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
-LEAST = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
-RAISE, MOST = 10**0.5, 0.4  # factor and limit of the same where an estimate cannot be simulated (our choice)
+MIN_EIGENVALUE = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
+RAISED_BY, MAX_EIGENVALUE = (
+    10**0.5,
+    0.4,
+)  # factor and limit of the same where an estimate cannot be simulated (our choice)
 
 
 def _in_order(value: Any) -> Any:
@@ -106,7 +109,7 @@ class Constraints:
     inertia: np.ndarray
     cone: BodyCone | None = None
     plane: str = ""
-    least: float = LEAST
+    least: float = MIN_EIGENVALUE
     likely: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -135,12 +138,12 @@ class Constraints:
             ) from error
 
     def raised(self) -> Constraints | None:
-        """Return these with M(q) three times as far from singular, None where it already is by `MOST`.
+        """Return these with M(q) three times as far from singular, None where it already is by `MAX_EIGENVALUE`.
 
         A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
         """
-        least = self.least * RAISE
-        return replace(self, least=least) if len(self.inertia) and least <= MOST else None
+        least = self.least * RAISED_BY
+        return replace(self, least=least) if len(self.inertia) and least <= MAX_EIGENVALUE else None
 
     def touched(self, factor: np.ndarray) -> Constraints:
         """Return these constraints with the cone of bodies replaced by the plane that holds the optimum of `factor`.
@@ -208,7 +211,7 @@ class Held:
     tight: np.ndarray
     free: LinearFit
     plane: str = ""
-    least: float = LEAST
+    least: float = MIN_EIGENVALUE
 
     @property
     def postures(self) -> int:
@@ -239,10 +242,10 @@ class Held:
                 f"M(q) is held positive definite in {self.postures} postures: the data alone give a robot that cannot "
                 "be there; the motion is too poor, or the estimate is biased"
             )
-        if self.postures and self.least > LEAST:
+        if self.postures and self.least > MIN_EIGENVALUE:
             told.append(
-                f"M(q) is kept {self.least / LEAST:.0f} times as far from singular as asked: nearer, the controller "
-                "cannot hold the simulated robot"
+                f"M(q) is kept {self.least / MIN_EIGENVALUE:.0f} times as far from singular as asked: nearer, the "
+                "controller cannot hold the simulated robot"
             )
         return told
 

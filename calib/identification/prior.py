@@ -14,9 +14,9 @@ is largest (MacKay 1992, automatic relevance of groups),
     log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
 
 with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what
-a kind would be if it alone explained `SHARE` of all torque (offsets: `OFFSET`), within a factor exp(`WIDTH`) (our
-choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that cancel.
-Rows are weighed by their joint's residual, which tells as many independent values as its autocorrelation lets it, but
+a kind would be if it alone explained `EXPLAINED_SHARE` of all torque (offsets: `OFFSET`), within a factor exp(`WIDTH`)
+(our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that
+cancel. Rows are weighed by their joint's residual, worth as many independent values as its autocorrelation lets it, but
 not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave whatever the model is. What the
 model lacks is no noise, and differs on other motion: where sizes are found residuals count `TEMPERING` times less, and
 the prior as many times more for the values than for their covariance; more where regimes left out ask for it
@@ -46,19 +46,19 @@ from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
 
-SHARE = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
+EXPLAINED_SHARE = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
 OFFSET = 0.01  # the same of constant torques: motors have friction rather than offsets (our choice)
 WIDTH = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
 MAX_DEVIATION = 3.0  # of the whole robot's parameters of a kind, rms, or of what explains all torque (our choice)
-NEAREST = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
+MIN_CAD_DEVIATION = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
 WHOLE = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
 MAX_INFLATION = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
 TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
-EXACT = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
+MIN_NOISE = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
 ROUNDS = 12
 SETTLED = 0.03  # of every parameter's sigma, and of every residual
-TOLD = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
+RESTING_SHARE = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
 DRIVES = 3.0  # terms without CAD: standard deviation in units of what would explain all of the torque
 ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times its square, seen from the joint
 
@@ -100,12 +100,12 @@ class Prior:
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return (b,) which parameters rest on the prior: the data lower their variance by less than `TOLD`.
+        """Return (b,) which parameters rest on the prior: the data lower their variance by less than `RESTING_SHARE`.
 
         Counted about the whole robot's share: its factor s is one number, and soon told.
         """
         b = len(self.own)
-        return np.diag(covariance)[:b] > (1.0 - TOLD) * self.own**2
+        return np.diag(covariance)[:b] > (1.0 - RESTING_SHARE) * self.own**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +160,7 @@ def find_prior(
     sizes = _sizes(model, data, columns, shared, more)
     squares, count = np.sum(data.factors[:, :, -1] ** 2, axis=1), np.maximum(data.rows, 1)
     std, tau = NOISE * np.sqrt(squares / count), np.full(n, 3.0)
-    std = np.maximum(std, EXACT * max(float(std.max()), 1e-300))
+    std = np.maximum(std, MIN_NOISE * max(float(std.max()), 1e-300))
     t, values = np.array(sizes.centre), np.zeros(len(columns))
     if start is not None:
         std, tau = start.first.std, start.first.inflation
@@ -205,7 +205,7 @@ def weighing(
     squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
     std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
     size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
-    std = np.maximum(std, EXACT * max(float(size.max()), 1e-300))
+    std = np.maximum(std, MIN_NOISE * max(float(size.max()), 1e-300))
     return scaled(noise, std, data.rows), tau
 
 
@@ -270,9 +270,10 @@ def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: 
     mean_square = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names)) / count
     body = alone[single] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
     known = mean_square > 0.0
-    near = np.where(known, body + np.log(NEAREST), -np.inf)
+    near = np.where(known, body + np.log(MIN_CAD_DEVIATION), -np.inf)
     far = np.where(known, body, alone) + np.log(MAX_DEVIATION)
-    share = np.array([OFFSET if name.startswith("one ") else 1.0 if name == "whole" else SHARE for name in names])
+    shares = {"one": OFFSET, "whole": 1.0}
+    share = np.array([shares.get(name.split(" ")[0], EXPLAINED_SHARE) for name in names])
     width = np.where([name == "whole" for name in names], WHOLE, WIDTH)
     return _Sizes(names, member, np.clip(alone + np.log(share), near, far), width, near, far)
 

@@ -27,15 +27,15 @@ from calib.robot.obstacles import (
     signed_distance,
 )
 
-LEAST, SHARE = 0.05, 0.05
+MIN_RADIUS, RADIUS_SHARE = 0.05, 0.05
 """Radius of a capsule where none is stated: this share of the stretched arm, and no less than [m]. Our choice."""
-TARGET = 0.02
+TARGET_RADIUS = 0.02
 """Radius of a target and its stem [m]: a reflector of 1.5 inch is 0.019. Our choice."""
 
 
 def usual_radius(chain: Chain) -> float:
     """Return the radius [m] of capsules that stand for the links of an arm where none is stated."""
-    return max(LEAST, round(SHARE * chain.stretched_length(), 3))
+    return max(MIN_RADIUS, round(RADIUS_SHARE * chain.stretched_length(), 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +271,7 @@ def from_chain(
     names = [chain.base, *(named.get(k, f"{element.name}_link") for k, element in enumerate(moving))]
     names += ["target"] if len(places) == 1 else [f"target {k + 1}" for k in range(len(places))]
     bodies = np.array([*range(len(moving) + 1), *[len(moving)] * len(places)])
-    radii = np.array([*[size] * (len(moving) + 1), *[TARGET] * len(places)])
+    radii = np.array([*[size] * (len(moving) + 1), *[TARGET_RADIUS] * len(places)])
     there = np.flatnonzero(length > 1e-6)
     own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + 1 and within]
     planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
 from calib.errors import refuse_robot
-from calib.robot.capsules import TARGET
+from calib.robot.capsules import TARGET_RADIUS
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.markup import Node, parse, text
@@ -202,7 +202,7 @@ def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | 
         if (length := float(np.linalg.norm(place))) > 1e-6:
             along = Rotation.align_vectors(place[None] / length, [[0.0, 0.0, 1.0]])[0]
             name = "target" if len(targets) == 1 else f"target {number}"
-            _attach(model, geometry, chain.tip, name, pose(along, place / 2), coal.Capsule(TARGET, length))
+            _attach(model, geometry, chain.tip, name, pose(along, place / 2), coal.Capsule(TARGET_RADIUS, length))
 
 
 def _finish(

@@ -12,7 +12,7 @@ from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import select_model
-from calib.geometry.uncertainty.error_model import END, ErrorModel, learn_errors
+from calib.geometry.uncertainty.error_model import END_SHARE, ErrorModel, learn_errors
 from calib.geometry.uncertainty.left_out import LeftOut
 from calib.robot.load import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure
@@ -126,7 +126,7 @@ def test_outside_a_range_the_interval_grows_by_its_end_and_not_where_frames_are_
     ends = tuple((2.0, 1.0) if j == 0 else (1.0, 1.0) for j in range(6))
     wide, plain = (replace(model, discrepancy=replace(model.discrepancy, wider=each)) for each in (ends, ()))
     q = np.repeat(model.learnt[:1], 3, axis=0)
-    low, first = np.quantile(model.learnt[:, 0], [0.0, END])
+    low, first = np.quantile(model.learnt[:, 0], [0.0, END_SHARE])
     q[:, 0] = [low + 0.01, low - 0.25 * (first - low), low - (first - low)]
     assert wide.position_sigma(q) / plain.position_sigma(q) == pytest.approx([1.0, 1.5, 2.0])
     block = replace(measured(2, 3, 1.6, 0.0), q=q)

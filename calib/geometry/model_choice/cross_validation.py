@@ -26,8 +26,8 @@ from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 
 CHUNK = 1000  # poses observed at once
-BLIND = 3.0  # error by covariance alone, over the nominal residuals, from which on a fold says nothing (our choice)
-LOOSE = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
+MAX_BLIND_ERROR = 3.0  # error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
+FRAME_SIGMA = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
@@ -192,7 +192,7 @@ def blind_folds(
     """Return which folds cannot be judged (folds,): the other rows do not tell where the tool would be in them.
 
     There the error that geometry and frames would have by their covariance alone, with the nominal arm's residuals
-    taken for noise and `plausible_deviation` known beforehand, is above `BLIND` times those residuals.
+    taken for noise and `plausible_deviation` known beforehand, is above `MAX_BLIND_ERROR` times those residuals.
 
     Args:
         nominal: the nominal arm with its frames fitted to all rows.
@@ -205,7 +205,7 @@ def blind_folds(
     sigmas: list[dict[str, float]] = [{} for _ in measured]
     for piece in nominal.pieces:
         sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
-    known = np.array([LOOSE if k >= table.arm else w for k, w in zip(free, plausible_deviation(nominal.cell, free))])
+    known = np.where(free >= table.arm, FRAME_SIGMA, plausible_deviation(nominal.cell, free))
     weights = nominal.row_weights()
     each, squares, none, moved = [], [], [None] * len(measured), [True] * len(measured)
     for fold in range(folds.count):
@@ -219,7 +219,7 @@ def blind_folds(
     for fold, own in enumerate(each):
         spread = np.linalg.inv(((total - own).square + np.diag(known**-2)) * np.outer(known, known))
         predicted = float(np.sum(squares[fold][0] * (spread * np.outer(known, known))))
-        result[fold] = predicted > BLIND**2 * noise
+        result[fold] = predicted > MAX_BLIND_ERROR**2 * noise
     return result
 
 

@@ -16,7 +16,7 @@ from calib.errors import UsageError, require
 
 REGIONS = 20
 FOLDS = 5
-MOST = 150
+MAX_STATION_POSES = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,10 +114,12 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
     """Return `transfer_folds`, `region_folds`, ten `random_folds`, or one fold for each of the ``poses``.
 
     Raises:
-        UsageError: for another name, or for leaving out each of more than `MOST` poses.
+        UsageError: for another name, or for leaving out each of more than `MAX_STATION_POSES` poses.
     """
-    if name == "poses" and sum(len(block) for block in measured) > MOST:
-        raise UsageError(f"folds 'poses' leaves out every pose once, which is for {MOST} rows at most; take 'random'")
+    if name == "poses" and sum(len(block) for block in measured) > MAX_STATION_POSES:
+        raise UsageError(
+            f"folds 'poses' leaves out every pose once, for {MAX_STATION_POSES} rows at most; take 'random'"
+        )
     ways = {
         "transfer": lambda: transfer_folds(measured, seed),
         "regions": lambda: region_folds(measured, seed=seed),

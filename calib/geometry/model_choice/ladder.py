@@ -28,10 +28,10 @@ from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings
 from calib.robot.deflection import Deflection, Term
 
-GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
+MIN_GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
 POSES_PER_ORDER = 8  # harmonics of order k are offered to sets of at least 8 k poses (our choice)
 
-GROSS = 8.0  # robust sigmas beyond which a row is not of this robot (our choice)
+MAX_RESIDUAL = 8.0  # robust sigmas beyond which a row is not of this robot (our choice)
 
 Progress = Callable[[int, int, str], None]
 
@@ -114,8 +114,8 @@ def select_model(
         cell: nominal arm, frames placed (`calib.geometry.first_guess.install`).
         measured: blocks of measurements.
         model: ``auto``, or one of `MODELS`: that rung and all below it.
-        settings: of every fit. With loss ``auto``, rows beyond `GROSS` robust sigmas of the rigid fit turn it into
-            ``cauchy``, for the fits and for the errors on unseen rows alike.
+        settings: of every fit. With loss ``auto``, rows beyond `MAX_RESIDUAL` robust sigmas of the rigid fit turn it
+            into ``cauchy``, for the fits and for the errors on unseen rows alike.
         torques: gravity torques (m, n) per block [N m]; None where the masses are not known.
         fixed: positions in the parameter vector that stay at their nominal.
         prior: standard deviations of the parameter vector about its nominal; infinite where nothing is known.
@@ -131,7 +131,7 @@ def select_model(
     folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
     climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell, seed)
     climber.rigid(model)
-    if settings.loss == "auto" and climber.best.outliers(GROSS):
+    if settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
         climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell, seed)
         climber.rigid(model)
     if model == "auto" or model in EFFECTS:
@@ -190,7 +190,7 @@ class _Climber:
                 drawn=self.drawn, prior=self.prior,
             )  # fmt: skip
             unseen = self._statistics(found, ()).error_rigid()
-            better = unseen < error * (1.0 - GAIN)
+            better = unseen < error * (1.0 - MIN_GAIN)
             wanted = better if model == "auto" else name == last
             self.rungs.append(
                 ModelStep(name, len(found.free), unseen, wanted, "" if better else "no better on unseen rows")
@@ -260,7 +260,7 @@ class _Climber:
                 self._tick(name)
                 tried[name] = statistics.error(np.concatenate([place[other] for other in [*kept, name]]))
             best = min(waiting, key=lambda name: tried[name].rms)
-            pays = tried[best].rms < error.rms * (1.0 - GAIN) and tried[best].wins(error)
+            pays = tried[best].rms < error.rms * (1.0 - MIN_GAIN) and tried[best].wins(error)
             for name in waiting if not pays else [best]:
                 note = "" if name == best and pays else "no better on unseen rows: left out"
                 where = np.concatenate([place[other] for other in [*kept, name]])
@@ -279,7 +279,7 @@ class _Climber:
             kept: effects that pay on the geometry.
             climbed: rungs tried before them, the geometry last.
         """
-        pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - GAIN)
+        pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - MIN_GAIN)
         note = "pays together with what follows" if pays else "no better on unseen rows than without the geometry"
         for k in range(climbed - 1, len(self.rungs)):
             if k < climbed or not pays:

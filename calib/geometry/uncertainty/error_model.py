@@ -27,7 +27,7 @@ from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.effects import term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
-from calib.geometry.model_choice.ladder import GROSS, ModelSelection
+from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.left_out import LeftOut
@@ -37,11 +37,11 @@ from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 
-SOME = 0.02  # share of the poses (our choice)
-END = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
-FEWEST = 20  # poses from which errors on rows left out are worth a model (our choice)
-MOST = 1500  # poses that folds are judged by (our choice)
-UNTOLD = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
+NEAR_SHARE = 0.02  # share of the poses (our choice)
+END_SHARE = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
+MIN_POSES = 20  # poses from which errors on rows left out are worth a model (our choice)
+MAX_POSES = 1500  # poses that folds are judged by (our choice)
+PRIOR_SIGMA = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class ErrorModel:
         """Return how many times as wide intervals (m,) are outside ranges: fully from half the width of an end on."""
         result = np.ones(len(q))
         for j, most in enumerate(self.discrepancy.wider):
-            low, first, last, high = np.quantile(self.learnt[:, j], [0.0, END, 1.0 - END, 1.0])
+            low, first, last, high = np.quantile(self.learnt[:, j], [0.0, END_SHARE, 1.0 - END_SHARE, 1.0])
             for far, end, factor in ((low - q[:, j], first - low, most[0]), (q[:, j] - high, high - last, most[1])):
                 share = np.clip(2.0 * far / max(end, 1e-9), 0.0, 1.0)
                 result = np.maximum(result, 1.0 + (factor - 1.0) * share)
@@ -178,12 +178,12 @@ def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
 
-    The latter is, joint by joint, the way to where `SOME` of the learnt poses are within reach: a few of them far off
-    the others do not tell how a joint is there.
+    The latter is, joint by joint, the way to where `NEAR_SHARE` of the learnt poses are within reach: a few of them far
+    off the others do not tell how a joint is there.
     """
     nearest = np.asarray(KDTree(learnt * levers).query(q * levers)[0]) ** 2
     alone, count = np.zeros(len(q)), len(learnt)
-    some = int(np.clip(round(SOME * count), 1, count))
+    some = int(np.clip(round(NEAR_SHARE * count), 1, count))
     for j, lever in enumerate(levers):
         values = np.sort(learnt[:, j])
         place = np.searchsorted(values, q[:, j])
@@ -214,7 +214,7 @@ def learn_errors(
     """Learn what errors to expect from those on rows left out; None without positions, or with too few.
 
     For every fold the geometry and the ridges of all effects that were taken up are found anew: ridges of all rows know
-    what was left out. With a robust loss, rows beyond `GROSS` robust sigmas are no errors of the arm and do not count.
+    what was left out. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.
 
     Args:
         selected: the model and its fit of all rows.
@@ -223,7 +223,7 @@ def learn_errors(
         seed: of the random folds.
     """
     found = selected.fit
-    if sum(len(block) for block in measured) < FEWEST or not all(isinstance(block, Positions) for block in measured):
+    if sum(len(block) for block in measured) < MIN_POSES or not all(isinstance(block, Positions) for block in measured):
         return None
     levers = _joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
     rows = _Rows(selected, measured, torques)
@@ -250,7 +250,7 @@ def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]
     q = np.concatenate([block.q for block in measured])
     edges, result = np.cumsum([len(block) for block in measured])[:-1], []
     for j in range(q.shape[1]):
-        low, high = np.quantile(q[:, j], [END, 1.0 - END])
+        low, high = np.quantile(q[:, j], [END_SHARE, 1.0 - END_SHARE])
         if high - low < 1e-6:
             continue
         fold = np.where(q[:, j] < low, 0, np.where(q[:, j] > high, 1, 2))
@@ -268,7 +268,7 @@ class _Rows:
         torques: Sequence[np.ndarray | None] | None,
     ):
         found, terms = selected.fit, selected.offered
-        every = max(1, -(-sum(map(len, measured)) // MOST))
+        every = max(1, -(-sum(map(len, measured)) // MAX_POSES))
         self.chosen = [np.arange(0, len(block), every) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
         self.pose, poses = [], []
@@ -277,7 +277,7 @@ class _Rows:
             self.pose.append(which + sum(map(len, poses)))
             poses.append(block.q[first])
         self.poses = np.concatenate(poses)
-        gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in found.outliers(GROSS)}
+        gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in found.outliers(MAX_RESIDUAL)}
         self.counts = [np.array([(b.file, int(row)) not in gross for row in b.rows], bool) for b in self.measured]
         torques = [None] * len(measured) if torques is None else torques
         given = [None if torque is None else torque[rows] for torque, rows in zip(torques, self.chosen)]
@@ -293,7 +293,7 @@ class _Rows:
         wide = plausible_deviation(cell, self.free[: len(own)])
         if found.prior is not None:
             wide = np.minimum(wide, found.prior[own])
-        self.prior = np.where(np.isfinite(wide), wide, UNTOLD)
+        self.prior = np.where(np.isfinite(wide), wide, PRIOR_SIGMA)
         scales, weights = found.used_sigmas(), found.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
         self.metric: list[tuple[np.ndarray, np.ndarray]] = []

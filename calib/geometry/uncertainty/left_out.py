@@ -21,10 +21,10 @@ from calib.estimation.variances import ROUNDS, variance_weights
 from calib.geometry.uncertainty.unevenness import Profile, Unevenness, unevenness
 
 COVERED = 0.95
-AGAIN = 100  # rounds of the search for variances without a fold's poses
+FOLD_ROUNDS = 100  # rounds of the search for variances without a fold's poses
 LASTING, CHANGE = 0.5, 0.33
 MIN_ENDS = 3  # that tell what is common to them (our choice)
-SPARE = 5  # rows of a kind that the poses outside a fold must have to tell an interval (our choice)
+MIN_ROWS = 5  # rows of a kind that the poses outside a fold must have to tell an interval (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class LeftOut:
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
         """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the radii: sigmas that hold near, far errors."""
-        near, rounds = self.near, AGAIN
+        near, rounds = self.near, FOLD_ROUNDS
         if not start:
             middle, rounds = float(np.median(self.squares)), ROUNDS
             start = [1.0, middle, *0.3 * middle / np.maximum(self.shapes[:, 2:].mean(axis=0), 1e-12)]
@@ -108,7 +108,7 @@ class LeftOut:
         for fold in np.unique(self.fold):
             rows = self.fold == fold
             rest = self.without(self.pose[rows])
-            if min(rest.near.sum(), (~rest.near).sum()) > SPARE:
+            if min(rest.near.sum(), (~rest.near).sum()) > MIN_ROWS:
                 own, radii = rest.learnt(weights)
                 sigma = np.sqrt(np.maximum(self.shapes[rows] @ own, 1e-30))
                 ratio[rows] = np.sqrt(self.squares[rows]) / (sigma * np.interp(self.away[rows], reach, radii))
@@ -128,7 +128,7 @@ class LeftOut:
         sizes = np.sqrt(self.squares) / (sigma * np.interp(self.away, reach, radii))
         side = (q > np.median(q, axis=0))[self.pose, self.joint].astype(int)
         rows = {(j, k): sizes[(self.joint == j) & (side == k)] for j in range(q.shape[1]) for k in (0, 1)}
-        rows = {end: each for end, each in rows.items() if len(each) > SPARE}
+        rows = {end: each for end, each in rows.items() if len(each) > MIN_ROWS}
         if len(rows) < MIN_ENDS:
             return ()
         size = np.array([np.sqrt(np.mean(each**2)) for each in rows.values()])

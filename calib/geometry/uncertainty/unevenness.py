@@ -1,6 +1,6 @@
 """Where errors are larger than elsewhere: the logarithm of their variance as a sum of one function per joint.
 
-    log s(q) = Σ_j f_j(q_j),    f_j ~ GP(0, a_j² exp(-|Δ| / (WAY · range)))
+    log s(q) = Σ_j f_j(q_j),    f_j ~ GP(0, a_j² exp(-|Δ| / (CORRELATION_LENGTH · range)))
 
 by regression of the logarithms of squared errors on joint values (Harvey 1976, Econometrica 44: multiplicative
 heteroscedasticity), every a_j at its most probable (`calib.estimation.relevance`): 0 where a joint tells nothing.
@@ -16,11 +16,11 @@ import numpy as np
 from calib.estimation.relevance import SETTLED, Gram, gram, relevance
 
 KNOTS = 9  # values per joint, linear in between (our choice)
-WAY = 0.5  # how far one value speaks for others, of the range (our choice)
-BEYOND = 0.2  # how far the function is stated outside the range, of it (our choice)
-LEAST = 0.02  # of the median squared error: smaller ones count as that (our choice)
-KNOWN = 1e-4  # variance of a logarithm that is known best: copies of few poses would be fitted without any error
-STILL = 1e-3  # a joint that moves by less tells nothing [rad or m]
+CORRELATION_LENGTH = 0.5  # how far one value speaks for others, of the range (our choice)
+KNOT_MARGIN = 0.2  # how far the function is stated outside the range, of it (our choice)
+MIN_SQUARE = 0.02  # of the median squared error: smaller ones count as that (our choice)
+MIN_VARIANCE = 1e-4  # variance of a logarithm that is known best: copies of few poses would be fitted without any error
+MIN_MOTION = 1e-3  # a joint that moves by less tells nothing [rad or m]
 ROUNDS = 30  # of the search for the a_j
 
 Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]  # per joint: its values, log s there
@@ -41,11 +41,11 @@ class Unevenness:
 
     def __init__(self, q: np.ndarray, squares: np.ndarray):
         low, high = q.min(axis=0), q.max(axis=0)
-        grid = np.linspace(-BEYOND, 1.0 + BEYOND, KNOTS)
-        self.moving = np.flatnonzero(high - low > STILL)
+        grid = np.linspace(-KNOT_MARGIN, 1.0 + KNOT_MARGIN, KNOTS)
+        self.moving = np.flatnonzero(high - low > MIN_MOTION)
         self.joints = q.shape[1]
         self.knots = low + np.outer(grid, high - low)
-        root = np.linalg.cholesky(np.exp(-np.abs(grid[:, None] - grid) / WAY))
+        root = np.linalg.cholesky(np.exp(-np.abs(grid[:, None] - grid) / CORRELATION_LENGTH))
         hats = [
             np.stack([np.interp(q[:, j], self.knots[:, j], one) for one in np.eye(KNOTS)], axis=1) for j in self.moving
         ]
@@ -54,7 +54,7 @@ class Unevenness:
         columns[:, 1:] -= mean
         self.bases = [root - each for each in mean.reshape(-1, KNOTS)]
         self.groups = np.concatenate([[-1], np.repeat(np.arange(len(self.moving)), KNOTS)])
-        self.columns, self.logs = columns, np.log(np.maximum(squares, max(LEAST * np.median(squares), 1e-300)))
+        self.columns, self.logs = columns, np.log(np.maximum(squares, max(MIN_SQUARE * np.median(squares), 1e-300)))
         self.data = gram(self.logs, self.columns)
 
     def profile(self, left_out: np.ndarray | None = None) -> Profile:
@@ -69,7 +69,7 @@ class Unevenness:
         )
 
     def _values(self, data: Gram) -> list[np.ndarray]:
-        data = replace(data, total=data.total + KNOWN * data.rows)
+        data = replace(data, total=data.total + MIN_VARIANCE * data.rows)
         found = relevance(data, self.groups, np.full(len(self.groups), 0.5), ROUNDS, SETTLED)
         alive = np.flatnonzero(found.ridge > 0.0)
         precision = data.square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)

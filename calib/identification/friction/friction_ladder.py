@@ -3,9 +3,10 @@
     standard → + coupling → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
 
 Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
-others, and the terms stay at the joints whose error on unseen time falls by `GAIN`, and does not grow where one half of
-the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms of a
-step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
+others, and the terms stay at the joints whose error on unseen time falls by `MIN_GAIN`, and does not grow where one
+half of the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms
+of a step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can
+tell.
 
 A coupling is a gear whose motor turns with two joints; it is offered for pairs of joints of which what the standard
 model leaves is explained by the other's motion. Cables are offered where sensors see them behind the gears, apart from
@@ -31,11 +32,11 @@ from calib.identification.left_out.time_folds import CrossValidation
 from calib.identification.rows import ObservationRows, observe_terms, triangulate
 from calib.records import Number, stored
 
-GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
+MIN_GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
-WINS = 0.6  # and on this share of the blocks
-SAMPLES = 3000  # of the rows that couplings are sought in, about
-SWITCHED_OFF = 1e-9  # σ of a term below which its ridge holds it at zero
+MIN_BLOCKS_WON = 0.6  # and on this share of the blocks
+COUPLING_ROWS = 3000  # of the rows that couplings are sought in, about
+MIN_SIGMA = 1e-9  # σ of a term below which its ridge holds it at zero
 MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
 
 
@@ -110,7 +111,7 @@ class FrictionSelection:
 
     def fitted(self, sigma: np.ndarray) -> FrictionSelection:
         """Return the selection after the final fit, by its terms' σ (k,): what that switched off is not kept."""
-        off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < SWITCHED_OFF)
+        off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < MIN_SIGMA)
         joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
         steps = []
         for step in self.steps:
@@ -263,8 +264,8 @@ def _flat(at: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Say whether a joint's squared errors, one half of the time predicting the other, did not grow by `GAIN`."""
-    return bool(after.sum() <= (1.0 + GAIN) ** 2 * before.sum())
+    """Say whether a joint's squared errors, one half of the time predicting the other, did not grow by `MIN_GAIN`."""
+    return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
@@ -279,7 +280,7 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
     if not used.any():
         return False
     lower = float(np.mean(after[used] < before[used]))
-    return bool(after.sum() < (1.0 - GAIN) ** 2 * before.sum() and lower >= WINS)
+    return bool(after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum() and lower >= MIN_BLOCKS_WON)
 
 
 def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
@@ -331,14 +332,14 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return some `SAMPLES` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
+    """Return some `COUPLING_ROWS` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
     parts = []
     for part, case in zip(candidates.rows, candidates.cases):
         own = kept(case.motion.segment, candidates.decimator)
         used = part.present.all(axis=1)
         parts.append([x[used] for x in (part.matrix, part.target, *(getattr(case.motion, key)[own] for key in "qva"))])
     matrix, target, *motion = (np.concatenate(series) for series in zip(*parts))
-    every = slice(None, None, max(1, len(target) // SAMPLES))
+    every = slice(None, None, max(1, len(target) // COUPLING_ROWS))
     return matrix[every], target[every], [series[every].T for series in motion]
 
 

@@ -15,7 +15,7 @@ from calib.identification.prediction import Dynamics
 from calib.identification.rows import term_columns
 
 SPEEDS = 8  # of each direction at which friction is to brake (our choice)
-LEAST = -0.01  # of the energy that a joint moves: noise and what other columns take over stay above (our choice)
+MIN_ENERGY_SHARE = -0.01  # of the energy that a joint moves: noise and other columns' shares stay above (our choice)
 
 
 def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
@@ -75,7 +75,7 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
 
 def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     """Return which joints friction drives, (n,) bool."""
-    return np.asarray(_dissipated(dynamics, cases) < LEAST)
+    return np.asarray(_dissipated(dynamics, cases) < MIN_ENERGY_SHARE)
 
 
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
@@ -85,7 +85,7 @@ def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
         MeasurementError: where these are most of the joints that move.
     """
     share = _dissipated(dynamics, cases)
-    found = np.flatnonzero(share < LEAST)
+    found = np.flatnonzero(share < MIN_ENERGY_SHARE)
     if len(found) and 2 * len(found) > np.count_nonzero(share):
         named = ", ".join(str(joint + 1) for joint in found)
         refuse_data(

@@ -35,20 +35,20 @@ from calib.identification.cases import Case
 from calib.identification.rows import segments
 
 COARSE, FINE = (10.0, 40.0), (10.0, 20.0, 30.0, 45.0, 65.0)  # nodes of the gains [Hz]
-LOWEST, HIGHEST = 16, 800  # orders per turn
+MIN_ORDER, MAX_ORDER = 16, 800  # orders per turn
 TURNS = range(16, 321)  # motor turns per turn that a family may have
-SIMILAR = 0.6  # of a gear's own best coherence: a number of turns that other gears have is taken instead (our choice)
+MIN_COHERENCE = 0.6  # of a gear's own best coherence: a number of turns of other gears takes its place (our choice)
 CELLS = 8192  # of a turn, for the search
-BINS = 4  # of the speed, per direction
+SPEED_BINS = 4  # of the speed, per direction
 RIDGES = (0.03, 0.1, 0.3, 1.0)  # of the mean information of a column
-LEAST = 0.1  # [rad] that a joint must travel
+MIN_TRAVEL = 0.1  # [rad] that a joint must travel
 BLOCKS = 8
-PAYS = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
-WORTH = 0.03  # in all: 1.5 % of its rms
-FREE = 0.04  # and where no family pays: 2 % of its rms (our choices)
-PAIRS = 3  # of free orders, at most
-SAMPLES = 4_000  # of the search
-START = 0.5  # [s] left out at the beginning, where robots start
+MIN_GAIN = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
+MIN_TOTAL_GAIN = 0.03  # in all: 1.5 % of its rms
+MIN_FREE_GAIN = 0.04  # and where no family pays: 2 % of its rms (our choices)
+MAX_FREE_SETS = 3  # of free orders, at most
+MAX_SAMPLES = 4_000  # of the search
+SKIPPED_START = 0.5  # [s] left out at the beginning, where robots start
 
 Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
 
@@ -109,14 +109,14 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
     Args:
         residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
     """
-    step = max(1, sum(len(case.motion) for case in cases) // SAMPLES)
+    step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
     used = np.concatenate([case.motion.weight[::step] > 0.5 for case in cases])
     block = np.where(used, np.concatenate([own[::step] for own in _blocks(cases)]), -1)
     kept = block >= 0
     if len(np.unique(block[kept])) < 2:
         return []
     q, v = (np.concatenate([getattr(case.motion, name)[::step] for case in cases])[kept] for name in ("q", "v"))
-    moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= LEAST))
+    moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= MIN_TRAVEL))
     if not moving:
         return []
     track = GearTravel(q, v, block[kept], moving)
@@ -140,7 +140,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     found = {j: int(np.argmax(score)) for j, score in scores.items()}
     offered = sorted({*found.values(), int(np.argmax(every))}, key=lambda k: -float(np.asarray(every)[k]))
     return {
-        j: TURNS[next((k for k in offered if scores[j][k] >= SIMILAR * scores[j][own]), own)]
+        j: TURNS[next((k for k in offered if scores[j][k] >= MIN_COHERENCE * scores[j][own]), own)]
         for j, own in found.items()
     }
 
@@ -158,9 +158,9 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
     sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
     offers = [tuple((j, order) for order in one) for j in sources for one in _family(turns[j])]
-    taken, best, ridge = _climb(bench, lambda rest: offers, PAYS)
+    taken, best, ridge = _climb(bench, lambda rest: offers, MIN_GAIN)
     if not taken:
-        taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), FREE, PAIRS)
+        taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), MIN_FREE_GAIN, MAX_FREE_SETS)
     if not taken:
         return None
     nodes = COARSE
@@ -175,7 +175,7 @@ def _family(turns: int) -> tuple[tuple[int, ...], ...]:
     """Return the orders per turn at which a gear shows, in the sets that are offered together."""
     n = turns
     return tuple(
-        one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= HIGHEST
+        one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= MAX_ORDER
     )  # fmt: skip
 
 
@@ -252,7 +252,7 @@ def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarra
     """Return S(k) of all whole orders k of a gear from 0 on, (CELLS / 2 + 1,); see the module."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
-    edges = np.quantile(speed, np.linspace(0.1, 1.0, BINS + 1))[:-1]
+    edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
     bins = np.searchsorted(edges, speed, side="right") * np.where(v > 0.0, 1, -1)
     cell = np.floor(q / (2.0 * np.pi) * CELLS).astype(int) % CELLS
     numbers, place = np.unique(track.block, return_inverse=True)
@@ -288,14 +288,14 @@ def _climb(
             break
         taken, best, ridge = waves, share, level
         rest = bench.fit(taken, COARSE, ridge)[0]
-    return (taken, best, ridge) if best >= WORTH else ((), 0.0, ridge)
+    return (taken, best, ridge) if best >= MIN_TOTAL_GAIN else ((), 0.0, ridge)
 
 
 def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
     """Return the most coherent order of the joint's own gear, and the most coherent two that are two apart."""
     power = coherence(track, joint, rest)
-    order = LOWEST + int(np.argmax(power[LOWEST : HIGHEST + 1]))
-    lower = LOWEST + int(np.argmax(power[LOWEST : HIGHEST - 1] + power[LOWEST + 2 : HIGHEST + 1]))
+    order = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER + 1]))
+    lower = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]))
     return [((joint, order),), ((joint, lower), (joint, lower + 2))]
 
 
@@ -314,6 +314,6 @@ def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
     numbers, first = [], 0
     for case, size, count in zip(cases, sizes, own):
         number = first + np.arange(size) * count // size
-        numbers.append(np.where(case.motion.t < START, -1, number))
+        numbers.append(np.where(case.motion.t < SKIPPED_START, -1, number))
         first += count
     return numbers

@@ -16,10 +16,7 @@ from calib.data.signals.decimation import Decimator, kept
 from calib.identification.cases import Case
 from calib.identification.rows import ObservationRows
 
-FAST, FAR = (
-    0.1,
-    0.15,
-)  # shares of the rows that are a joint's fastest, its hardest accelerated, and at each end (our choice)
+FAST_SHARE, END_SHARE = 0.1, 0.15  # of the rows: a joint's fastest, its hardest accelerated; at each end (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +46,8 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     if rows % q.shape[1]:  # rows of the platform, or the power: of all joints together, and of the one that moves most
         joint = np.full(rows, np.argmax(np.std(q, axis=0)))
         v, a = (np.copysign(np.linalg.norm(x / (np.std(x, axis=0) + 1e-12), axis=1)[:, None], x) for x in (v, a))
-    low, high = np.quantile(q, [FAR, 1.0 - FAR], axis=0)
-    fastest, hardest = (np.abs(x) > np.quantile(np.abs(x), 1.0 - FAST, axis=0) for x in (v, a))
+    low, high = np.quantile(q, [END_SHARE, 1.0 - END_SHARE], axis=0)
+    fastest, hardest = (np.abs(x) > np.quantile(np.abs(x), 1.0 - FAST_SHARE, axis=0) for x in (v, a))
     inside = np.stack([fastest, hardest, q < low, q > high, v > 0.0, v < 0.0])[:, :, joint]
     stacked = [np.concatenate([part.matrix, part.target[:, :, None]], axis=2) for part in all_rows]
     squares, counts = np.zeros((len(inside), rows, p + 1, p + 1)), np.zeros((len(inside), rows))

@@ -45,10 +45,10 @@ from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward, replayed_error
 
 FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
-LONGEST = 20.0  # [s] of a recording that are replayed
-MARGIN = 0.05  # least eigenvalue of a possible robot's inertia, scaled by its diagonal
-SOFT = 0.25  # least smoothing of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MARGIN` is 0.11
-LEAST = 1e-3  # [kg m² or kg] least inertia of a joint
+MAX_SECONDS = 20.0  # [s] of a recording that are replayed
+MIN_EIGENVALUE = 0.05  # least eigenvalue of a possible robot's inertia, scaled by its diagonal
+MIN_SMOOTHING = 0.25  # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MIN_EIGENVALUE` is 0.11
+MIN_INERTIA = 1e-3  # [kg m² or kg] least inertia of a joint
 FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
 
 
@@ -126,9 +126,9 @@ def replay(
 
 
 def _stretch(case: Case) -> slice:
-    """Return the longest part without gaps, cut to `LONGEST`."""
+    """Return the longest part without gaps, cut to `MAX_SECONDS`."""
     first, last = max(segments(case.motion.segment), key=lambda ends: ends[1] - ends[0])
-    return slice(first, min(last, first + int(LONGEST * case.motion.rate)))
+    return slice(first, min(last, first + int(MAX_SECONDS * case.motion.rate)))
 
 
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
@@ -156,14 +156,14 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 def _possible(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
     """Return the robot with as much inertia (n,) of its motors added as makes it possible, and that.
 
-    The least eigenvalue of its inertia matrix along the reference, scaled by the joints' own, is brought to `MARGIN`.
+    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `MIN_EIGENVALUE`.
     """
     bodies, first = robot.bodies, robot.inertial
     inertia = mass_matrix(bodies, robot.parameters[:first], np.ascontiguousarray(reference.q[::50]))
     inertia = inertia + added_inertia(robot.terms, robot.parameters[first:], bodies.n)
-    size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), LEAST)
+    size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), MIN_INERTIA)
     least = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
-    added = max(0.0, MARGIN - least) * size
+    added = max(0.0, MIN_EIGENVALUE - least) * size
     softer = tuple(_softer(one, value, size, reference) for one, value in zip(robot.terms, robot.parameters[first:]))
     robot = replace(robot, terms=softer)
     if not added.any():
@@ -176,7 +176,7 @@ def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference
     """Return a term whose sign the simulator can integrate at this control period."""
     if "v0" not in one.form.settings:
         return one
-    least = SOFT * abs(value) * reference.period / size[one.acts[0][0]]
+    least = MIN_SMOOTHING * abs(value) * reference.period / size[one.acts[0][0]]
     return replace(one, settings=(*one.settings[:-1], max(one.settings[-1], least)))
 
 

@@ -39,11 +39,11 @@ from calib.identification.parameter_constraints import Constraints, Held, hold, 
 from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
-LIMIT = 10  # iterations; 3 to 6 are usual
-FOLLOWED = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
-GAINS_OFF = 1.25  # times as far from its reference as simulated: from here on gains are not those stated (our choice)
-UNLIKE = 2.0  # times the model's own error, that the torque simulated is off by where the loop is another (our choice)
-RETREATS = 6  # halvings of a step to parameters that cannot be simulated
+MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
+MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
+MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
+MAX_LOOP_ERROR = 2.0  # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
+MAX_RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
 @dataclass(frozen=True)
@@ -150,12 +150,12 @@ class Instrumental:
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
         away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
-        return np.flatnonzero(away > np.log(GAINS_OFF) + 5.0 * unsure)
+        return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
     @property
     def explains(self) -> bool:
         """Whether the simulated loop explains the recording as well as the model does its measured motion."""
-        return not len(self.off) and bool(np.all(self.direct < UNLIKE * self.own))
+        return not len(self.off) and bool(np.all(self.direct < MAX_LOOP_ERROR * self.own))
 
     @property
     def shift(self) -> np.ndarray:
@@ -184,7 +184,7 @@ def identify_instrumental(
     positive: Sequence[str] = (),
     constraints: Constraints | None = None,
     tolerance: float = 0.025,
-    limit: int = LIMIT,
+    limit: int = MAX_ROUNDS,
 ) -> Instrumental:
     """Estimate base parameters with instruments from simulation.
 
@@ -321,7 +321,7 @@ def _with_signs(
     motion, band = case.motion, 0.5 * case.motion.band
     measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
-    followed = away <= FOLLOWED * motion.velocity_noise(band)
+    followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
     if not followed.all():
         speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
         seen = observe(task.model, columns[drowned], replace(case, motion=replace(motion, v=speed)), task.decimator)
@@ -397,7 +397,7 @@ def _simulate_new(
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
     retreats = 0
-    while retreats < RETREATS:
+    while retreats < MAX_RETREATS:
         share, new = 0.5**retreats, task.plant(old, found)
         tried = new.with_parameters(share * new.parameters + (1.0 - share) * old.parameters)
         try:
@@ -498,7 +498,7 @@ def _stray(runs: Runs) -> np.ndarray:
     rest = found - slope * expected
     rows = [inflation(rest[:, j]) for j in range(rest.shape[1])]
     sigma = np.sqrt(np.array(rows) * np.mean(rest**2, axis=0) / size)
-    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(GAINS_OFF), slope, np.nan))
+    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
 
 
 ROUNDS = {

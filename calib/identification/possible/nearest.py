@@ -20,7 +20,7 @@ from calib.estimation.triangles import retriangulate
 from calib.identification.possible.information import Information
 from calib.identification.possible.problem import DRIVE, BodyCost
 
-LARGEST = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
+MAX_TRACE = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
 
 
 def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> np.ndarray:
@@ -45,9 +45,9 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), pseudo_inertia.UNITS).reshape(count, 4, 4, 10 * count)
     bodies = np.concatenate([bodies, np.zeros((count, 4, 4, len(problem.sizes)))], axis=3)
     positive = [k for k in np.flatnonzero(problem.positive) if count + k != spared]
-    rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * LARGEST), np.eye(len(matrix))[10 * count :][positive]])
+    rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * MAX_TRACE), np.eye(len(matrix))[10 * count :][positive]])
     offset = np.repeat([1.0, 0.0], [count, len(positive)])
-    least = np.where(np.arange(count) == spared, -4.0 * LARGEST, 0.0)
+    least = np.where(np.arange(count) == spared, -4.0 * MAX_TRACE, 0.0)
     result = matrix @ minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, least).values
     result[10 * count :] += given
     return np.asarray(result)

@@ -45,13 +45,13 @@ every motion (97.8 %).
 """
 BORROWED = 4.0  # blocks' worth of what all joints say together of one's errors (our choice)
 CHANCES = (np.arange(41) + 0.5) / 41
-MOST = 5000  # samples of a recording that intervals are evaluated at
-NEAR, REPEAT, FINER = 0.05, 0.5, 8  # of the spread of states; share of them met before; samples per thinned one
-EDGE = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
-DOUBLE, PRIOR = 2.0, 0.02
+MAX_SAMPLES = 5000  # samples of a recording that intervals are evaluated at
+SAME_STATE, MIN_REPEATED, FINER_BY = 0.05, 0.5, 8  # of states' spread; share of states met; samples per thinned one
+MAX_OUTSIDE = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
+DOUBLING, PRIOR = 2.0, 0.02
 """The log(1 + d²) at which errors have twice their variance before any data; as share of all rows (our choice)."""
-SOME = 4000  # errors of a joint that its weights are found from, about
-LARGE, EXACT = 5.0, 1e-9  # sigmas that an error counts as at most; of a joint's error, below which there is none
+ERRORS_USED = 4000  # errors of a joint that its weights are found from, about
+MAX_ERROR, MIN_ERROR = 5.0, 1e-9  # sigmas that an error counts as; of a joint's error, below which it has none
 WAYS = ("outside the range of joint", "faster than learnt at joint", "accelerating more than learnt at joint")
 
 
@@ -81,7 +81,7 @@ class TorqueDiscrepancy:
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return by which of q, v, a and at which joint (3, N, n) states leave what was learnt from."""
-        return self._outside(q, v, a) > EDGE * (np.array(self.upper) - np.array(self.lower))[:, None]
+        return self._outside(q, v, a) > MAX_OUTSIDE * (np.array(self.upper) - np.array(self.lower))[:, None]
 
     def _outside(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         states = np.stack([q, v, a])
@@ -185,7 +185,7 @@ class TorqueIntervals:
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
     """Return what a model expects of its errors on a recording, beside those of its prediction (N, rows)."""
     motion = case.motion
-    index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), MOST)).astype(int))
+    index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), MAX_SAMPLES)).astype(int))
     q, v, a = (np.asarray(x[index]) for x in (motion.q, motion.v, motion.a))
     states = segmented_states(dynamics.model.columns, case)[:, index]
     sigma = errors.sigma(dynamics, q, v, a, case.carried, states)
@@ -270,7 +270,7 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
         errors.append(torques[-1] - dynamics.model.torque(dynamics.values, q, v, a, case.carried, memory))
         states.append(own)
         blocks.append(np.where(motion.weight[index] > 0.5, rows.block, -1))
-        every = slice(None, None, max(1, decimator.factor // FINER))
+        every = slice(None, None, max(1, decimator.factor // FINER_BY))
         whole.append(np.hstack([motion.q, motion.v])[every])
         near = np.searchsorted(index, np.arange(len(motion))[every]).clip(max=len(index) - 1)
         parts.append(rows.block[near])
@@ -292,11 +292,11 @@ def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
     """
     spread = np.maximum(samples.whole.std(axis=0), 1e-6)
     trees = {k: KDTree(samples.whole[samples.part == k] / spread) for k in blocks}
-    limit, runs = NEAR * np.sqrt(len(spread)), []
+    limit, runs = SAME_STATE * np.sqrt(len(spread)), []
     for block in blocks:
         own = samples.states[:2, samples.block == block].transpose(1, 0, 2).reshape(-1, len(spread)) / spread
         met = [np.isfinite(tree.query(own, distance_upper_bound=limit)[0]).mean() for tree in trees.values()]
-        run = tuple(k for k, share in zip(trees, met) if k == block or share >= REPEAT)
+        run = tuple(k for k, share in zip(trees, met) if k == block or share >= MIN_REPEATED)
         if run not in runs and len(run) < len(blocks):
             runs.append(run)
     return [np.array(run) for run in (runs if len(runs) > 1 else [(block,) for block in blocks])]
@@ -351,12 +351,12 @@ def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int) -> np.
         blocks: of time.
     """
     errors, shapes = (np.concatenate(each) for each in zip(*folds))
-    every = max(1, len(errors) // SOME)
+    every = max(1, len(errors) // ERRORS_USED)
     squares, shapes = errors[::every].T ** 2, shapes[::every].transpose(1, 0, 2).copy()
     size = np.maximum(squares.mean(axis=1), 1e-300)
-    squares = np.maximum(squares / size[:, None], EXACT**2)
+    squares = np.maximum(squares / size[:, None], MIN_ERROR**2)
     shapes[:, :, 0] /= size[:, None]
-    count, known = squares.shape[1], np.array([[1.0, 0.0, 0.0], [0.0, 1.0, DOUBLE]])
+    count, known = squares.shape[1], np.array([[1.0, 0.0, 0.0], [0.0, 1.0, DOUBLING]])
     expected = np.array([1.0, 2.0]), known, np.array([count / blocks, max(1.0, PRIOR * count)])
     result = []
     for row in range(len(size)):
@@ -381,7 +381,7 @@ def _in_units(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the log size per fold of a row's errors, in units of their weights (3,), and errors in units of both."""
     each = [(error[:, row] ** 2, shapes[:, row] @ weights) for error, shapes in folds]
-    least = max(EXACT**2 * float(np.mean(np.concatenate([square for square, _ in each]))), 1e-30)
+    least = max(MIN_ERROR**2 * float(np.mean(np.concatenate([square for square, _ in each]))), 1e-30)
     units = [np.sqrt(square / np.maximum(own, least)) for square, own in each]
-    logs = np.array([0.5 * np.log(np.mean(np.minimum(one, LARGE) ** 2) + 1e-12) for one in units])
+    logs = np.array([0.5 * np.log(np.mean(np.minimum(one, MAX_ERROR) ** 2) + 1e-12) for one in units])
     return logs, np.concatenate([one / np.exp(log) for one, log in zip(units, logs)])

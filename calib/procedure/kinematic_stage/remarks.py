@@ -10,7 +10,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding
 from calib.geometry.accuracy import NATURE
-from calib.geometry.model_choice.ladder import GROSS, ModelSelection
+from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import observe
 from calib.geometry.result import GeometricFit
 from calib.units import ERRORS
@@ -78,7 +78,7 @@ def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> F
         robust: the rigid models on the same rows with a loss that does not.
         reach: of the arm [m].
     """
-    off = [row for row in named_outliers(robust.rigid) if row.sigmas > GROSS]
+    off = [row for row in named_outliers(robust.rigid) if row.sigmas > MAX_RESIDUAL]
     if not off or misfit(robust, reach):
         return None
     best = min(rung.cross_validated for rung in robust.rungs)

@@ -54,7 +54,7 @@ OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # setting
 APART = 1e-3  # rms by which redundant encoders contradict each other from which it is said [rad or m] (our choice)
 RATE = 100.0  # of torques_1.csv [Hz]
 FEW = 200  # samples of a recording at which they are asked
-DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.LEAST`
+DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.MIN_ENERGY_SHARE`
 
 Recorded = str | Path | Recording
 

@@ -297,7 +297,7 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
     if status == loop_kernels.STIFF:
         return CannotSimulate(
             f"{place}friction at rest is too stiff for the control period, by more than "
-            f"{loop_kernels.MOST} steps: "
+            f"{loop_kernels.MAX_STEPS} steps: "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
     return Diverged(f"the loop diverged at {time:.4g} s: {LOWER}", None)

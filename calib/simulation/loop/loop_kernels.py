@@ -41,9 +41,9 @@ from calib.dynamics.shape_kernels import (
 )
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
-MOST = 64  # steps that friction may ask for in one period
-BRISK = 1.5  # reciprocals of friction's fastest decay in a step of the midpoint rule, which is stable up to 2
-REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: one period away at most 6 v0
+MAX_STEPS = 64  # steps that friction may ask for in one period
+MIDPOINT_STEP = 1.5  # reciprocals of friction's fastest decay in a step of the midpoint rule, which is stable up to 2
+STIFF_REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: at most 6 v0
 FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 
@@ -305,7 +305,7 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
         slope, spring = acts[t, 0] * slope, acts[t, 0] * spring
         if kinds[t, 1] == LOAD:
             slope *= abs(seen(acts, t, loads))
-        if abs(abs(seen(acts, t, v)) - middle) > REACH * width:
+        if abs(abs(seen(acts, t, v)) - middle) > STIFF_REACH * width:
             slope = 0.0
         if slope == 0.0 and spring == 0.0:
             continue
@@ -397,7 +397,7 @@ def _advance(
     """
     n = q.shape[0]
     pieces = int(0.5 * period * stiffness(kinds, acts, loads, v, matrix, at)) + 1
-    if pieces > MOST:
+    if pieces > MAX_STEPS:
         return STIFF
     span = period / pieces
     for piece in range(pieces):
@@ -430,12 +430,12 @@ def _advance_midpoint(
 ):  # fmt: skip
     """Advance q, v (n,) by the midpoint rule: half of the work of `_advance`, for periods short against the motion.
 
-    In steps of at most `BRISK` reciprocals of friction's fastest decay: the rule's 1 + z + z²/2 has no zero, so that
-    the velocity does not change its sign, and is 0.625 there.
+    In steps of at most `MIDPOINT_STEP` reciprocals of friction's fastest decay: the rule's 1 + z + z²/2 has no zero, so
+    that the velocity does not change its sign, and is 0.625 there.
     """
     n = q.shape[0]
-    pieces = int(period * stiffness(kinds, acts, loads, v, matrix, at) / BRISK) + 1
-    if pieces > 2 * MOST:
+    pieces = int(period * stiffness(kinds, acts, loads, v, matrix, at) / MIDPOINT_STEP) + 1
+    if pieces > 2 * MAX_STEPS:
         return STIFF
     span = period / pieces
     plant = (tree, body, linear, kinds, acts, memory, loads)

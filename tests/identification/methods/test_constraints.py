@@ -16,7 +16,7 @@ from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.methods.registry import METHODS
-from calib.identification.parameter_constraints import LEAST, ConstraintSettings, WeightedSum
+from calib.identification.parameter_constraints import MIN_EIGENVALUE, ConstraintSettings, WeightedSum
 
 FREE = {"pc-ols": "ols", "pc-wls": "wls", "pc-irls": "irls"}
 
@@ -81,7 +81,7 @@ def test_a_robot_that_cannot_be_is_made_one_that_can(problem):
     held = METHODS["pc-wls"].estimate(wanted)
     tensor = wanted.constrained.inertia
     assert np.linalg.eigvalsh(tensor @ loose.estimate.values).min() < 0.0
-    assert np.linalg.eigvalsh(tensor @ held.estimate.values).min() > 0.1 * LEAST * np.abs(tensor).min()
+    assert np.linalg.eigvalsh(tensor @ held.estimate.values).min() > 0.1 * MIN_EIGENVALUE * np.abs(tensor).min()
     assert held.held is not None and held.held.postures > 0
 
 
@@ -197,7 +197,7 @@ def test_definite_inertia_gives_the_optimum_of_cvxpy(problem):
     size = np.abs(np.einsum("kiip,p->ki", made.inertia, free)).mean(axis=0)
     b = cvxpy.Variable(p)
     scaled = made.inertia / np.sqrt(size)[:, None, None] / np.sqrt(size)[:, None] / norms
-    cones = [sum(b[k] * one[:, :, k] for k in range(p)) - LEAST * np.eye(len(size)) >> 0 for one in scaled]
+    cones = [sum(b[k] * one[:, :, k] for k in range(p)) - MIN_EIGENVALUE * np.eye(len(size)) >> 0 for one in scaled]
     bound = made.matrix / norms @ b <= made.upper
     aim = cvxpy.sum_squares((triangle[:p, :p] / norms @ b - triangle[:p, p]) / np.linalg.norm(triangle[:p, p]))
     cvxpy.Problem(cvxpy.Minimize(aim), [*cones, bound]).solve(solver="CLARABEL")

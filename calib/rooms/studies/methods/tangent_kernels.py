@@ -31,7 +31,7 @@ from calib.dynamics.kernels import OPTIONS
 from calib.simulation.loop.loop_kernels import (
     DIVERGED,
     FINE,
-    MOST,
+    MAX_STEPS,
     SINGULAR,
     STIFF,
     accelerate,
@@ -299,7 +299,7 @@ def _advance_tangent(
     if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, slopes[0]):
         return SINGULAR
     pieces = int(0.5 * period * stiffness(kinds, acts, loads, v, matrix, at)) + 1
-    if pieces > MOST:
+    if pieces > MAX_STEPS:
         return STIFF
     span = period / pieces
     for piece in range(pieces):
