@@ -204,7 +204,7 @@ def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tupl
 
 
 def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
-    """Return the condition number of the columns that can be told, motions before included."""
+    """Return the condition number of the identifiable columns, earlier motions included."""
     known = None if given.prior is None else given.prior.per_sample(settings.samples, settings.repeat * settings.period)
     return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.columns)
 

@@ -43,7 +43,7 @@ def objectives_of(settings: ExcitationSettings, condition: Excitation) -> tuple[
         condition: see `read_goals`.
 
     Raises:
-        UsageError: for two aims, or one beside the condition numbers that it replaces.
+        UsageError: for two aims, or one together with the condition numbers that it replaces.
     """
     aims: list[Index] = [one for one in AIMS if one in settings.goals]
     if not aims:

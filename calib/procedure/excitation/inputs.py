@@ -52,7 +52,7 @@ class ExcitedModel:
 
 @dataclass(frozen=True, eq=False)
 class IdentifiableColumns:
-    """The columns that a motion can tell apart.
+    """The columns that a motion can identify.
 
     Attributes:
         columns: (c,) of the model's; None: all of them.
@@ -92,7 +92,7 @@ class ExcitationInputs:
     Attributes:
         chain, limits, model: the arm, what it must keep, and the dynamics to excite.
         locked: joints that rest, and where; None: where the search likes it.
-        columns: that the motion can tell apart.
+        columns: that the motion can identify.
         prior: motions that count already; None without any.
     """
 
@@ -236,7 +236,7 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
 def identifiable(
     model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None
 ) -> IdentifiableColumns:
-    """Return which columns of a model a motion with these joints locked, and those before, can tell apart."""
+    """Return which columns of a model a motion with these joints locked, and those before, can identify."""
     names = model.exact.names
     if not locked:
         return IdentifiableColumns(None, None, names)
@@ -247,7 +247,7 @@ def identifiable(
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
         f"held: {still}; a held joint's torque is stiction in part and is left out; {len(kept)} of {len(names)} "
-        f"columns can be told ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
+        f"columns are identifiable ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
         f"{', ...' if len(gone) > 12 else ''})"
     )
     return IdentifiableColumns(kept, sigmas, tuple(names[k] for k in kept), (note,) if gone else ())

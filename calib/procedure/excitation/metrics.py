@@ -27,7 +27,7 @@ class DesignCondition:
 
 @dataclass(frozen=True)
 class _DesignSetting:
-    """What was asked for: period [s], the columns to tell, and how many instants were verified."""
+    """What was asked for: period [s], the columns to identify, and how many instants were verified."""
 
     period: float
     columns: tuple[str, ...]

@@ -52,7 +52,7 @@ class _DrivesFile:
     drives: Mapping[str, PerJoint] = field(default_factory=dict)
 
 
-COARSE = 150  # grid of the outer loop
+COARSE_GRID = 150  # grid of the outer loop
 Progress = Callable[[str], None]
 
 
@@ -273,4 +273,4 @@ def _duration(
 ) -> float:
     check_within(path, lower, upper)
     _check_places(path, known)
-    return time_optimal(path, limits, law, grid=COARSE).duration
+    return time_optimal(path, limits, law, grid=COARSE_GRID).duration

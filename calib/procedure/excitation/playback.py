@@ -25,9 +25,9 @@ from trajectories.design.verify import dense_motion
 from trajectories.places import Clearance
 from trajectories.setpoints import Setpoints, joined, slowed
 
-RISE, JERK = DEFAULT_RISE, 20.0  # of an approach, per s and s² times its speed, where nothing else is said
-LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
-BLOCK = 4000
+APPROACH_RISE, APPROACH_JERK = (DEFAULT_RISE, 20.0)  # over its speed, where none is stated
+MAX_APPROACH_SPEED = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
+BLOCK_ROWS = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
 
 def _torque(model: BaseModel, values: np.ndarray, track: Setpoints) -> np.ndarray:
     parts = []
-    for begin in range(0, len(track), BLOCK):
-        part = (np.ascontiguousarray(x[begin : begin + BLOCK]) for x in (track.q, track.v, track.a))
+    for begin in range(0, len(track), BLOCK_ROWS):
+        part = (np.ascontiguousarray(x[begin : begin + BLOCK_ROWS]) for x in (track.q, track.v, track.a))
         parts.append(model.regressor(*part) @ values)
     return np.concatenate(parts)
 
@@ -116,10 +116,10 @@ def approach_to(
     _check_start(here, chain, known)
     sizes = {order: box.upper for order, box in boxes.items()}
     free = np.full(chain.n, np.inf)
-    velocity = np.minimum(sizes.get(1, free), LEISURE)
+    velocity = np.minimum(sizes.get(1, free), MAX_APPROACH_SPEED)
     acceleration, jerk = (
         np.where(np.isfinite(sizes.get(order, free)), sizes.get(order, free), factor * velocity)
-        for order, factor in ((2, RISE), (3, JERK))
+        for order, factor in ((2, APPROACH_RISE), (3, APPROACH_JERK))
     )
     found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
     notes = [_place(one, found) for one in known.constraints if not isinstance(one, BoxLimit)]

@@ -1,4 +1,4 @@
-"""What a motion will tell of the dynamics, before anything is moved: sigmas of parameters and of torques.
+"""Predicted σ of parameters and torques that a motion will identify, before anything is moved.
 
 With Y one sample's regressor and σ_j the error of joint j's torque that no parameter explains, a log of R independent
 rows per joint leaves the base parameters with the covariance
@@ -7,7 +7,7 @@ rows per joint leaves the base parameters with the covariance
 
 and a torque on other motion with the variance Y C Yᵀ. R counts the rows that `calib identify` keeps: twice the band
 that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term
-holds. It is taken as a share of the torque limits, stated or `NOISE`; all sigmas go with it in proportion.
+holds. It is taken as a share of the torque limits, stated or `DEFAULT_NOISE`; all sigmas go with it in proportion.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
-NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
+DEFAULT_NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
 PERIODS = (5.0, 10.0, 20.0, 40.0)
-INSTANTS = 500  # over a period
-TASK = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
+PERIOD_SAMPLES = 500  # over a period
+TASK_STATES = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """What a log of a motion will tell.
+    """Predicted σ from a log of a motion.
 
     Attributes:
         seconds: of motion; rows_per_joint: independent ones.
@@ -70,7 +70,7 @@ class PredictedSigma(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionOutlook:
-    """What a designed motion will tell, and what others of other lengths would.
+    """Predicted σ of a designed motion, and of motions of other lengths.
 
     Attributes:
         noise: (n,) taken as the torques' error [N m or N]; noise_share: of the torque limits.
@@ -99,12 +99,12 @@ def foretell(
     Args:
         given, problem, found: the robot, what was solved, and the motion.
         repeat: periods that are run.
-        noise: share of the torque limits; None: `NOISE`.
+        noise: share of the torque limits; None: `DEFAULT_NOISE`.
         problem_of: a period [s] -> the problem with it.
         evaluations: for each of the other periods; 0: none are looked at.
         seed: of the typical task.
     """
-    limits, share = given.limits.torque, NOISE if noise is None else noise
+    limits, share = given.limits.torque, DEFAULT_NOISE if noise is None else noise
     if not np.isfinite(limits).all():
         return None, ()
     sigmas = share * limits
@@ -132,12 +132,12 @@ def foretell(
 
 
 def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
-    """Return regressors (TASK, n, c) of typical states."""
+    """Return regressors (TASK_STATES, n, c) of typical states."""
     box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
     low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)
     speeds = np.array([joint.velocity for joint in given.chain.joints])
     fast = 0.5 * np.where(np.isfinite(speeds), speeds, 1.0)
-    q, v, a = low + (high - low) * rng.random((TASK, n)), *(2.0 * rng.random((2, TASK, n)) - 1.0)
+    q, v, a = low + (high - low) * rng.random((TASK_STATES, n)), *(2.0 * rng.random((2, TASK_STATES, n)) - 1.0)
     for j, value in given.locked.items():
         q[:, j], v[:, j], a[:, j] = 0.0 if value is None else value, 0.0, 0.0
     return _columns(given, given.model.exact.regressor(q, fast * v, DEFAULT_RISE * fast * a))
@@ -153,14 +153,14 @@ def _prediction(
 ) -> tuple[MotionPrediction, np.ndarray]:  # fmt: skip
     """Return what `repeat` periods of a motion tell, and the sigmas (c,) of the parameters."""
     period = family.period * factor
-    motion = dense_motion(family, x, period / INSTANTS * np.arange(INSTANTS), factor)
+    motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     counted = np.ones(given.chain.n) if given.columns.sigmas is None else given.columns.sigmas
     Y = _columns(given, given.model.exact.regressor(motion.q, motion.v, motion.a)) / (noise * counted)[:, None]
     W = Y.reshape(-1, Y.shape[2])
     rows = 2.0 * _band(motion, period) * period * repeat
     scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
     _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
-    root = (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None] * np.sqrt(INSTANTS / rows)
+    root = (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None] * np.sqrt(PERIOD_SAMPLES / rows)
     torque = np.sqrt(np.mean(np.sum((task @ root) ** 2, axis=2), axis=0))
     share = float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
     return MotionPrediction(period * repeat, rows, torque, share), np.linalg.norm(root, axis=1)

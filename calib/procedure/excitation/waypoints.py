@@ -23,8 +23,8 @@ from calib.geometry.inverse import Goal
 from calib.robot.chain import Chain, joint_kinds
 from calib.transforms import pose
 
-TRIES = 40  # random configurations from which a waypoint is sought (our choice)
-REACHED = 1e-6  # [m and rad] that may be left
+MAX_TRIES = 40  # random configurations from which a waypoint is sought (our choice)
+MAX_ERROR = 1e-6  # [m and rad] that may be left
 
 
 def read_waypoints(
@@ -47,7 +47,7 @@ def read_waypoints(
     wanted = pose(targets.rotation, targets.position)
     low, high = (np.where(np.isfinite(x), x, s * np.pi) for x, s in ((lower, -1.0), (upper, 1.0)))
     here = np.asarray(start, dtype=float) if start is not None else (low + high) / 2
-    others = np.random.default_rng(0).uniform(low, high, (TRIES, chain.n))
+    others = np.random.default_rng(0).uniform(low, high, (MAX_TRIES, chain.n))
     found = []
     for k in range(len(targets)):
         near = here if targets.q is None else np.array(targets.q[k])
@@ -62,12 +62,12 @@ def _reached(
     """Return joint values (n,) at a target (1, 4, 4): from where the arm is, else of many tries the nearest to it."""
     q = inverse.nearest(goal, target, near[None], inverse.reach(goal, target, near[None]))
     left = inverse.differences(goal, q, target)
-    if np.abs(left).max() <= REACHED:
+    if np.abs(left).max() <= MAX_ERROR:
         return q[0]
     many = np.repeat(target, len(others), axis=0)
     tried = inverse.reach(goal, many, others)
     left = inverse.differences(goal, tried, many)
-    met = np.abs(left).max(axis=1) <= REACHED
+    met = np.abs(left).max(axis=1) <= MAX_ERROR
     if not met.any():
         best = left[np.argmin(np.linalg.norm(left, axis=1))]
         turn = f" and {np.degrees(np.linalg.norm(best[3:])):.3g} deg" if goal.dof == 6 else ""

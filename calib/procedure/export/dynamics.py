@@ -16,15 +16,15 @@ parameters.json       names, units, values and covariances of geometry and dynam
                       with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
 README.txt            what each file is for, and the verdict on it.
 
-Masses are those of bodies that can exist (`calib.identification.possible.solve`). What the torques do not tell is drawn
-to the robot's own masses: by the entropic (log-det) prior, which keeps off the border of what can exist; with ``--prior
-euclidean`` by its second order, which does not, so that a body may come out thin. A link to which others are fixed
-(flange, covers, sensors) was identified with them as one body: the others keep the masses the source gives them, and
-the moving link takes the rest. Where that rest is no possible body, the moving link takes all and the others get mass
-zero. Links on joints that are not part of the arm (fingers) keep theirs, standing at zero. Payloads that were
-identified are not part of the robot: they are in parameters.json alone. Offsets, gear couplings and richer friction
-have no place in URDF and MJCF; parameters.json has them, and a note says so. The sign of Coulomb friction was smoothed
-as tanh(v / v0).
+Masses are those of physically consistent bodies (`calib.identification.possible.solve`). What the torques do not
+identify is regularised towards the masses of the robot's description: by the entropic (log-det) prior, which keeps off
+the border of the physically consistent; with ``--prior euclidean`` by its second order, which does not, so that a body
+may come out thin. A link to which others are fixed (flange, covers, sensors) is identified with them as one body: the
+others keep the masses the source gives them, and the moving link takes the rest. Where that rest is not physically
+consistent, the moving link takes all and the others get mass zero. Links on joints that are not part of the arm
+(fingers) keep theirs, standing at zero. Payloads that were identified are not part of the robot: they are in
+parameters.json alone. Offsets, gear couplings and richer friction have no place in URDF and MJCF; parameters.json has
+them, and a note says so. The sign of Coulomb friction was smoothed as tanh(v / v0).
 """
 
 from __future__ import annotations

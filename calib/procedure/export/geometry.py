@@ -22,7 +22,7 @@ from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert
 
 OFFSETS_HEADER = ("joint", "unit", "offset", "sigma")
-SAME = 1e-9  # poses read back by Pinocchio have to agree to this [m, and as a rotation matrix]
+MAX_DIFFERENCE = 1e-9  # of poses read back [m, and as a rotation matrix], and of torques over the largest
 
 
 def read(folder: Path) -> CalibratedChain:
@@ -88,7 +88,7 @@ def export_urdf(
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
-    """Refuse a URDF text in which Pinocchio or yourdfpy sees other poses than this toolkit does (`SAME`).
+    """Refuse a URDF text in which Pinocchio or yourdfpy sees other poses than this toolkit does (`MAX_DIFFERENCE`).
 
     Returns:
         Who has read it; a text that yourdfpy cannot read is not refused, and why is said.
@@ -99,7 +99,7 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     own = urdf.build(tree, *urdf.ends(tree, None, tip, named))
     q = random_joints(own, 20, 0)
     error = float(np.abs(tip_poses(edited, own, q) - forward(own, q)).max())
-    if error > SAME:
+    if error > MAX_DIFFERENCE:
         raise RobotError(f"{where}: Pinocchio reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
     few = q[:5]
     try:
@@ -108,7 +108,7 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
         return f"Pinocchio reads the same poses to 1e-9; not read a second time: {error}"
     straight = np.stack([invert(urdf.align(tree.above[link].axis)) for link in own.links])[:, None]  # of slanted axes
     error = float(np.abs(seen - np.concatenate([joint_frames(own, few) @ straight, forward(own, few)[None]])).max())
-    if error > SAME:
+    if error > MAX_DIFFERENCE:
         raise RobotError(f"{where}: yourdfpy reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 

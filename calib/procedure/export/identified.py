@@ -20,7 +20,7 @@ from calib.robot.chain import Chain
 from calib.robot.description_checks import impossible_bodies
 from calib.words import listing
 
-UNLIKE = 3.0  # times a body's mass in the description from which on it is named (our choice)
+MAX_MASS_RATIO = 3.0  # times a body's mass in the description from which on it is named (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +124,13 @@ def mass_notes(given: IdentifiedRobot) -> list[str]:
         theirs = given.chain.inertias[:, 9]
         pairs = zip(names, masses, theirs)
         unlike = [
-            f"{name} {mass:.3g} kg ({own:.3g})" for name, mass, own in pairs if not own / UNLIKE < mass < own * UNLIKE
+            f"{name} {mass:.3g} kg ({own:.3g})"
+            for name, mass, own in pairs
+            if max(mass, own) > MAX_MASS_RATIO * min(mass, own)
         ]
         if unlike:
             notes.append(
-                f"masses unlike the robot's description by more than {UNLIKE:g} times (that in brackets): "
+                f"masses unlike the robot's description by more than {MAX_MASS_RATIO:g} times (that in brackets): "
                 f"{', '.join(unlike)}; torques tell sums of masses, not each"
             )
     if wrong := impossible_bodies(given.chain):

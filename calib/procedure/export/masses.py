@@ -11,6 +11,7 @@ from calib.dynamics import pseudo_inertia, rigid_body
 from calib.errors import RobotError
 from calib.folders import MJCF
 from calib.procedure.export import geometry
+from calib.procedure.export.geometry import MAX_DIFFERENCE
 from calib.procedure.export.identified import IdentifiedRobot
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import mjcf, urdf, urdf_inertials, urdf_write
@@ -18,8 +19,6 @@ from calib.robot.formats.readback import motion_torques
 from calib.robot.formats.urdf_tree import UrdfTree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert
-
-SAME = 1e-9  # of poses [m, and as a rotation matrix] and of torques, relative to the largest
 
 
 def as_mjcf(given: IdentifiedRobot) -> str:
@@ -114,14 +113,14 @@ def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
     if mjcf:
         wanted = wanted + given.drives.values[:, 0] * a
         away = float(np.abs(frames - urdf_write.moving_frames(given.chain, q)).max())
-        if away > SAME:
+        if away > MAX_DIFFERENCE:
             raise RobotError(f"{where}: Pinocchio reads other poses, by {away:.2g}; nothing was written")
     off = float(np.abs(torques - wanted).max()) / max(1.0, float(np.abs(wanted).max()))
-    if off > SAME:
+    if off > MAX_DIFFERENCE:
         raise RobotError(
             f"{where}: Pinocchio reads other torques, by {off:.2g} of the largest; nothing was written. Do other "
             "joints of the file carry mass that the arm's identification has not seen?"
         )
     for what, read_back, own in (("damping", damping, 1), ("friction", friction, 2)):
-        if not np.allclose(read_back, given.drives.values[:, own], rtol=SAME, atol=1e-12):
+        if not np.allclose(read_back, given.drives.values[:, own], rtol=MAX_DIFFERENCE, atol=1e-12):
             raise RobotError(f"{where}: Pinocchio reads another {what} than was written")

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
 EDITED = "edited by hand"
-SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
-LISTED = 6  # files on the first sheet
-LONG = (400, 200, 100, 64)  # letters of a line of the setup on the first sheet: as many as all lines together
-SETUP = 1000  # leave room for, in letters
-REASON = 560  # letters of a reason on the first sheet; the whole of a longer one stands behind it
+DIGEST_DIGITS = 12  # hexadecimal digits of a SHA-256 on the first sheet
+MAX_LISTED_FILES = 6  # files on the first sheet
+MAX_LINE_LETTERS = (400, 200, 100, 64)  # of a line of the setup on the first sheet
+MAX_SETUP_LETTERS = 1000  # of all its lines
+MAX_REASON_LETTERS = 560  # letters of a reason on the first sheet; the whole of a longer one stands behind it
 BEHIND = ("session made", "pose plan", "seed", "command")  # labels of the setup that the first sheet leaves out
 CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
@@ -83,10 +83,12 @@ def certificate(
     for label, value in setup:
         if label not in BEHIND:
             first.setdefault(label, value)
-    most = next((one for one in LONG if sum(min(one, len(value)) for value in first.values()) <= SETUP), LONG[-1])
-    marks = [(name, role, digest[:SHORT]) for name, role, _, digest in filed[:LISTED]]
-    if len(files) > LISTED:
-        marks.append((f"and {len(files) - LISTED} more, see Files", "", ""))
+    sizes = [len(value) for value in first.values()]
+    fits = (one for one in MAX_LINE_LETTERS if sum(min(one, size) for size in sizes) <= MAX_SETUP_LETTERS)
+    most = next(fits, MAX_LINE_LETTERS[-1])
+    marks = [(name, role, digest[:DIGEST_DIGITS]) for name, role, _, digest in filed[:MAX_LISTED_FILES]]
+    if len(files) > MAX_LISTED_FILES:
+        marks.append((f"and {len(files) - MAX_LISTED_FILES} more, see Files", "", ""))
     when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
     issued = f"{when}, armature-calib {metadata.version('armature-calib')}"
     return Page(
@@ -96,7 +98,7 @@ def certificate(
 
 def _fitting(section: Section) -> Section:
     """Return a section whose reason fits the first sheet; the whole of a longer one comes first among its blocks."""
-    short = _shortened(section.reason, REASON)
+    short = _shortened(section.reason, MAX_REASON_LETTERS)
     if short == section.reason:
         return section
     return replace(section, reason=short, blocks=[Text("Reason in full", [section.reason]), *section.blocks])

@@ -18,7 +18,7 @@ from calib.procedure.report import uncertainty_figures
 from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, save_all
 from calib.procedure.report.style import AFTER, BEFORE, HALF, QUIET, WIDE
 
-FEW = 8  # torque rows whose figures fit half a page
+MAX_HALF_PAGE_ROWS = 8  # torque rows whose figures fit half a page
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
@@ -94,7 +94,7 @@ def torques(
         title: of the whole.
         errors: relative error of each row [%]; none where it is not known.
     """
-    columns = 2 if len(rows) > FEW else 1
+    columns = 2 if len(rows) > MAX_HALF_PAGE_ROWS else 1
     panels = []
     for j, (row, unit) in enumerate(zip(rows, units)):
         left = f": {errors[j]:.3g} % left" if j < len(errors) and np.isfinite(errors[j]) else ""
@@ -117,7 +117,7 @@ def errors_by_row(fitted: np.ndarray, unseen: np.ndarray, rows: Sequence[str]) -
     ]
     title = f"at most {max(unseen):.3g} % left" if len(rows) else ""
     panel = Panel(bars, x="torque unexplained [%]", ynames=rows, grid="x")
-    return Chart([panel], 0.8 + 0.21 * len(rows), width=WIDE if len(rows) > FEW else HALF, title=title)
+    return Chart([panel], 0.8 + 0.21 * len(rows), width=WIDE if len(rows) > MAX_HALF_PAGE_ROWS else HALF, title=title)
 
 
 def autocorrelations(
@@ -132,7 +132,7 @@ def autocorrelations(
         width: of the figure [in].
     """
     shown = [(row, white) for row, white in zip(rows, found) if white is not None and len(white.acf)]
-    columns = min(7 if len(shown) > FEW else 4 if width > HALF else 3, max(1, len(shown)))
+    columns = min(7 if len(shown) > MAX_HALF_PAGE_ROWS else 4 if width > HALF else 3, max(1, len(shown)))
     panels = []
     for k, (row, white) in enumerate(shown):
         inner = k + columns < len(shown)

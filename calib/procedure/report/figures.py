@@ -114,7 +114,7 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     own = next(iter(unseen.fit.values()))
     sides = [np.nan_to_num(one.raw.joints) for one in (own, proof)]
     name, looked = next(iter((unseen.validation or unseen.fit).items()))
-    width = WIDE if len(unseen.rows) > dynamics_figures.FEW else HALF
+    width = WIDE if len(unseen.rows) > dynamics_figures.MAX_HALF_PAGE_ROWS else HALF
     bars = dynamics_figures.errors_by_row(sides[0], sides[1], unseen.rows)
     drawn = dynamics_figures.autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
     shares = f"Share of each torque that the model leaves, on the training motion and on {where}."

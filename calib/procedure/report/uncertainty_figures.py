@@ -21,7 +21,7 @@ from calib.records import read_rows
 from calib.units import small
 
 Curve = Sequence[tuple[float, float]]
-TOP = 15  # elements in the ranked figure
+MAX_ELEMENTS = 15  # elements in the ranked figure
 T = TypeVar("T")
 
 
@@ -67,7 +67,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "it moves most, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
-        result["effects"] = picture(_effects(known[:TOP]), words)
+        result["effects"] = picture(_effects(known[:MAX_ELEMENTS]), words)
     return result
 
 

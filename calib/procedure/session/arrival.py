@@ -23,9 +23,9 @@ from calib.identification.checks.recorded_motion import (
 )  # fmt: skip
 from calib.robot.chain import Chain
 
-EXACT = 1e-8  # read-back joints that equal the commanded ones to so much were not read back [rad or m]
-LOOSE = 0.98  # share of the motion that a recorded period explains, below which the tracking is worth a note
-SCALE = 10.0  # a factor between measured and nominal torques that no wrong mass explains
+MIN_READBACK_DIFFERENCE = 1e-8  # [rad or m] closer to the commanded joints they were not read back
+MIN_TRACKED_SHARE = 0.98  # of the motion, explained by a recorded period; below it is noted
+MAX_TORQUE_RATIO = 10.0  # a factor between measured and nominal torques that no wrong mass explains
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[str]:
@@ -35,7 +35,7 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[str]:
     if not close.any():
         return []
     off = np.abs(measured.q[close] - plan[index[close]])
-    if off.max() < EXACT:
+    if off.max() < MIN_READBACK_DIFFERENCE:
         return ["the joint values are the commanded ones to the last digit; log what the encoders read once it stands"]
     j = int(np.argmax(off.max(axis=0)))
     rms = 1e3 * float(np.sqrt(np.mean(off**2)))
@@ -96,7 +96,7 @@ def check_motion(
     notes = []
     if found.periods < wanted:
         notes.append(f"{found.periods} of {wanted} repetitions of the motion were recorded")
-    if found.likeness < LOOSE:
+    if found.likeness < MIN_TRACKED_SHARE:
         name = recording.joint_names[found.loosest]
         explained = f"it explains {found.likeness:.1%}"
         notes.append(f"the robot follows the motion loosely ({explained}), {name} most: that is allowed")
@@ -144,7 +144,7 @@ def check_torques(recording: Recording, chain: Chain) -> None:
         return
     names = ", ".join(recording.joint_names[j] for j in sure)
     size = np.abs(share[sure])
-    if (size > SCALE).all() or (size < 1 / SCALE).all():
+    if (size > MAX_TORQUE_RATIO).all() or (size < 1 / MAX_TORQUE_RATIO).all():
         guess = "are they mNm? Say so in the header (tau_… [mNm])"
         if np.median(size) < 1:
             guess = "are they currents (i_… [A]), or torques before the gear?"

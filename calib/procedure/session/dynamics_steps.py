@@ -32,10 +32,8 @@ from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
 Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
-SHORTER, OTHER = (
-    0.8,
-    3,
-)  # the validation motion's period over the training's, and what is added to its seed (our choice)
+VALIDATION_PERIOD = 0.8  # of the validation motion, over the training motion's (our choice)
+VALIDATION_SEED = 3  # added to the seed for the validation motion
 
 
 def options_of(session: Session) -> IdentifyOptions:
@@ -50,10 +48,10 @@ def options_of(session: Session) -> IdentifyOptions:
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
     own = dict(options.files)
     for path in session.brought("training", "unseen"):
-        carried = tuple(label for label in known if label.lower() in path.stem.lower())
-        if carried:
+        labels = tuple(label for label in known if label.lower() in path.stem.lower())
+        if labels:
             own[path.name] = replace(
-                own.get(path.name, FileSettings(options.every.recording, options.every.filter)), payload=carried
+                own.get(path.name, FileSettings(options.every.recording, options.every.filter)), payload=labels
             )
     return replace(options, settings=settings, files=own)
 
@@ -74,10 +72,10 @@ def excite(session: Session, say: Say) -> list[str]:
     for name in names:
         first = name == "training"
         settings = ExcitationSettings(
-            period=wanted.period * (1.0 if first else SHORTER), harmonics=wanted.harmonics, rate=wanted.rate,
+            period=wanted.period * (1.0 if first else VALIDATION_PERIOD), harmonics=wanted.harmonics, rate=wanted.rate,
             starts=wanted.starts if first else 1,
             evaluations=wanted.evaluations if first else max(20, wanted.evaluations // 3),
-            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted.repeats, outlook=first,
+            seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=wanted.repeats, outlook=first,
         )  # fmt: skip
         designed = design.excite(
             session.fit.path, settings, limits=limits,
@@ -91,8 +89,8 @@ def excite(session: Session, say: Say) -> list[str]:
             f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "
             f"normalised, {len(designed.inputs.model.exact.names)} columns; every limit is kept"
         )
-        told = (*designed.inputs.limits.bounds.lines(), *designed.notes)
-        notes += [f"{name}: {note}" for note in told if first]
+        said = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [f"{name}: {note}" for note in said if first]
     if limits is None:
         notes.append("only the robot's own limits were kept: watch for collisions, or name a limits file")
     return notes
@@ -103,9 +101,9 @@ def record(session: Session, say: Say) -> list[str]:
     cuts, notes = {}, []
     for path in session.brought("training"):
         say(f"reading {path.name}")
-        found, told = _check_recording(session, path, "training")
+        found, said = _check_recording(session, path, "training")
         cuts[path.name] = found
-        notes += told
+        notes += said
     files.write_json(session.path(CUTS), cuts)
     files.write(session.path(MOTION_CHECKED), "\n".join(notes) + "\n")
     return notes
@@ -202,8 +200,8 @@ def predict(session: Session, say: Say) -> list[str]:
     unseen = session.brought("unseen")
     notes, aside = [], {}
     for path in unseen:
-        aside[path.name], told = _check_recording(session, path, "validation")
-        notes += told
+        aside[path.name], said = _check_recording(session, path, "validation")
+        notes += said
     say("predicting unseen motion")
     given = inputs.gather(
         session.fit.path, training, [*held, *_cut_paths(unseen, aside)], options=options_of(session),
