@@ -18,74 +18,21 @@ from calib.procedure.kinematic_stage.inputs import load_robot
 POSE = ["q1", "q2", "q3", "q4", "q5", "q6", "x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
-def degrees(rows):
-    return [row | {f"q{j}": row[f"q{j}"] * 57.29578 for j in range(1, 7)} for row in rows]
-
-
-def millimetres(rows):
-    return [row | {axis: 1000.0 * row[axis] for axis in "xyz"} for row in rows]
-
-
-def not_a_number(rows):
-    rows[4]["y"] = float("nan")
-    return rows
-
-
-def short_quaternion(rows):
-    for name in ("qx", "qy", "qz", "qw"):
-        rows[2][name] *= 0.5
-    return rows
-
-
-def beyond_limits(rows):
-    rows[5]["q2"] = 6.29
-    return rows
-
-
-def all_equal(rows):
-    return [rows[0]] * len(rows)
-
-
-def few(rows):
-    return rows[:3]
-
-
-@pytest.mark.parametrize(
-    ("spoil", "columns", "words"),
-    [
-        (degrees, POSE[:9], ("row 1", "q1", "deg")),
-        (millimetres, POSE[:9], ("row 1", "'x'", "mm")),
-        (lambda rows: rows, [*POSE[:8]], ("'z'", "missing")),
-        (lambda rows: rows, [*POSE[:2], *POSE[3:9]], ("'q3'", "missing")),
-        (not_a_number, POSE[:9], ("row 5", "'y'")),
-        (short_quaternion, POSE, ("row 3", "norm 0.5")),
-        (beyond_limits, POSE[:9], ("row 6", "q2", "limits")),
-        (all_equal, POSE[:9], ("same joint values",)),
-        (few, POSE[:9], ("3 usable rows",)),
-    ],
-    ids=["degrees", "millimetres", "no z", "no q3", "nan", "quaternion", "limits", "equal poses", "three poses"],
-)
-def test_impossible_measurements(cell, calib, spoil, columns, words):
-    file = cell.write("bad.csv", spoil(cell.measure(30)), columns)
-    code, _, err = calib("fit", "ur5", file, "--out", "done")
-    assert code == 2
-    assert len(err.splitlines()) == 1
-    assert "bad.csv" in err
-    for word in words:
-        assert word in err
-    assert sorted(path.name for path in cell.folder.iterdir()) == ["bad.csv"]
-
-
-def test_a_column_twice(cell, calib):
-    file = cell.write("bad.csv", cell.measure(30))
-    lines = file.read_text().splitlines()
-    file.write_text("\n".join([lines[0] + ",q1", *(line + ",0" for line in lines[1:])]))
-    code, _, err = calib("fit", "ur5", file, "--out", "done")
-    assert (code, "q1" in err, "twice" in err) == (2, True, True)
+def test_impossible_measurements_end_in_one_line_and_leave_nothing(cell, calib):
+    """What is wrong with them, and how it is said: tests/data/poses/test_bad_measurements.py."""
+    good = cell.measure(30)
+    for rows, columns, word in (
+        (good, POSE[:8], "'z'"),
+        (good[:3], POSE[:9], "3 usable rows"),
+        (good[:1] * 9, POSE, "same"),
+    ):
+        code, _, err = calib("fit", "ur5", cell.write("bad.csv", rows, columns), "--out", "done")
+        assert (code, len(err.splitlines()), "bad.csv" in err, word in err) == (2, 1, True, True), err
+        assert sorted(path.name for path in cell.folder.iterdir()) == ["bad.csv"]
 
 
 def test_a_unit_that_is_stated_is_not_advised(cell, calib):
-    rows = [{(f"{k} [deg]" if k[0] == "q" else k): v for k, v in row.items()} for row in degrees(cell.measure(30))]
+    rows = [{(f"{k} [deg]" if k[0] == "q" else k): 57.3 * v for k, v in row.items()} for row in cell.measure(30)]
     for row in rows:
         row["q1 [deg]"] *= 60.0
     code, _, err = calib("fit", "ur5", cell.write("bad.csv", rows, list(rows[0])[:9]), "--out", "done")
@@ -217,16 +164,6 @@ def test_a_killed_fit_leaves_no_folder(cell):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not Path("done").exists()
-
-
-def test_debug_shows_the_traceback(cell, calib, monkeypatch):
-    """What leaves the command line as an exception, Python prints with its traceback."""
-    arguments = ["fit", "ur7", "a.csv", "--out", "done"]
-    code, _, err = calib(*arguments)
-    assert (code, "Traceback" in err) == (2, False)
-    monkeypatch.setenv("CALIB_DEBUG", "1")
-    with pytest.raises(CalibError, match="ur7"):
-        calib(*arguments)
 
 
 def test_a_number_that_is_not_finite_is_never_written(tmp_path):

@@ -31,7 +31,7 @@ def test_ur5_tracker(data, calib, here):
     unseen = found["validation"]["grid_800.csv"]
     assert (found["fit"]["poses"], unseen["poses"]) == (600, 200)
     assert unseen["nominal"]["position_mm"]["rms"] > 0.5
-    assert unseen["calibrated"]["position_mm"]["rms"] < 0.07
+    assert unseen["calibrated"]["position_mm"]["rms"] < min(0.07, 0.1 * unseen["nominal"]["position_mm"]["rms"])
     assert found["verdict"] == "pass"
     geometry = next(rung for rung in found["ladder"] if rung["model"] == "geometry")
     assert 0.1 < geometry["cross_validated_mm"] < 0.14
@@ -63,7 +63,7 @@ def test_ur10_pose(data, calib, here):
     unseen = found["validation"]["A_grid_2500.csv"]
     assert unseen["poses"] == 1000
     assert unseen["calibrated"]["position_mm"]["rms"] < 0.12
-    assert unseen["calibrated"]["orientation_deg"]["rms"] < 0.03
+    assert unseen["calibrated"]["orientation_deg"]["rms"] < min(0.03, unseen["nominal"]["orientation_deg"]["rms"])
 
 
 def test_ur10_another_station(data, calib, here):
@@ -82,7 +82,7 @@ def test_motoman_small_box(data, calib, here):
     found, out = metrics_of(calib, folder / "model_right.urdf", folder / "right_6x6x6_150.csv", "--holdout", "0.3333")
     unseen = found["validation"]["right_6x6x6_150.csv"]
     assert (found["fit"]["poses"], unseen["poses"]) == (100, 50)
-    assert unseen["calibrated"]["position_mm"]["rms"] < 0.075
+    assert unseen["calibrated"]["position_mm"]["rms"] < 0.07
     assert "cannot be told from" in out
 
 
@@ -92,7 +92,7 @@ def test_motoman_wide(data, calib, here):
     found, out = metrics_of(calib, folder / "model_right.urdf", folder / "right_wide_386.csv", "--holdout", "0.259")
     unseen = found["validation"]["right_wide_386.csv"]
     assert unseen["poses"] == 100
-    assert unseen["calibrated"]["position_mm"]["rms"] < 1.35
+    assert unseen["calibrated"]["position_mm"]["rms"] < 1.3
     assert found["verdict"] == "marginal"
     assert "no rigid geometry explains" in found["reason"]
     assert "another set-up" in out
@@ -121,6 +121,6 @@ def test_tiago_outliers_are_named(data, calib, here):
     folder = data / "tiago_laas"
     found, out = metrics_of(calib, folder / "model.urdf", folder / "mocap_35poses.csv", "--loss", "cauchy")
     assert found["fit"]["poses"] == 35
-    assert found["outliers"][0]["row"] == 10
-    assert found["outliers"][0]["size_mm"] > 60.0
+    assert found["outliers"][0]["row"] == 10 and len(found["outliers"]) <= 35 // 3
+    assert found["outliers"][0]["size_mm"] > 60.0 and found["fit"]["calibrated"]["position_mm"]["mean"] < 6.0
     assert "row 10" in out
