@@ -22,8 +22,8 @@ from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
 
 T = TypeVar("T")
-LARGEST = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
-DEEPEST = 32
+MAX_BYTES = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
+MAX_LEVELS = 32
 _PLAIN = {  # pydantic's words
     "float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false", "tuple": "a list",
     "too_short": "at least one number",
@@ -44,14 +44,14 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
     try:
         check_regular(path, streams=True)
         with open(path, "rb") as file:
-            data = file.read(LARGEST + 1)
-        if len(data) > LARGEST:
-            raise error(f"{path}: is larger than {LARGEST / 1e6:g} MB: is it the right file?")
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise error(f"{path}: is larger than {MAX_BYTES / 1e6:g} MB: is it the right file?")
         found = tomllib.loads(data.decode("utf-8-sig"))
     except OSError as wrong:
         raise error(f"{path}: cannot be read: {wrong.strerror or wrong}") from wrong
     except RecursionError:
-        raise error(f"{path}: is nested too deeply: more than {DEEPEST} levels") from None
+        raise error(f"{path}: is nested too deeply: more than {MAX_LEVELS} levels") from None
     except ValueError as wrong:  # of tomllib, of the decoder, of a number with thousands of digits, of a name with NUL
         words = "a whole number of thousands of digits" if "digits" in str(wrong) else wrong
         raise error(f"{path}: is no TOML: {words}") from wrong
@@ -64,8 +64,8 @@ def _check_size(found: Any, place: str, error: type[CalibError]) -> None:
     ahead: list[tuple[tuple[Any, ...], Any]] = [((), found)]
     while ahead:
         loc, value = ahead.pop()
-        if len(loc) > DEEPEST:
-            raise error(f"{place}: {located(loc[:3])}: is nested too deeply: more than {DEEPEST} levels")
+        if len(loc) > MAX_LEVELS:
+            raise error(f"{place}: {located(loc[:3])}: is nested too deeply: more than {MAX_LEVELS} levels")
         if isinstance(value, int) and not -(2**63) <= value < 2**63:
             raise error(f"{place}: {located(loc)}: a whole number of more than 64 bits: {shown(value)}")
         inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from calib.procedure.report.style import AFTER, BEFORE, QUIET, WIDE, legend, log_axis, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, PAGE_WIDTH, QUIET, legend, log_axis, sheet, styled
 from calib.procedure.session.folder import Session
 from calib.rooms.cells import demo
 
@@ -93,7 +93,7 @@ def draw(session: Session, verdict: str, figures: dict[str, float]) -> None:
     t, measured, predicted = (np.array(each, dtype=float).T for each in (curves.t, curves.measured, curves.predicted))
     row = int(np.argmax(np.linalg.norm(measured, axis=0)))
     with styled():
-        figure, (poses, torque) = sheet(1, 2, WIDE, 2.9, head=0.3)
+        figure, (poses, torque) = sheet(1, 2, PAGE_WIDTH, 2.9, head=0.3)
         place = np.arange(1, len(before) + 1)
         for errors, colour, name in ((before, BEFORE, "nominal"), (after, AFTER, "calibrated")):
             poses.plot(place, errors, "o", color=colour, markersize=4.0)

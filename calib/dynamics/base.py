@@ -25,7 +25,7 @@ from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.triangles import retriangulate
 
 SAMPLES = 500
-SMALLEST = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small
+MIN_COEFFICIENT = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small
 BLOCK = 2048  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
 
 
@@ -78,9 +78,9 @@ class Base:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The b names, with R where others are regrouped in, by no less than `SMALLEST`."""
+        """The b names, with R where others are regrouped in, by no less than `MIN_COEFFICIENT`."""
         return tuple(
-            self.standard[k] + ("R" if (np.abs(row) >= SMALLEST).any() else "")
+            self.standard[k] + ("R" if (np.abs(row) >= MIN_COEFFICIENT).any() else "")
             for k, row in zip(self.kept, self.split.coefficients)
         )
 
@@ -213,7 +213,7 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
     return retriangulate(triangles.reshape(-1, p))
 
 
-def expressions(base: Base, digits: int = 5, smallest: float = SMALLEST) -> tuple[str, ...]:
+def expressions(base: Base, digits: int = 5, smallest: float = MIN_COEFFICIENT) -> tuple[str, ...]:
     """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``.
 
     Args:

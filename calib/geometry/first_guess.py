@@ -44,9 +44,9 @@ UNITS = {
     25.4: "are they mm under a header that says in",
     0.03937: "are they in under a header that says mm",
 }
-FEW_DEGREES = 2.1 * math.pi * DEG  # no joint goes further: they may be rad read as deg (our choice)
+MAX_TURN = 2.1 * math.pi * DEG  # no joint goes further: they may be rad read as deg (our choice)
 TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
-ENOUGH = 300  # rows of a block that a guess is made from (our choice)
+MAX_GUESS_ROWS = 300  # rows of a block that a guess is made from (our choice)
 
 
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
@@ -62,7 +62,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
     for block in sorted(measured, key=lambda b: (_rank(b), -_turning(chain, b), -len(b))):
-        block = take(block, np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int)))
+        block = take(block, np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int)))
         arm = forward(chain, block.q)
         check_scale(block, chain)
         for number in np.unique(block.tool):
@@ -129,7 +129,7 @@ def _spread(positions: np.ndarray) -> tuple[float, float]:
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
     """Return which units would explain a spread, those of the joints first, as a question; and the header to write."""
     guesses = [("", predicted, "'x [mm]'")]
-    if np.abs(block.q).max() < FEW_DEGREES:
+    if np.abs(block.q).max() < MAX_TURN:
         turning = np.array([joint.kind != "prismatic" for joint in chain.joints])
         moved = _spread(forward(chain, np.where(turning, block.q / DEG, block.q))[:, :3, 3])[0]
         guesses.insert(0, ("are the joints rad under a header that says deg", moved, "'q1 [rad]'"))
@@ -149,7 +149,7 @@ def _rank(block: PoseMeasurements) -> int:
 
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
     """Return how far a block's poses turn about their second axis, rms in steps of `TURN`, up to `TURNED` of them."""
-    rows = np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int))
+    rows = np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int))
     if len(rows) < 3:
         return 0.0
     _, turns = chordal_turns(forward(chain, block.q[rows])[:, :3, :3])

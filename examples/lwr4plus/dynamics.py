@@ -41,7 +41,7 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, absorb, empty
 from calib.identification.cases import Case, make_case
 from calib.identification.rows import observe
-from calib.procedure.report.style import AFTER, INK, QUIET, WIDE, save, sheet, styled
+from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots, lwr4plus
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
@@ -351,7 +351,7 @@ def torques(found: Fit, data: Data) -> Figure:
     rows = observe(found.model, found.base.kept, case, case.motion.decimator)
     computed, t = rows.matrix @ values_of(found), np.linspace(case.motion.t[0], case.motion.t[-1], len(rows.target))
     with styled():
-        figure, axes = sheet(4, 2, width=WIDE, height=6.4)
+        figure, axes = sheet(4, 2, width=PAGE_WIDTH, height=6.4)
         for joint, axis in enumerate(axes[:7]):
             axis.plot(t, rows.target[:, joint], color=QUIET, linewidth=2.0, label="measured")
             axis.plot(t, computed[:, joint], color=AFTER, linewidth=0.8, linestyle="--", label="computed")

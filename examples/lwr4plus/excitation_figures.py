@@ -8,7 +8,7 @@ import numpy as np
 from dynamics import TABLE_4
 from matplotlib.figure import Figure
 
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, log_axis, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, log_axis, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.simulation.loop.references import Reference
@@ -18,7 +18,7 @@ def paths(chain: Chain, motions: dict[str, Reference]) -> Figure:
     """Draw the tool's path of every motion in space (Fig. 5)."""
     with styled():
         across, down = min(len(motions), 3), -(-len(motions) // 3)
-        figure = Figure(figsize=(WIDE, 2.5 * down))
+        figure = Figure(figsize=(PAGE_WIDTH, 2.5 * down))
         for k, (name, motion) in enumerate(motions.items()):
             axis: Any = figure.add_subplot(down, across, k + 1, projection="3d")
             axis.plot(*forward(chain, motion.q[::20])[:, :3, 3].T, color=AFTER, linewidth=0.7)
@@ -34,7 +34,7 @@ def estimates(found: dict[str, Any]) -> Figure:
     """Draw the essential estimates' errors, CAD and fitted geometry, RP and OT (Figs 6 and 7)."""
     place, colours = np.arange(len(TABLE_4)), dict(zip(found, (BEFORE, MARK, QUIET, AFTER)))
     with styled():
-        figure, (first, second) = sheet(2, 1, width=WIDE, height=5.8, head=0.3)
+        figure, (first, second) = sheet(2, 1, width=PAGE_WIDTH, height=5.8, head=0.3)
         for k, (name, row) in enumerate(found.items()):
             off = 100.0 * np.abs(np.array(row["estimate"]) / row["truth"] - 1.0)
             first.plot(
@@ -59,7 +59,7 @@ def speeds(rows: dict[str, list[dict[str, Any]]], shares: tuple[float, ...]) -> 
     """Draw the plain moves' median RSD over that of B, and their true error in sigma, by speed; one dot per seed."""
     own = rows["B, 44 columns"]
     with styled():
-        figure, (left, right) = sheet(1, 2, width=WIDE, height=2.8)
+        figure, (left, right) = sheet(1, 2, width=PAGE_WIDTH, height=2.8)
         for key, colour, words in (("102 fitted", AFTER, "all 102 fitted"), ("44 fitted", MARK, "the 44 fitted alone")):
             runs = {share: rows[f"moves at {share:g}"] for share in shares if f"moves at {share:g}" in rows}
             level = np.median([one[key]["median_rsd"] for one in own])

@@ -46,7 +46,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.load import load
 from trajectories.constraints import TorqueLimit, box_limits
@@ -203,7 +203,7 @@ def reached(
 def picture(curves: dict[str, Curve], seconds: float) -> Figure:
     """Draw the geometric mean of both condition numbers against processor time."""
     with styled():
-        figure, (axis,) = sheet(width=WIDE, height=3.2)
+        figure, (axis,) = sheet(width=PAGE_WIDTH, height=3.2)
         styles = [(color, dash) for dash in ("-", "--") for color in (AFTER, MARK, BEFORE, QUIET, INK)]
         for (name, curve), (color, dash) in zip(curves.items(), styles):
             seen = [point for point in curve if point[0] <= seconds] or [(seconds, np.nan)]

@@ -17,7 +17,7 @@ from calib.procedure.report.console import rendered
 from calib.rooms.studies.conditions import Condition, read_study, shipped
 from calib.rooms.studies.experiment import make_experiment
 from calib.rooms.studies.reports.report import console_table
-from calib.rooms.studies.summary import LEAST, sign_test, summarise
+from calib.rooms.studies.summary import MIN_DATA_SETS, sign_test, summarise
 from calib.rooms.studies.trial import FOUND, NOT_RECORDED, run_trial
 
 FILE = """
@@ -159,9 +159,9 @@ def test_what_is_there_stays_in_sight_of_a_study_that_asks_for_less(tmp_path: Pa
 def test_where_none_is_taken_it_is_said_why(tmp_path: Path):
     study = read_study([written(tmp_path)])
     digest = study.conditions[0].digest
-    few = [replace(ROW, digest=digest, seed=k) for k in range(LEAST - 1)]
+    few = [replace(ROW, digest=digest, seed=k) for k in range(MIN_DATA_SETS - 1)]
     (one,) = summarise(study, few)
-    assert one.best is None and f"--runs {LEAST}" in one.why_none
+    assert one.best is None and f"--runs {MIN_DATA_SETS}" in one.why_none
     (one,) = summarise(study, [replace(row, status="diverged") for row in [*few, replace(few[0], seed=99)]])
     assert one.best is None and "gives an estimate" in one.why_none
     (one,) = summarise(study, [*few, replace(few[0], seed=99)])

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from trajectories.errors import BadInput, NothingFeasible
 from trajectories.timing.path import SAME, Path, through
 
-SAMPLES, MOST, STEPS = 41, 641, 400
+SAMPLES, MAX_SAMPLES, STEPS = 41, 641, 400
 REACHED, KEPT = 1e-9, 1e-6  # [m and rad] of the pose at the samples, and between them
 
 Forward = Callable[[np.ndarray], np.ndarray]
@@ -65,7 +65,7 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
         between = (share[1:] + share[:-1]) / 2
         error = np.abs(_error(forward(path(between * length)), _targets(first, goal, between)))
         deviation = np.array([np.linalg.norm(error[:, :3], axis=1).max(), np.linalg.norm(error[:, 3:], axis=1).max()])
-        if deviation.max() <= KEPT or 2 * count > MOST:
+        if deviation.max() <= KEPT or 2 * count > MAX_SAMPLES:
             return _Line(path, deviation)
         count = 2 * count - 1
 

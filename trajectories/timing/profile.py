@@ -10,7 +10,7 @@ import numpy as np
 from trajectories.setpoints import Setpoints
 from trajectories.timing.path import Path
 
-SMALLEST = 1e-9  # share of a speed that stands for "just after rest", where friction has its direction already
+MIN_SPEED_SHARE = 1e-9  # share of a speed that stands for "just after rest", where friction has its direction already
 TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -80,7 +80,7 @@ def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: 
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
     s = profile.s[:-1, None] + share * np.diff(profile.s)[:, None]
     x = profile.x[:-1, None] + share * np.diff(profile.x)[:, None]
-    speed = np.sqrt(np.maximum(x, SMALLEST**2 * profile.x.max()))
+    speed = np.sqrt(np.maximum(x, MIN_SPEED_SHARE**2 * profile.x.max()))
     trapezoid = np.ones(per_interval)
     trapezoid[[0, -1]] = 0.5
     weights = np.diff(profile.times)[:, None] * trapezoid / (per_interval - 1)
@@ -107,5 +107,5 @@ def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = 
     q, v, a = moved(path, s, speed, u)
     if torque is None:
         return Setpoints(rate, q, v, a)
-    barely = np.maximum(speed, SMALLEST * speed.max())
+    barely = np.maximum(speed, MIN_SPEED_SHARE * speed.max())
     return Setpoints(rate, q, v, a, torque(q, path(s, 1) * barely[:, None], a))

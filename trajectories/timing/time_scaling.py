@@ -25,7 +25,7 @@ from trajectories.timing.path import Path, reversals
 from trajectories.timing.profile import Profile, Sampled, dense, moved
 from trajectories.timing.reachability import ConstraintRows, fastest
 
-GRID, PER_SPAN, MOST = 400, 200, 2400  # intervals, in all and between two knots
+GRID, PER_SPAN, MAX_INTERVALS = 400, 200, 2400  # intervals, in all and between two knots
 ACTIVE = 0.01  # of a limit: nearer than that it is active
 
 
@@ -185,7 +185,7 @@ def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
     Args:
         count: intervals; None: `GRID`, or `PER_SPAN` between knots where these are many.
     """
-    count = count or int(np.clip(PER_SPAN * (len(path.knots) - 1), GRID, MOST))
+    count = count or int(np.clip(PER_SPAN * (len(path.knots) - 1), GRID, MAX_INTERVALS))
     even = np.linspace(0, 1, count + 1)
     s = path.length * (1 - np.cos(np.pi * even)) / 2
     extra = np.concatenate([reversals(path, s), path.knots if len(path.knots) < count / 4 else []])

@@ -8,7 +8,7 @@ from calib.config_types import OneOf
 
 MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coupling", "harmonics", "wobble")
 LOSSES = ("auto", "none", "huber", "cauchy")
-FINEST = 1e-10  # no instrument's sigma is smaller [m or rad]; our choice
+MIN_SIGMA = 1e-10  # no instrument's sigma is smaller [m or rad]; our choice
 
 Model = Annotated[str, OneOf(MODELS)]
 Loss = Annotated[str, OneOf(LOSSES)]

@@ -52,7 +52,7 @@ from typing import Annotated, Any
 
 from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread  # fmt: skip
-from calib.data.poses.choices import FINEST, Loss, Model
+from calib.data.poses.choices import MIN_SIGMA, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion
 from calib.units import ANGLES, LENGTHS
@@ -61,11 +61,11 @@ FORMATS = ("csv", "robodk", "three_smr")
 AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
 EULER = ("vector", "wpr", "xyz", *(f"{axes} {how}" for axes in AXES for how in ("fixed", "moving")))
 
-Metres = Annotated[float, Real(above=0, least=FINEST, most=0.1, unit="m")]
-Radians = Annotated[float, Real(above=0, least=FINEST, most=1.0, unit="rad")]
+Metres = Annotated[float, Real(above=0, least=MIN_SIGMA, most=0.1, unit="m")]
+Radians = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="rad")]
 Prior = Annotated[float, Real(above=0, least=1e-12, most=1e6)]  # [m, rad, or a deflection's unit]
-MetresOrZero = Annotated[float, Real(above=0, least=FINEST, most=0.1, unit="m", zero=True)]
-RadiansOrZero = Annotated[float, Real(above=0, least=FINEST, most=1.0, unit="rad", zero=True)]
+MetresOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=0.1, unit="m", zero=True)]
+RadiansOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="rad", zero=True)]
 Each = Spread(3, "a number or three")
 
 

@@ -24,7 +24,7 @@ from calib.errors import MeasurementError
 
 DIGITS = 9  # of one number or more in a row that was computed: values typed by a person have fewer (our choice)
 _DIGIT = re.compile(r"\d")
-NEAR = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
+MAX_JOINT_DIFFERENCE = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
 
 
 def write_poses(
@@ -77,7 +77,7 @@ def check_planned(
     return plausible.check_joints(q if moves else q[:1], sheet, columns, joints, kinds, limits)
 
 
-def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = NEAR) -> tuple[str, ...]:
+def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX_JOINT_DIFFERENCE) -> tuple[str, ...]:
     """Hold the joints of a measurement against the poses (m, n) [rad or m] that were to be measured.
 
     A planned and a measured pose are the same where no joint differs by more than `near`.

@@ -27,7 +27,7 @@ from numpy.lib import format as npy
 
 from calib.data.recordings.recording import Joints, Recording, read_only, span
 from calib.data.recordings.recording_options import (
-    OWN,
+    KEYS_BESIDE_SERIES,
     RATES,
     SYNONYMS,
     RecordingOptions,
@@ -153,7 +153,11 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
     if gain is not None and (gain == 0.0).any():
         archive.fail("has a gain of zero: no current makes a torque there", "drive_gain")
     variance = f"variance_{found.get(kind, '')}"
-    unused = [name for name in archive.members if name not in (*found.values(), *OWN, *RATES, "periods", variance)]
+    unused = [
+        name
+        for name in archive.members
+        if name not in (*found.values(), *KEYS_BESIDE_SERIES, *RATES, "periods", variance)
+    ]
     noise = _variance(archive, variance, q.shape, rows)
     return Recording(
         t[rows],

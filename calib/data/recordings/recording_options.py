@@ -53,9 +53,9 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 MEASURED = ("actual", "measured", "state", "robot")
 _NUMBER = re.compile(r"\d+(?!.*\d)")
-LATEST = 1.0  # largest lag that is believed [s] (our choice)
+MAX_LAG = 1.0  # largest lag that is believed [s] (our choice)
 RATES = ("frequency", "rate", "sample_rate", "fs")
-OWN = ("joint_names", "drive_gain", "use_range")
+KEYS_BESIDE_SERIES = ("joint_names", "drive_gain", "use_range")
 SCALES = {
     "t": TIMES, "q": POSITIONS, "v": VELOCITIES, "torque": EFFORTS, "current": CURRENTS, "tau_link": EFFORTS,
     "tau_motor": EFFORTS, "tau_ff": EFFORTS, "q_link": POSITIONS, "q_ref": POSITIONS,
@@ -102,7 +102,7 @@ class RecordingOptions:
     rate: Positive | None = None
     topic: Name = ""
     use_range: Flag = True
-    lag: Annotated[float, Real(least=-LATEST, most=LATEST, unit="s")] = 0.0
+    lag: Annotated[float, Real(least=-MAX_LAG, most=MAX_LAG, unit="s")] = 0.0
     rows: Annotated[str, Hidden()] = "motor"
     motors: Annotated[bool, Hidden()] = True
     sensors: Annotated[bool, Hidden()] = False

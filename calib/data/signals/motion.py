@@ -26,7 +26,8 @@ from calib.data.signals.filtering import ORDER, border, curvature, low_pass, slo
 from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resample
 from calib.errors import UsageError, refuse_data
 
-SLOW = 0.01  # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
+# of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
+STANDSTILL_SHARE = 0.01
 FASTER = 5.0  # f_v of f_q at most (our choice)
 CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
 
@@ -132,7 +133,7 @@ class Motion:
         ]
         return np.concatenate(parts)
 
-    def standstill(self, slow: float | Sequence[float] = SLOW) -> np.ndarray:
+    def standstill(self, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
         """Return (N,) whether all joints stand: friction is then any value up to Coulomb's, unknown."""
         return np.asarray(~moving(self, slow).any(axis=1))
 
@@ -229,7 +230,7 @@ def thin(motion: Motion) -> Motion:
     return replace(motion, **(picked | efforts | {"weight": weight}), rate=rate, decimator=whole)
 
 
-def moving(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
+def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
     """Return (N, n) whether each joint moves: |v_j| at or above `slow`, a share of its peak or (n,) [rad/s or m/s]."""
     peak = np.abs(motion.v).max(axis=0)
     threshold = slow * peak if isinstance(slow, (int, float)) else np.asarray(slow, dtype=float)

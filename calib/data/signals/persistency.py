@@ -13,8 +13,8 @@ from calib.data.signals.filtering import hann
 from calib.data.signals.motion import Motion
 
 SINE = 0.98  # of the variance: a joint that moves as one sine
-STILL = 1e-3  # a joint that goes less far has not moved [rad or m]
-MOST = 20_000  # states of a motion that are compared
+MIN_TRAVEL = 1e-3  # a joint that goes less far has not moved [rad or m]
+MAX_STATES = 20_000  # states of a motion that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +59,11 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     max_samples = 100_000
     thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > max_samples else 1
     q = motion.q[start:stop:thin] - motion.q[start:stop:thin].mean(axis=0)
-    still = np.ptp(q, axis=0) < STILL
+    still = np.ptp(q, axis=0) < MIN_TRAVEL
     found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate / thin) for j in range(motion.n)]
     unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
     correlation = unit.T @ unit
-    singular = np.linalg.svd(unit[:: max(1, len(unit) // MOST)], compute_uv=False)
+    singular = np.linalg.svd(unit[:: max(1, len(unit) // MAX_STATES)], compute_uv=False)
     min_share = 0.02  # of the largest singular value: a function of time that counts
     functions = int((singular > min_share * singular[0]).sum())
     lines, strongest, share = (np.array(part) for part in zip(*found))
@@ -83,17 +83,17 @@ def repeats(training: Motion, other: Motion) -> float:
     order of parts hides a repeat; the same path at another speed is none. Evidence from a repeat is no evidence:
     whatever the model gets wrong along that path, the fit has already absorbed (our choice: refuse from a half on).
     """
-    moves = np.ptp(training.q, axis=0) > STILL
+    moves = np.ptp(training.q, axis=0) > MIN_TRAVEL
     if not moves.any() or training.n != other.n:
         return 0.0
     states = []
-    for motion, most in ((training, MOST), (other, MOST // 10)):
+    for motion, most in ((training, MAX_STATES), (other, MAX_STATES // 10)):
         own = np.flatnonzero(~motion.standstill())
         own = own[:: max(1, len(own) // most)]
         states.append(np.hstack([motion.q[own], motion.v[own]]))
     spread = np.hstack([training.q.std(axis=0), training.v.std(axis=0)])
     fixed = ~np.hstack([moves, moves])
-    spread[fixed] = np.maximum(np.abs(np.hstack([other.q.std(axis=0), other.v.std(axis=0)]))[fixed], STILL)
+    spread[fixed] = np.maximum(np.abs(np.hstack([other.q.std(axis=0), other.v.std(axis=0)]))[fixed], MIN_TRAVEL)
     seen, new = (state / spread for state in states)
     if not len(seen) or not len(new):
         return 0.0
@@ -139,7 +139,7 @@ def _about(top: int, rate: float, size: int) -> list[float]:
 
 def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
     """Return the part of the variance of `q` (N,) that one sine of frequency `f` [Hz] and a constant explain."""
-    thin = max(1, int(rate / (20 * f)), len(q) // MOST)
+    thin = max(1, int(rate / (20 * f)), len(q) // MAX_STATES)
     y, angle = q[::thin] - q[::thin].mean(), 2 * np.pi * f * np.arange(0, len(q), thin) / rate
     basis = np.stack([np.ones(len(y)), np.sin(angle), np.cos(angle)], axis=1)
     left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]

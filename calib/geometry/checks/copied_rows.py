@@ -13,7 +13,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.checks.repeatability import SAME
 from calib.words import counted
 
-MOST = 0.5  # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
+MAX_COPIED_SHARE = 0.5  # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
 
 
 class _Aside(Protocol):
@@ -54,7 +54,7 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
             if told := _numbers(aside.block, chosen):
                 notes.append(f"{name}: {_rows(told)} {words}: not unseen")
         same = _numbers(aside.block, again | copied)
-        if len(same) > MOST * len(aside.block) and not aside.held_out:
+        if len(same) > MAX_COPIED_SHARE * len(aside.block) and not aside.held_out:
             proofless.add(name)
     return proofless, notes
 

@@ -12,7 +12,7 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
 SAME = 1e-3  # joints of a pose that is visited again differ by less [rad or m] (this and the next: our choice)
-MANY = 3.0  # standard errors that repeated poses have to be off to be called drift
+MIN_DRIFT_SIGMAS = 3.0  # standard errors that repeated poses have to be off to be called drift
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Drift:
     rms: float
 
     def exceeds(self, sigma: float) -> bool:
-        """Say whether noise of `sigma` per axis [m] cannot explain the differences, at `MANY` standard errors."""
-        return self.rms > (MANY / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
+        """Say whether the differences are above `MIN_DRIFT_SIGMAS` standard errors of noise of `sigma` per axis [m]."""
+        return self.rms > (MIN_DRIFT_SIGMAS / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
 
 
 def noise_of_difference(sigma: float) -> float:

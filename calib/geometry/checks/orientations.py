@@ -20,7 +20,7 @@ from calib.transforms import from_quaternion
 ROWS = 200  # how many are looked at (this and the next three: our choice)
 WRONG = 20.0  # median misfit [deg] from which on the file's orientations are not what they are said to be
 RIGHT = 5.0  # and below which another reading of them is
-NEAR = 0.1  # of the positions' spread: their median misfit then
+MAX_MISFIT = 0.1  # of the positions' spread: their median misfit then
 
 
 def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
@@ -48,7 +48,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     }
     for words, quaternion in readings.items():
         angle, distance = _misfit(arm, position, quaternion)
-        if angle < RIGHT and distance < NEAR:
+        if angle < RIGHT and distance < MAX_MISFIT:
             refuse_data(
                 block.file,
                 f"the orientations do not turn with the arm (as x y z w they are off by {found:.0f}° in the median, "

@@ -10,9 +10,10 @@ from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.robot.kinematics import forward
 
-LOOSE = 2e-3  # [m] a placement known no better than this is worth a word (our choice)
+MAX_PLACEMENT_SIGMA = 2e-3  # [m] a placement known no better than this is worth a word (our choice)
 NAMED = 4  # parameters by which families of merged ones are distinguished
-STILL = 45.0  # [deg] orientation range below which "the wrist is held still" is the likely reason (our choice)
+# [deg] orientation range below which "the wrist is held still" is the likely reason (our choice)
+MIN_ORIENTATION_RANGE = 45.0
 PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}
 
 
@@ -89,9 +90,9 @@ def _loose(found: GeometricFit) -> list[Finding]:
     for tool in found.cell.tool_names:
         own = [index[f"{tool}.{axis}"] for axis in "xyz" if f"{tool}.{axis}" in index]
         sigma = float(np.linalg.norm(estimate.sigma[own]))
-        if own and sigma >= LOOSE:
+        if own and sigma >= MAX_PLACEMENT_SIGMA:
             spread = _orientation_range(found)
-            still = spread if spread is not None and spread < STILL else None
+            still = spread if spread is not None and spread < MIN_ORIENTATION_RANGE else None
             station = _confused(found, own, index)
             result.append(finding("loose-tool", tool=tool, sigma=sigma, station=station, still=still))
     return result

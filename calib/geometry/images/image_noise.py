@@ -18,7 +18,8 @@ import numpy as np
 from calib.arrays import frozen
 from calib.estimation import robust
 
-ALIKE, LEAST = 0.05, 2e-6  # change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
+# change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
+MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class ImageNoise:
     def near(self, other: ImageNoise) -> bool:
         """Say whether two estimates are alike, so that the fit need not be repeated."""
         pairs = ((self.factor, other.factor), (self.displacement, other.displacement), (self.turn, other.turn))
-        alike = all(abs(a - b) <= ALIKE * max(a, b) + LEAST for a, b in pairs)
+        alike = all(abs(a - b) <= MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE for a, b in pairs)
         return alike and np.abs(self.weight - other.weight).max(initial=0.0) < 0.05
 
 

@@ -27,7 +27,7 @@ SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to expla
 UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
 EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
 SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse grid
-SURE = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
+MIN_SIGN_CORRELATION = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
 HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
 UNLIMITED = 100.0  # torque limit of a joint that states none [N m or N]
 CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
@@ -174,7 +174,8 @@ def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
     """Compare recorded torques with those of the nominal masses, friction left free.
 
     Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
-    rigid-body torque is more than `HEAVY` of its limit and the partial correlation of both torques is above `SURE`.
+    rigid-body torque is more than `HEAVY` of its limit and the partial correlation of both torques is above
+    `MIN_SIGN_CORRELATION`.
 
     Args:
         recording: with torques of n joints.
@@ -216,7 +217,7 @@ def share_of_nominal(
         free = friction if other is None else np.column_stack([friction, other[:, j]])
         own, seen = (x - free @ np.linalg.lstsq(free, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
         common, power = own @ seen, own @ own
-        if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > SURE:
+        if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > MIN_SIGN_CORRELATION:
             share[j] = common / max(power, 1e-12)
     return share
 

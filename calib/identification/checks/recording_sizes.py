@@ -28,7 +28,7 @@ from calib.identification.checks.whole_robot import (
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
-ROWS, FEW = 1500, 500  # samples on which a lag is looked for, and all else
+MAX_LAG_SAMPLES, MAX_SAMPLES = 1500, 500  # samples on which a lag is looked for, and all else
 DATED = 0.01  # share of a joint's travel by which errors of dates move its positions
 DRAWS = 6  # independent errors in what velocities leave of the positions: those with a dead zone drift for long
 FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are the positions
@@ -96,7 +96,7 @@ def compare_sizes(
         speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
     counted = motion.sampling.clock == "counted"
     bodies = _under(chain, gravity)
-    many, few = (take_samples(case, bodies, count) for count in (ROWS, FEW))
+    many, few = (take_samples(case, bodies, count) for count in (MAX_LAG_SAMPLES, MAX_SAMPLES))
     lag = None if many is None else lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
     other = rearranged(few, chain) if known and few is not None else None
@@ -105,7 +105,7 @@ def compare_sizes(
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> ReversedSigns | None:
     """Return which motors' torques of a recording have the wrong sign; arguments and None as of `compare_sizes`."""
-    few = take_samples(case, _under(chain, gravity), FEW)
+    few = take_samples(case, _under(chain, gravity), MAX_SAMPLES)
     return None if few is None else reversed_signs(few)
 
 

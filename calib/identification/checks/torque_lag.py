@@ -23,11 +23,11 @@ LAGS = 0.25  # largest lag that is tried [s], in steps of
 STEP = 0.005
 FREE = 0.03  # by which friction may turn over early or late by itself [s]
 SWEEPS = 30  # over the joints' own lags
-LEAST, SURE = 0.015, 3.5  # least lag that is told [s], and in sigmas
+MIN_LAG, MIN_LAG_SIGMAS = 0.015, 3.5  # least lag that is told [s], and in sigmas
 HELPS = 1.05  # and what is left without it over what is left with it: of another robot any lag may be the best
 KNOWN = 0.4  # share of the joints' torques that may be left: a model that leaves more knows no lag
 ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
-ALIKE = 0.5  # share of that lag by which those of both halves may differ from it
+MAX_LAG_DIFFERENCE = 0.5  # share of that lag by which those of both halves may differ from it
 ROUNDS = 4  # of weighing joints by what is left of them
 UNSURE = 0.005  # sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms
 LONG = 2.0  # time with samples below which a motion tells no lag: bodies then stand for it [s]
@@ -58,7 +58,7 @@ class Lag:
     @property
     def told(self) -> bool:
         """Whether all torques come late, surely, and by enough."""
-        least = max(LEAST, SURE * self.sigma)
+        least = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
         return least < abs(self.seconds) < LAGS - STEP and self.factor > HELPS and self.after < KNOWN
 
 
@@ -82,11 +82,13 @@ def _alone(whole: Lag, halves: Sequence[Lag]) -> int | None:
     """Return the joint with a lag of its own as no other has, in the whole and alike in its halves; None without."""
     j, more = int(whole.gains.argmax()), np.sort(whole.gains) - 1.0
     late = whole.own[j] - whole.seconds
-    if abs(late) < LEAST or abs(whole.own[j]) > LAGS - 1.5 * STEP or len(more) < 2:
+    if abs(late) < MIN_LAG or abs(whole.own[j]) > LAGS - 1.5 * STEP or len(more) < 2:
         return None
     if more[-1] < max(ALONE, OTHERS * more[-2]):
         return None
-    return j if all(abs(half.own[j] - half.seconds - late) < ALIKE * abs(late) for half in halves) else None
+    return (
+        j if all(abs(half.own[j] - half.seconds - late) < MAX_LAG_DIFFERENCE * abs(late) for half in halves) else None
+    )
 
 
 def _part(samples: MotionSamples, part: slice) -> MotionSamples:

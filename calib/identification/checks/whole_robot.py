@@ -26,8 +26,9 @@ from calib.robot.chain import Chain
 
 JOINTS = 3  # of the shortest arm that is looked at (our choice)
 ROUNDS = 3  # of weighing joints by what is left of them
-SURE = 5.0  # sigmas from which on a factor is told
-ALIKE = 0.3  # least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
+MIN_FACTOR_SIGMAS = 5.0  # sigmas from which on a factor is told
+# least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
+MIN_EXCHANGED_SPEED = 0.3
 KNOWN = 0.5  # largest share of their torques' variance that is left as recorded
 QUARTERS = (1, 2, 3)  # turns of a joint's zero that are tried [90 deg]
 MAX_LEFT = 0.8  # of what is left as recorded, with a sign reversed: sound recordings at hand are left 0.91 and more
@@ -89,7 +90,7 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     still, moving = samples.at_rest, samples.inertial - samples.at_rest
     inertia, own = _factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))
     mass, other = _factor(samples.torque, still @ whole, np.concatenate([moving, samples.drives], axis=2))
-    if inertia < SURE * own or mass < SURE * other:
+    if inertia < MIN_FACTOR_SIGMAS * own or mass < MIN_FACTOR_SIGMAS * other:
         return None
     return ClockRatio(inertia / mass, float(np.hypot(own / inertia, other / mass)))
 
@@ -165,7 +166,7 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Rearranged | None:
     order, straight = np.arange(chain.n), np.zeros(chain.n)
     before = np.maximum(list(_left(samples, masses, order, straight)), 1e-9)
     speed = samples.v.std(axis=0)
-    moves = (speed > ALIKE * speed.max()) & (before < KNOWN)
+    moves = (speed > MIN_EXCHANGED_SPEED * speed.max()) & (before < KNOWN)
     tried = [((a, b), 0) for a, b in combinations(np.flatnonzero(moves).tolist(), 2)]
     turning = [j for j, joint in enumerate(chain.joints) if joint.kind != "prismatic"]
     tried += [((j,), quarters) for j in turning for quarters in QUARTERS]

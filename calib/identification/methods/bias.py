@@ -15,7 +15,7 @@ from calib.identification.settings import IdentificationSettings
 
 FOLLOWS = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
 BLUR = 3.0  # widths of the smoothed sign that the noise of the velocity may have (our choice)
-SMALL = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
+MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
 NEGLIGIBLE = 1.0  # standard deviations of a shift that is not worth a word (our choice)
 
 
@@ -140,7 +140,7 @@ def _words(found: Instrumental) -> list[str]:
     worst = np.argsort(-shift)[:5]
     named = ", ".join(f"{found.names[k]} by {shift[k]:.2g} sigma" for k in worst)
     p = f"p = {found.verdict.p:.2g}" if found.verdict.p > 0.0 else "p < 1e-300"
-    if shift.max() < SMALL:
+    if shift.max() < MAX_SHIFT_SIGMAS:
         return [f"least squares is biased ({p}), but by little: {named}"]
     return [f"least squares is biased (Durbin, Wu, Hausman: {p}), off {named}: method 'iv' is not"]
 

@@ -42,7 +42,8 @@ BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 HOLDS = 0.93  # least share of errors on unseen motion within the 95 % intervals, beyond chance
 JOINT_HOLDS = 0.90  # the same for a single joint, whose errors may leave them twice as often as stated
 SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
-ALIKE = 3.0  # neighbouring rows that count as one from which on what is left is no noise, but something unmodelled
+# neighbouring rows that count as one from which on what is left is no noise, but something unmodelled
+MAX_CORRELATED_ROWS = 3.0
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
 
 
@@ -313,7 +314,7 @@ def _unmodelled(found: Identification) -> list[str]:
     """Say where sigmas hold for this motion alone: the model lacks something there."""
     alike = np.nan_to_num(found.fitted.inflation)
     rows = found.settings.torque_rows.numbered(found.dynamics.model.n)
-    joints = [f"{rows[k]} ({alike[k]:.0f} rows count as one)" for k in np.flatnonzero(alike >= ALIKE)]
+    joints = [f"{rows[k]} ({alike[k]:.0f} rows count as one)" for k in np.flatnonzero(alike >= MAX_CORRELATED_ROWS)]
     if not joints:
         return []
     return [

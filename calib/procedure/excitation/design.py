@@ -33,7 +33,7 @@ from trajectories.errors import NothingFeasible
 from trajectories.fourier import fourier_family
 
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
-QUICK = 240  # evaluations for a motion of another period, which is only looked at (our choice)
+OUTLOOK_EVALUATIONS = 240  # evaluations for a motion of another period, which is only looked at (our choice)
 INSTANTS = 1000  # over the period, at which condition numbers are reported
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
@@ -164,7 +164,7 @@ def _outlook(
 
     look = settings.outlook and not found.interrupted
     say("what other periods would tell")
-    evaluations = min(QUICK, settings.evaluations // 4) if look else 0
+    evaluations = min(OUTLOOK_EVALUATIONS, settings.evaluations // 4) if look else 0
     return foretell(
         given, problem, found, settings.repeat, settings.noise, problem_of, evaluations, settings.seed
     )  # fmt: skip

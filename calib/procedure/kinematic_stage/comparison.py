@@ -222,7 +222,7 @@ def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
     return gravity_torques(chain, block.q)
 
 
-POSES, CYCLES, ENOUGH = 5, 30, 100  # what the norm asks for; how many poses makers judge accuracy by
+POSES, CYCLES, USUAL_POSES = 5, 30, 100  # what the norm asks for; how many poses makers judge accuracy by
 ARMS = ("nominal", "calibrated")
 
 
@@ -288,4 +288,6 @@ def iso9283_sentence(found: RepeatedPoses) -> str:
     )
     few = [f"{POSES} poses"] * (found.poses < POSES) + [f"{CYCLES} cycles"] * (least < CYCLES)
     words += f"; the norm asks for {' and '.join(few)}" if few else ""
-    return words + (f"; too few poses to state an accuracy (makers take {ENOUGH})" if found.poses < ENOUGH else "")
+    return words + (
+        f"; too few poses to state an accuracy (makers take {USUAL_POSES})" if found.poses < USUAL_POSES else ""
+    )

@@ -40,10 +40,10 @@ from calib.robot.deflection import Deflection
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows
-MOST = 0.2  # correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
+MAX_CORRECTION = 0.2  # correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
 SINGULAR = 0.02  # singular values of the Jacobian, smallest over largest
 ASTRAY = 0.01  # further from a target than this no singularity is to blame [m]
-SLACK = 1e-9  # [rad or m]
+LIMIT_TOLERANCE = 1e-9  # [rad or m]
 STARTS = 24  # random starts for each target without joints
 
 
@@ -205,8 +205,8 @@ def compensate(
     """Return the joint commands that put the real tool on the targets.
 
     The nominal robot says which configuration is meant; from there the calibrated one is led to the target, joints
-    moving as little as they can. Where one would move by more than `MOST`, the arm is near a singularity: it is held
-    back, and what is left is said.
+    moving as little as they can. Where one would move by more than `MAX_CORRECTION`, the arm is near a singularity:
+    it is held back, and what is left is said.
 
     Args:
         fitted: see `read`.
@@ -229,7 +229,10 @@ def compensate(
     one, two = placements(fitted, frame, tool)
     count, notes = _dof(targets, one.chain, dof)
     lower, upper = one.chain.lower, one.chain.upper
-    if start is not None and not ((np.asarray(start) >= lower - SLACK) & (np.asarray(start) <= upper + SLACK)).all():
+    if (
+        start is not None
+        and not ((np.asarray(start) >= lower - LIMIT_TOLERANCE) & (np.asarray(start) <= upper + LIMIT_TOLERANCE)).all()
+    ):
         raise UsageError(f"start {list(start)}: beyond the joints' limits {lower.tolist()} to {upper.tolist()}")
     before = Goal(one, count, lower, upper)
     after = Goal(two, count, lower, upper, torques_of(fitted))
@@ -238,10 +241,10 @@ def compensate(
     say("the calibrated robot")
     q = inverse.reach(after, wanted, q0)
     q = inverse.nearest(after, wanted, np.clip(q0, lower, upper), q)
-    far = np.flatnonzero(np.abs(q - q0).max(axis=1, initial=0.0) > MOST)
-    q[far] = inverse.held_back(after, wanted[far], q0[far], MOST)
+    far = np.flatnonzero(np.abs(q - q0).max(axis=1, initial=0.0) > MAX_CORRECTION)
+    q[far] = inverse.held_back(after, wanted[far], q0[far], MAX_CORRECTION)
     left = _sizes(inverse.differences(after, q, wanted))
-    reached = _within(left, tolerance) & ((q0 >= lower - SLACK) & (q0 <= upper + SLACK)).all(axis=1)
+    reached = _within(left, tolerance) & ((q0 >= lower - LIMIT_TOLERANCE) & (q0 <= upper + LIMIT_TOLERANCE)).all(axis=1)
     singular = inverse.conditions(after, q0) < SINGULAR
     reason = tuple("" if good else _why(one.chain, *row) for good, *row in zip(reached, q0, q, left, singular))
     say("sigmas")
@@ -328,13 +331,13 @@ def _why(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, sin
     """Say why a target is not reached, from what is left there (2,) [m, rad]."""
     rest = f"{1e3 * left[0]:.3g} mm" + ("" if np.isnan(left[1]) else f" and {1e3 * left[1]:.3g} mrad")
     for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
-        if not low - SLACK <= value <= high + SLACK:
+        if not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
             return f"the target itself is outside the limits {low:.4g} to {high:.4g} of {name} ({value:.4g})"
     at = [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]
     if at:
         return f"{', '.join(at)} at a limit: {rest} left"
     if singular and left[0] < ASTRAY:
-        return f"near a singularity, where joints would move by more than {MOST:g} rad or cannot follow: {rest} left"
+        return f"near a singularity: joints would move more than {MAX_CORRECTION:g} rad or cannot follow: {rest} left"
     return f"out of reach: {rest} left at the nearest pose found"
 
 

@@ -7,13 +7,13 @@ from typing import Annotated
 
 from calib.arguments import checked
 from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, Seed, Text, Typed, Whole
-from calib.data.poses.choices import FINEST, Loss, Model
+from calib.data.poses.choices import MIN_SIGMA, Loss, Model
 from calib.procedure.measuring.run_settings import DEFAULT_RUN, RunSettings
 
 DELIVERABLES = ("urdf", "corrections")  # what a verdict is about: robot.urdf alone, or with joint_corrections.csv
 Place = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity="length")]  # of a target in the tip's frame
 Point = Annotated[tuple[Place, Place, Place], Expect("x,y,z [m]")]
-Sigma = Annotated[float, Real(above=0.0, least=FINEST, most=10.0, unit="m or rad", quantity="1")]
+Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or rad", quantity="1")]
 Stations = Annotated[str, OneOf(("each", "one"))]
 Deliverable = Annotated[str, OneOf(DELIVERABLES)]
 Index = Annotated[str, OneOf("poses.indices:Index")]

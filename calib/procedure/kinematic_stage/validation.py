@@ -40,7 +40,7 @@ from calib.robot.chain import Chain
 from calib.transforms import invert
 
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
-GROSS = 8.0  # our choice
+OUTLIER_SIGMAS = 8.0  # our choice
 ARM = {"urdf": "URDF alone", "corrections": "with joint corrections"}
 PLACES = tuple(
     f"{name} [{unit}]"
@@ -194,11 +194,11 @@ def _elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[Fi
 
 
 def _doubtful(validation: Mapping[str, Comparison]) -> list[Finding]:
-    """Return unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
+    """Return unseen rows whose error is more than `OUTLIER_SIGMAS` times the median: they may be wrong measurements."""
     result = []
     for name, each in validation.items():
         sizes, numbers = each.errors[1].main, [row for block in each.blocks for row in _numbers(block)]
-        far = np.flatnonzero(sizes > GROSS * np.median(sizes)) if len(sizes) == len(numbers) else []
+        far = np.flatnonzero(sizes > OUTLIER_SIGMAS * np.median(sizes)) if len(sizes) == len(numbers) else []
         if not len(far):
             continue
         rest = np.delete(sizes, far)

@@ -40,7 +40,7 @@ ASSUMED = (
 )
 TRIES = 60
 UNKNOWN = "unknown"
-BLIND = "whether the camera sees the board"
+VIEW_UNCHECKED = "whether the camera sees the board"
 Angle = Annotated[float, Real(above=0, quantity="angle")]
 Distance = Annotated[float, Real(least=0, quantity="length")]
 

@@ -19,7 +19,8 @@ from poses.indices import Index, observability
 from poses.information import log_det
 
 ROUNDS = 3  # times that poses are replaced, and the run is planned again (our choice)
-TRIES, PATIENT = 200, 4  # candidates tried in the place of one pose, by straight moves, by via-points (our choice)
+# candidates tried in the place of one pose, by straight moves, by via-points (our choice)
+MAX_STRAIGHT_TRIES, MAX_VIA_TRIES = 200, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +127,7 @@ def _joined(
             if np.abs(q - exchange.candidates[k]).max(axis=1).min() > 1e-9
         ]  # fmt: skip
         itself = [(None, straight) for straight in (True, False)]
-        others = [(k, True) for k in ranked[:TRIES]] + [(k, False) for k in ranked[:PATIENT]]
+        others = [(k, True) for k in ranked[:MAX_STRAIGHT_TRIES]] + [(k, False) for k in ranked[:MAX_VIA_TRIES]]
         for number, straight in itself + others:
             trial = q[place] if number is None else exchange.candidates[number]
             postures = turns(chain, trial, limits.lower, limits.upper)

@@ -21,7 +21,7 @@ from calib.data.poses.pixels import IN_HAND
 from calib.errors import RobotError, UsageError, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
-from calib.procedure.measuring.camera_view import BLIND, CameraTable, CameraView, ImageObservation, camera_view
+from calib.procedure.measuring.camera_view import VIEW_UNCHECKED, CameraTable, CameraView, ImageObservation, camera_view
 from calib.procedure.measuring.constraints_file import (
     CELL,
     DEFAULTS,
@@ -43,9 +43,9 @@ from calib.words import listing
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
 
-ABSURD = 100.0  # times the arm's reach: no cell is that large (our choice)
+MAX_REACHES = 100.0  # times the arm's reach: no cell is that large (our choice)
 BODY = 1.2  # of the reach is where a link's body ends (our choice)
-NEAREST = 3  # distances that a constraint holds: the smallest ones, so that two that change places both are there
+DISTANCES = 3  # distances that a constraint holds: the smallest ones, so that two that change places both are there
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +93,11 @@ class Limits:
 
 
 def _shortfall(model: Any, clearance: float, q: np.ndarray) -> np.ndarray:
-    return clearance - np.sort(model.distances(q), axis=1)[:, :NEAREST]
+    return clearance - np.sort(model.distances(q), axis=1)[:, :DISTANCES]
 
 
 def _closing(model: Any, q: np.ndarray) -> np.ndarray:
-    order = np.argsort(model.distances(q), axis=1)[:, :NEAREST]
+    order = np.argsort(model.distances(q), axis=1)[:, :DISTANCES]
     return -np.take_along_axis(model.gradients(q), order[:, :, None], axis=1)
 
 
@@ -129,7 +129,7 @@ def _with_camera(limits: Limits, stated: CameraTable, cell: Installation, path: 
     """Return limits that keep the board in the camera's view, past the arm's own links, where enough is known of it."""
     unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     if stated.unknown:
-        return replace(limits, unchecked=(*unchecked, f"{BLIND} (not known: {', '.join(stated.unknown)})"))
+        return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))
     try:
         view = camera_view(stated, cell.chain, str(path), path.parent)
     except RobotError as error:
@@ -332,7 +332,7 @@ def _never_act(
     """Return the names of what stands beyond the arm's reach, and what to say of it.
 
     Raises:
-        UsageError: for what stands `ABSURD` times as far, and for links thicker than the arm is long.
+        UsageError: for what stands `MAX_REACHES` times as far, and for links thicker than the arm is long.
     """
     slides = sum(max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m")
     tool = float(np.linalg.norm(cell.tools[:, :3, 3], axis=1).max(initial=0.0))
@@ -350,7 +350,7 @@ def _never_act(
         for name, distance in beyond.items()
     ]
     for said, distance in zip(words, beyond.values()):
-        require(distance <= ABSURD * reach, f"{where}: {said} Lengths are in m", UsageError)
+        require(distance <= MAX_REACHES * reach, f"{where}: {said} Lengths are in m", UsageError)
     return set(beyond), tuple(words)
 
 

@@ -35,8 +35,10 @@ LEISURE = {
 RISE = 2.0  # acceleration [1/s] times the speed: half a second to get there; our choice
 BLOCKED = 3.0  # times that a straight move which does not keep clear is taken to last; our choice
 PLACES = 8  # of a straight move that are looked at to guess whether it keeps clear
-ROUNDS, QUICK, PATIENT = 4, 250, 1000  # orders tried, and random places per way in them and in the last; our choice
-NEAR = 8  # turns of a pose, and poses to come from, that are tried to tell whether there is any way; our choice
+# orders tried, and random places per way in them and in the last; our choice
+ROUNDS, WAY_TRIES, LAST_WAY_TRIES = 4, 250, 1000
+# turns of a pose, and poses to come from, that are tried to tell whether there is any way; our choice
+MAX_NEIGHBOURS = 8
 MIN_STEP = 0.01  # of a joint's range that the search for a way goes at once, however slow the joint is; our choice
 FORBIDDEN = 1e4  # [s] a move for which no way was found
 Progress = Callable[[str], None]
@@ -119,7 +121,7 @@ def plan_run(
         if np.array_equal(own[[0, -1]], q[[one, two]]):
             known[one, two] = own
             cost[one, two] = cost[two, one] = seconds(own[:-1], own[1:]).sum()
-    for tries in (*[QUICK] * ROUNDS, PATIENT):
+    for tries in (*[WAY_TRIES] * ROUNDS, LAST_WAY_TRIES):
         order = tour(cost)
         fresh = [pair for pair in map(_pair, order[:-1], order[1:]) if known.get(pair) is None]
         for number, (one, two) in enumerate(fresh, 1):
@@ -197,14 +199,14 @@ def way_to(
 ) -> tuple[int, np.ndarray] | None:  # fmt: skip
     """Return a clear way (k, n) to one of some postures (p, n) from one of others (m, n), and from which; None: none.
 
-    The moves of least time are tried, for each of the `NEAR` nearest postures: straight ones from the `NEAR` nearest of
-    the others, or with via-points from the nearest.
+    The moves of least time are tried, for each of the `MAX_NEIGHBOURS` nearest postures: straight ones from the
+    `MAX_NEIGHBOURS` nearest of the others, or with via-points from the nearest.
     """
     velocity, acceleration = _speeds(chain, settings.speed)
     room, times = _room(chain, limits, velocity), move_times(postures[:, None], others, velocity, acceleration)
-    for end in np.argsort(times.min(axis=1))[:NEAR]:
-        for start in np.argsort(times[end])[: NEAR if straight else 1]:
-            own = way(room, others[start], postures[end], seed=seed, most=0 if straight else QUICK)
+    for end in np.argsort(times.min(axis=1))[:MAX_NEIGHBOURS]:
+        for start in np.argsort(times[end])[: MAX_NEIGHBOURS if straight else 1]:
+            own = way(room, others[start], postures[end], seed=seed, most=0 if straight else WAY_TRIES)
             if own is not None:
                 return int(start), own
     return None

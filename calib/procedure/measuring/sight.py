@@ -21,7 +21,7 @@ from poses.space import PoseConstraint, constraint_gradient
 
 BEAM = 0.01
 """Least distance of a link from the line of sight [m]: about the radius of a tracker's beam. Our choice."""
-NEAREST = 2
+DISTANCES = 2
 """Links that are looked at per line of sight: the nearest ones. Our choice; where two change places, both are there."""
 SEEN = 1e-6
 """What a constraint may be broken by where a target still counts as seen."""
@@ -29,7 +29,7 @@ SEEN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _Behind:
-    """What links of the arm take from a line of sight: `BEAM` less the distances of the nearest, (m, `NEAREST`).
+    """What links of the arm take from a line of sight: `BEAM` less the distances of the nearest, (m, `DISTANCES`).
 
     Attributes:
         arm: with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
@@ -47,13 +47,13 @@ class _Behind:
         return self._nearest(q)[0]
 
     def gradient(self, q: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, `NEAREST`, n)."""
+        """Return the derivatives (m, `DISTANCES`, n)."""
         return self._nearest(q)[1]
 
     def _nearest(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = self.arm.beam(q, self.target(q)[1], self.velocity(q)[:, :3], self.instrument)
         distances, slopes = (part[:, self.links] for part in found)
-        order = np.argsort(distances, axis=1)[:, :NEAREST]
+        order = np.argsort(distances, axis=1)[:, :DISTANCES]
         rows = np.arange(len(q))[:, None]
         return BEAM - distances[rows, order], -slopes[rows, order]
 

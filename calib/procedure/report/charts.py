@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from calib import files
 from calib.procedure.report import style
 from calib.procedure.report.page import Picture
-from calib.procedure.report.style import AFTER, INK, MARK, QUIET, WIDE, log_axis
+from calib.procedure.report.style import AFTER, INK, MARK, PAGE_WIDTH, QUIET, log_axis
 
 SIZE = 16.0  # of a coloured dot [pt²]
 
@@ -302,7 +302,7 @@ class Chart:
     panels: Sequence[Panel]
     height: float
     columns: int = 1
-    width: float = WIDE
+    width: float = PAGE_WIDTH
     title: str = ""
 
 
@@ -327,7 +327,7 @@ def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
 
 def picture(chart: Chart, caption: str) -> Picture:
     """Return a chart for a page; one that was drawn before is taken again: a certificate shows what its steps drew."""
-    return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF)
+    return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH)
 
 
 @lru_cache(maxsize=32)

@@ -12,7 +12,7 @@ import numpy as np
 from calib.errors import UsageError
 from calib.estimate_files import read_estimate
 from calib.identification.loop.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay
-from calib.identification.methods.bias import SMALL
+from calib.identification.methods.bias import MAX_SHIFT_SIGMAS
 from calib.identification.scores import Score, relative_error_sigma
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
@@ -25,7 +25,7 @@ from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Tab
 from calib.records import read_rows, typed_rows
 from calib.units import small
 
-TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
+MAX_RSD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
 WORDS = 46  # letters of what a parameter holds that are printed
 SHOWN = 8  # geometric errors listed
 WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
@@ -339,7 +339,7 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
     )
     said = "no bias of least squares is seen"
     if test.least_squares_biased:
-        little = loop.largest_shift_sigma < SMALL
+        little = loop.largest_shift_sigma < MAX_SHIFT_SIGMAS
         said = "least squares is biased, surely but by little" if little else "least squares is biased"
     if not loop.explains:
         said = "of a loop that explains less than the model does: it says nothing"
@@ -398,7 +398,7 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Bl
 def _identifiability(found: DynamicReport) -> list[str]:
     """Return what the motion can and cannot tell, in sentences."""
     lines = []
-    weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > TOLD]
+    weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:
         lines.append(f"Not told from zero (σ above half the value): {', '.join(weak)}.")
     _, proof, where = proof_of(found.unseen)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.procedure.report.charts import Bars, Chart, Dots, Heat, Histogram, Level, Line, Panel, Words
-from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF, INK, MARK, WIDE, number
+from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
 from calib.units import ERRORS
 
 PALE = "#c3ccd6"  # of changes below two sigmas
@@ -45,7 +45,7 @@ def error_histogram(
         f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after", f"{nature} error [{unit}]", "poses",
         xlim=(edges[0], edges[-1]), ylim=(0.0, 1.2 * max(1, *map(max, counts))), log="x" if apart else "",
     )  # fmt: skip
-    return Chart([panel], 2.4, width=HALF)
+    return Chart([panel], 2.4, width=HALF_WIDTH)
 
 
 def residuals_by_joint(
@@ -148,7 +148,7 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
         Panel([Heat(np.where(count > 0, values, np.nan), unit, (0, wide, high, 0))], title, "u [px]", "v [px]", ticks=5)
         for values, unit, title in shown
     ]
-    return Chart(panels, 0.8 + 0.5 * (WIDE - 2.0) * high / wide, 2)
+    return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * high / wide, 2)
 
 
 def parameter_changes(
@@ -197,7 +197,9 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
         layers.append(Words(f"gap {number(last / first)}", *middle, (-6, 0), MARK, across="right", along="center"))
     title = f"{rank} of {len(values)} parameters are identifiable"
     limits = 0.3 * float(shown.min()), 3.0 * float(shown.max())
-    return Chart([Panel(layers, title, "number", "singular value", ylim=limits, log="y", grid="y")], 2.4, width=HALF)
+    return Chart(
+        [Panel(layers, title, "number", "singular value", ylim=limits, log="y", grid="y")], 2.4, width=HALF_WIDTH
+    )
 
 
 def ladder(
@@ -253,6 +255,6 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
     title = f"correlations up to {off[chosen].max():.2f}" if len(chosen) > 1 else ""
     heat = Heat(correlation[np.ix_(chosen, chosen)], limits=(-1.0, 1.0), colours="PuOr", written=len(labels) <= 10)
     longest = max(map(len, labels), default=0)
-    side = max(HALF, 0.13 * len(labels) + 0.05 * longest + 1.0)  # long names widen the figure, and never overlap
+    side = max(HALF_WIDTH, 0.13 * len(labels) + 0.05 * longest + 1.0)  # long names widen the figure, and never overlap
     panel = Panel([heat], title, xnames=labels, ynames=labels)
     return Chart([panel], side - 0.3, width=side)

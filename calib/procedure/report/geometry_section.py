@@ -26,10 +26,10 @@ from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
 ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "URDF alone"}
-MOST_ROWS = 60  # parameters beyond which joint corrections are not listed
-MOST_POSES = 30  # repeated poses that are listed
-MOST_OUTLIERS = 20
-FEW = 8  # outliers named in a sentence
+MAX_ROWS = 60  # parameters beyond which joint corrections are not listed
+MAX_POSES = 30  # repeated poses that are listed
+MAX_OUTLIERS = 20
+MAX_NAMED_OUTLIERS = 8  # outliers named in a sentence
 ISO_HEADER = (
     "pose", "cycles", "AP nominal [mm]", "AP calibrated [mm]", "x, y, z of it [mm]", "RP [mm]", "RP a, b, c [deg]",
     "vAP [mm]",
@@ -236,7 +236,7 @@ def _rms_words(rows: ComparedRows) -> str:
 
 def _parameter_table(report: Report) -> Table:
     """Return the fitted parameters; of many joint corrections only the arm and the frames are printed."""
-    shown = [row for row in report.parameters if len(report.parameters) <= MOST_ROWS or row.group != "deflection"]
+    shown = [row for row in report.parameters if len(report.parameters) <= MAX_ROWS or row.group != "deflection"]
     rows = []
     for row in shown:
         factor, printed = SMALL.get(row.unit, (1.0, row.unit))
@@ -257,8 +257,8 @@ def _outlier_sentences(metrics: FitMetrics) -> list[str]:
     if not metrics.outliers:
         return []
     count = len({(each.file, each.row) for each in metrics.outliers})
-    worst = "; ".join(map(_outlier_words, metrics.outliers[:FEW]))
-    more = "; ..." if len(metrics.outliers) > FEW else ""
+    worst = "; ".join(map(_outlier_words, metrics.outliers[:MAX_NAMED_OUTLIERS]))
+    more = "; ..." if len(metrics.outliers) > MAX_NAMED_OUTLIERS else ""
     loss = metrics.findings.loss if metrics.findings else ""
     how = "kept in the fit" if loss in ("", "none") else f"weighed down by the {loss} loss"
     return [f"{count} rows beyond 4 robust sigma, {how}: {worst}{more}"]
@@ -277,11 +277,11 @@ def _outlier_table(metrics: FitMetrics) -> Table:
     found = metrics.outliers
     rows = [
         (Path(each.file).name, str(each.row), each.nature, _outlier_size(each), f"{each.sigmas:.1f}")
-        for each in found[:MOST_OUTLIERS]
+        for each in found[:MAX_OUTLIERS]
     ]
     note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
-    if len(found) > MOST_OUTLIERS:
-        note += f" {len(found) - MOST_OUTLIERS} more in metrics.json."
+    if len(found) > MAX_OUTLIERS:
+        note += f" {len(found) - MAX_OUTLIERS} more in metrics.json."
     header = ("file", "row", "residual", "size", "robust sigmas")
     return Table("Rows that do not fit", header, rows, note, numbers=(1, 3, 4))
 
@@ -321,9 +321,9 @@ def iso9283_tables(metrics: FitMetrics) -> list[Table]:
     result = []
     for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
         if iso := found.iso9283:
-            rows = [_iso_row(number, each) for number, each in enumerate(iso.each[:MOST_POSES], 1)]
-            if len(iso.each) > MOST_POSES:
-                rows.append(("…", f"{len(iso.each) - MOST_POSES} more in metrics.json", *[""] * 6))
+            rows = [_iso_row(number, each) for number, each in enumerate(iso.each[:MAX_POSES], 1)]
+            if len(iso.each) > MAX_POSES:
+                rows.append(("…", f"{len(iso.each) - MAX_POSES} more in metrics.json", *[""] * 6))
             title = f"Accuracy and repeatability, {name} ({iso9283_sentence(iso)})"
             result.append(Table(title, ISO_HEADER, rows, ISO_NOTE, numbers=range(1, 8)))
     return result

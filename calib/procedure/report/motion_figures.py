@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib.procedure.report.charts import Chart, Level, Line, Panel, Words, save_all
-from calib.procedure.report.style import AFTER, BEFORE, HALF, MARK, QUIET
+from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.procedure.report.uncertainty_figures import outlook_figure
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
@@ -104,7 +104,7 @@ def _history_figure(designed: Designed) -> Chart:
     history = np.asarray(designed.found.history, dtype=float)
     title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
     curve = Line(np.arange(len(history)), history)
-    return Chart([Panel([curve], title, "improving feasible motions", "objective")], 2.2, width=HALF)
+    return Chart([Panel([curve], title, "improving feasible motions", "objective")], 2.2, width=HALF_WIDTH)
 
 
 def _front_figure(front: Front) -> Chart:
@@ -113,7 +113,7 @@ def _front_figure(front: Front) -> Chart:
     good, rest = good[np.argsort(good[:, 1])], front.values[~front.best]
     points = [Line(good[:, 1], good[:, 0], "o-", size=4.0), Line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
     title = f"{len(good)} motions to choose from"
-    return Chart([Panel(points, title, front.names[1], front.names[0])], 2.5, width=HALF)
+    return Chart([Panel(points, title, front.names[1], front.names[0])], 2.5, width=HALF_WIDTH)
 
 
 def _motion(designed: Designed) -> Any:

@@ -24,7 +24,7 @@ from calib import files
 
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
 BROWN = "#a8622a"  # BEFORE, dark enough for letters
-WIDE, HALF = 7.4, 3.6  # a page's line and half of it [in]
+PAGE_WIDTH, HALF_WIDTH = 7.4, 3.6  # a page's line and half of it [in]
 DPI = 200  # of print
 COLOURS = 256  # of a PNG with a palette, a third as large as one without
 POINTS = 700  # stretches of a curve, of which each keeps its smallest and its largest value
@@ -66,7 +66,7 @@ def styled(quiet_titles: bool = False) -> Iterator[None]:
 
 
 def sheet(
-    rows: int = 1, columns: int = 1, width: float = HALF, height: float = 2.5, head: float = 0.0
+    rows: int = 1, columns: int = 1, width: float = HALF_WIDTH, height: float = 2.5, head: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure without a window, and its axes row by row.
 

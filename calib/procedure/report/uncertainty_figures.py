@@ -16,7 +16,7 @@ from calib import files
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, Words, picture
 from calib.procedure.report.page import Picture
-from calib.procedure.report.style import AFTER, BEFORE, HALF, MARK, QUIET
+from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.records import read_rows
 from calib.units import small
 
@@ -43,7 +43,7 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         layers, "predicted, before anything is moved", along, across, (0.8 * low[0], 1.25 * high[0]),
         (0.7 * low[1], 1.4 * high[1]), log="xy", grid="both",
     )  # fmt: skip
-    return Chart([panel], 2.4, width=HALF)
+    return Chart([panel], 2.4, width=HALF_WIDTH)
 
 
 def from_folder(folder: Path) -> dict[str, Picture]:
@@ -112,7 +112,7 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     title = f"{int((size > MIN_SHIFT).sum())} of these {len(rows)} geometric errors matter"
     limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))
     panel = Panel(layers, title, "shift [σ of torque noise]", xlim=limits, ynames=labels)
-    return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF)
+    return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF_WIDTH)
 
 
 def _milli(row: GeometricEffect) -> str:

@@ -31,7 +31,7 @@ from calib.robot.tables import dumps
 
 Say = Callable[[str], None]
 LIMITS = "limits.toml"
-BESIDE = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
+CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
 HEAD = "# What the cell is like, as calib new was told; calib formats limits says what may stand here.\n"
 COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
 
@@ -98,9 +98,9 @@ def _limits(
         return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
     if not told.camera.unknown:
         camera_view(told.camera, chain, "the cell", Path())
-    given = {key: getattr(told.camera, key) for key in BESIDE if key not in told.camera.unknown}
-    tables = {**stated, "camera": {**stated["camera"], **{key: BESIDE[key] for key in given}}}
-    copied = {BESIDE[key]: Path(name) for key, name in given.items()}
+    given = {key: getattr(told.camera, key) for key in CAMERA_FILES if key not in told.camera.unknown}
+    tables = {**stated, "camera": {**stated["camera"], **{key: CAMERA_FILES[key] for key in given}}}
+    copied = {CAMERA_FILES[key]: Path(name) for key, name in given.items()}
     return {LIMITS: f"{HEAD}{dumps(tables)}", **copied}, LIMITS
 
 

@@ -15,7 +15,7 @@ from calib.data.poses.plans import write_poses
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
-from calib.procedure.measuring.camera_view import BLIND
+from calib.procedure.measuring.camera_view import VIEW_UNCHECKED
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.measuring.selection_prediction import write as write_prediction
@@ -41,9 +41,9 @@ def choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[s
         robot_file, wanted.fit, choice, constraints=session.named(wanted.constraints), base=base, tip=tip,
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
-    said = any(words.startswith(BLIND) for words in chosen.unchecked)
+    said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
     if instrument.measures == Pixels.kind and not chosen.by_images and not said:
-        chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{BLIND} ({HOW})"))
+        chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{VIEW_UNCHECKED} ({HOW})"))
     found, q = chosen.selection, chosen.selection.joints
     if found.interrupted:  # a session is resumed, not gone on with half a search
         raise KeyboardInterrupt

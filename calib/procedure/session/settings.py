@@ -50,7 +50,7 @@ from calib.procedure.session.answers import Torques
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
 NOTHING = "nothing"  # is measured: the geometry is taken as it is described
-MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
+MAX_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
 COLUMN, WIDTH = 41, 118  # where comments begin and end
 _HEAD = (
@@ -198,10 +198,10 @@ class DynamicsSection:
     )
 
     def __post_init__(self) -> None:
-        if self.repeats > MOST_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
+        if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
                 f"period {self.period:g} s at rate {self.rate:g} Hz, {self.repeats} times: more than "
-                f"{MOST_SAMPLES:.0e} samples"
+                f"{MAX_SAMPLES:.0e} samples"
             )
 
 

@@ -18,7 +18,7 @@ from calib.transforms import orthonormal, pose
 
 STEPS = 12  # of Gauss–Newton
 SETTLED = 1e-9  # relative change of the cost after which no image needs another
-FEWEST = 6
+MIN_CORNERS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
 def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:
     seen = np.flatnonzero(~np.isnan(sight[:, 0]))
     ray = sight[seen]
-    if len(seen) < FEWEST:
+    if len(seen) < MIN_CORNERS:
         return pose(None, [0.0, 0.0, 1.0])
     middle, size = table[seen, :2].mean(axis=0), table[seen, :2].std() + 1e-9
     flat = np.column_stack([(table[seen, :2] - middle) / size, np.ones(len(seen))])
@@ -109,7 +109,7 @@ def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray)
             break
     count = seen.sum(axis=1)
     rms = np.sqrt(cost / np.maximum(2.0 * count - 6.0, 1.0))
-    return BoardPoses(poses, np.where(count >= FEWEST, rms, np.nan), information)
+    return BoardPoses(poses, np.where(count >= MIN_CORNERS, rms, np.nan), information)
 
 
 def _normal(

@@ -19,7 +19,7 @@ from calib.rooms.camera.image_folders import find_corners, joint_table, problem_
 
 Show = Callable[[str], None]
 USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
-SMALLEST = 1.0  # side of a square [mm]
+MIN_SQUARE = 1.0  # side of a square [mm]
 
 
 def make(
@@ -39,19 +39,19 @@ def make(
         UsageError: for a board that cannot be, or does not fit onto its paper, and for another that is there already.
     """
     from calib.rooms.camera import board_print
-    from calib.rooms.camera.detection import FEWEST
+    from calib.rooms.camera.detection import MIN_CORNERS
 
     require(kind in KINDS, f"--kind {kind}: expected one of {', '.join(KINDS)}", UsageError)
     if paper is not None and paper.lower() not in board_print.PAPERS:
         raise UsageError(f"--paper {paper}: expected one of {', '.join(board_print.PAPERS)}")
-    if square < SMALLEST:
+    if square < MIN_SQUARE:
         raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
     usual, share, across = USUAL[kind]
     with refused_as(UsageError, ValueError, "this board cannot be: {}"):
         side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
         made = Board(kind, columns or across, rows, side, between, words or usual).checked()
-        if (count := len(boards.corners(made))) < FEWEST:
-            raise UsageError(f"a {made.words} has {count} corners; an image counts from {FEWEST} on: more squares")
+        if (count := len(boards.corners(made))) < MIN_CORNERS:
+            raise UsageError(f"a {made.words} has {count} corners; an image counts from {MIN_CORNERS} on: more squares")
         size = board_print.page_size(made, (paper or "").lower())
     there = out / boards.FILE
     if not overwrite and there.exists() and not _as_printed(out):

@@ -24,8 +24,8 @@ from calib.rooms.camera.images import quiet, read_image
 LOOKED_INTO = 3  # useless images that are looked into for the reason, unless it is found
 
 COARSE = 1.5e6  # pixels of the image that markers are sought in (our choice, as the next ones)
-FEWEST = 8  # corners that make an image useful
-MANY = 4  # markers that tell a dictionary
+MIN_CORNERS = 8  # corners that make an image useful
+MIN_MARKERS = 4  # markers that tell a dictionary
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}  # of a corner's sigma [px]; tags' wander with blur
 BLURRED = 7.0  # width of an edge from which on an image is refused [px]
 MOVED = 1.8  # ratio of the widths of edges across and along from which on blur is motion
@@ -45,15 +45,15 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
     coarse = image if factor == 1.0 else cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     scale = np.array(image.shape[::-1]) / np.array(coarse.shape[::-1])
     ids, found = _coarse(coarse, board)
-    if len(ids) < FEWEST and factor < 1.0:
+    if len(ids) < MIN_CORNERS and factor < 1.0:
         ids, found, scale = *_coarse(image, board), np.ones(2)
     found = (found + 0.5) * scale - 0.5
     none = Detection(np.full((len(table), 2), np.nan), np.full(len(table), np.nan))
-    if len(ids) < min(FEWEST, len(table)):
+    if len(ids) < min(MIN_CORNERS, len(table)):
         return replace(none, problem=_absent(image, coarse, board, len(ids), thorough))
     ids, found, spacing = _consistent(ids, found, table, board)
     ids, found = _refined(image, board, ids, found, spacing)
-    if len(ids) < min(FEWEST, len(table)):
+    if len(ids) < min(MIN_CORNERS, len(table)):
         return replace(none, problem=f"only {len(ids)} of {len(table)} corners are sharp enough: blurred, or too small")
     sigma, edge, motion = _quality(image, found, FLOOR[board.kind], spacing)
     pixel, sigmas = none.pixel.copy(), none.sigma.copy()
@@ -169,16 +169,16 @@ def _widths(across: np.ndarray, down: np.ndarray, contrast: float) -> tuple[floa
 def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, thorough: bool) -> str:
     """Return why no board was found."""
     if count:
-        return f"only {count} corners of the board are seen ({FEWEST} are needed): move it into view"
+        return f"only {count} corners of the board are seen ({MIN_CORNERS} are needed): move it into view"
     if np.percentile(image[::5, ::5], 99) < 30:
         return "too dark: hardly anything is brighter than 30 of 255; expose longer"
     if np.mean(image[::5, ::5] > 252) > 0.25:
         return "over-exposed: a quarter of the image is white or more; expose shorter"
     if thorough:
-        if len(_coarse(np.ascontiguousarray(coarse[:, ::-1]), board)[0]) >= FEWEST:
+        if len(_coarse(np.ascontiguousarray(coarse[:, ::-1]), board)[0]) >= MIN_CORNERS:
             return "the board is seen mirrored: is the image flipped, or seen in a mirror? Save it unflipped"
         if board.kind != "chessboard":
-            if (seen := _markers(coarse, board.dictionary)) >= MANY:
+            if (seen := _markers(coarse, board.dictionary)) >= MIN_MARKERS:
                 return (
                     f"{seen} markers of {board.dictionary} are seen, but not where board.toml has them: are kind, "
                     "columns and rows (squares, not inner corners) those of the print?"
@@ -197,7 +197,7 @@ def _other_dictionary(image: np.ndarray, board: Board) -> str:
     others = [each for each in DICTIONARIES if each.endswith("_100") or each.startswith("apriltag_36h11")]
     counts = {each: _markers(image, each) for each in others if each.split("_")[0] != own}
     best = max(counts, key=lambda each: counts[each])
-    return best if counts[best] >= MANY else ""
+    return best if counts[best] >= MIN_MARKERS else ""
 
 
 def _markers(image: np.ndarray, name: str) -> int:

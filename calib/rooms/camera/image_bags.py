@@ -1,7 +1,8 @@
 """Images of a board from ROS 1 and 2 bags and MCAP: sensor_msgs/Image and CompressedImage beside JointState.
 
 Every image takes the joint values at its own stamp, between the joint states before and after it. An image during which
-a joint moved faster than `STILL` is left out: its joint values are not those of its exposure. Of images taken at one
+a joint moved faster than `MAX_JOINT_SPEED` is left out: its joint values are not those of its exposure. Of images
+taken at one
 stop of the arm the first `SAME` are kept. What is kept is written as a folder (``calib images BAG --board board.toml
 --out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
 """
@@ -26,7 +27,7 @@ from calib.rooms.camera.detection import detected
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 JOINT = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
-STILL = 2e-3  # of a joint about an image [rad/s or m/s]; this and the next two: our choice
+MAX_JOINT_SPEED = 2e-3  # of a joint about an image [rad/s or m/s]; this and the next two: our choice
 Say = Callable[[int, str], None]
 APART = 1e-3  # joints of one stop differ by less [rad or m]
 SAME = 3  # images of one stop that are kept
@@ -170,11 +171,13 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
     own = q[before] * (1.0 - share) + q[after] * share
     near = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < LATE * 1e9
     speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
-    still = speed < STILL
+    still = speed < MAX_JOINT_SPEED
     if not near.all():
         notes.append(f"{int((~near).sum())} images have no joint state within {LATE:g} s (do the clocks agree?)")
     if moving := int((near & ~still).sum()):
-        notes.append(f"{moving} images were taken while the arm moved (faster than {1e3 * STILL:g} mrad/s): left out")
+        notes.append(
+            f"{moving} images were taken while the arm moved (faster than {1e3 * MAX_JOINT_SPEED:g} mrad/s): left out"
+        )
     kept, stop = [], 0
     for k in np.flatnonzero(near & still):
         stop = stop + 1 if kept and np.abs(own[k] - own[kept[-1]]).max() < APART else 1

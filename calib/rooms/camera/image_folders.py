@@ -39,7 +39,7 @@ from calib.rooms.camera import corner_file
 from calib.rooms.camera.corner_file import Found
 from calib.words import counted, listing
 
-LEAST = 3  # usable images below which a folder is refused
+MIN_IMAGES = 3  # usable images below which a folder is refused
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]
@@ -148,11 +148,11 @@ def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray,
     if extra := sorted(set(found.images) - set(names)):
         notes.append(f"{len(extra)} images have no row in {JOINTS}: {listing(extra, 5)}")
     notes += problem_words(problems)
-    if len(rows) < LEAST:
+    if len(rows) < MIN_IMAGES:
         why = "; ".join(notes) or "there are no more rows"
         raise MeasurementError(
             f"{counted(len(rows), 'usable image')}: a calibration takes some 20 to 40 from all "
-            f"around, {LEAST} at the very least ({why})",
+            f"around, {MIN_IMAGES} at the very least ({why})",
             path,
         )
     return rows, notes

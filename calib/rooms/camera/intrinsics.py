@@ -18,15 +18,15 @@ from calib.errors import CalibError, refuse_data
 from calib.rooms.camera.board_pose import board_poses
 from calib.words import counted
 
-MOST = 30  # images that a first lens is found from (our choice)
-FEWEST = 4
+MAX_IMAGES = 30  # images that a first lens is found from (our choice)
+MIN_IMAGES = 4
 STARTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5, 2.2, 3.2)  # focal lengths tried first, in widths of the image (our choice)
 TRIED = 8  # images that they are tried on (our choice)
 FITTED = 8  # of a lens's values: focal lengths, principal point, four of distortion
 STEPS = 60
 BENT = 0.5  # reprojection error from which on the other model is tried [px], and share of it that makes it the better
 WRONG = 50.0  # reprojection error of no lens [px]
-LOOSE = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
+MAX_FOCAL_SIGMA = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +60,13 @@ def estimate_lens(
         MeasurementError: too few images, or all from one direction, so that the focal length cannot be told.
     """
     good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
-    if len(good) < FEWEST:
+    if len(good) < MIN_IMAGES:
         refuse_data(
             file,
-            f"{counted(len(good), 'image')} with a board: a lens takes {FEWEST} at least, tilted "
+            f"{counted(len(good), 'image')} with a board: a lens takes {MIN_IMAGES} at least, tilted "
             "differently, and a good one 15; take more, or give the lens (camera.yaml)",
         )
-    good = good[np.unique(np.linspace(0, len(good) - 1, MOST).astype(int))]
+    good = good[np.unique(np.linspace(0, len(good) - 1, MAX_IMAGES).astype(int))]
     own = pixel[good]
     found, rms, matrix = _fitted(board, own, size, model)
     if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:
@@ -82,7 +82,7 @@ def estimate_lens(
             "one camera, at one focus, of this board?",
         )
     loose = _focal_sigma(found, matrix, rms)
-    if not loose < LOOSE:
+    if not loose < MAX_FOCAL_SIGMA:
         told = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
         refuse_data(
             file,

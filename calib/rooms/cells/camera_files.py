@@ -22,7 +22,7 @@ from calib.rooms.cells.cell import Cell
 from calib.transforms import invert, pose, to_xyz_rpy
 
 LENS = Lens("pinhole", np.array([1250.0, 1252.0, 640.0, 508.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (1280, 1024))
-ROUGH = 2  # digits to which places are told [m, rad]
+DIGITS = 2  # digits to which places are told [m, rad]
 LIMITS = """[camera]
 mounting = "in hand"
 lens = "camera.yaml"
@@ -45,7 +45,7 @@ def limits_of(found: CameraCell) -> Iterator[Path]:
     truth, folder = found.cell.truth, Path(tempfile.mkdtemp(prefix="calib-demo-"))
     middle = pose(None, 0.5 * np.array([*found.board.extent, 0.0]))
     places = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
-    told = {name: [np.round(part, ROUGH).tolist() for part in to_xyz_rpy(place)] for name, place in places.items()}
+    told = {name: [np.round(part, DIGITS).tolist() for part in to_xyz_rpy(place)] for name, place in places.items()}
     try:
         write_lens(found.lens, folder / "camera.yaml")
         write_board(found.board, folder / "board.toml")

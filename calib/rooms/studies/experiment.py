@@ -3,7 +3,7 @@
 The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40) or 140 Hz (RV-2SQ); the encoders'
 noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows decimated, as
 `calib identify` does it. What is believed of the robot may differ from what it is (`Condition.mismatch`). All data sets
-of a condition share the motion: the best by condition number of `DRAWN` random Fourier series within the limits
+of a condition share the motion: the best by condition number of `MOTION_TRIES` random Fourier series within the limits
 (self-collisions are not looked at).
 """
 
@@ -44,7 +44,7 @@ from calib.simulation.loop.references import Reference, random_fourier
 from calib.simulation.loop.tracking import feed_forward
 
 # our choices
-DRAWN, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
+MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
 REACH, SPEED, ACCELERATION = 0.9, 0.8, 40.0  # shares of the limits; largest in any joint [rad/s²]
 THIN = 50  # of the control rate: instants at which a motion's condition and the validation torques are taken
 GEOMETRY = 3.0  # times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated
@@ -117,7 +117,7 @@ def set_up(robot: str, duration: float) -> Setup:
         matrix = matrix.reshape(-1, len(kept))
         return float(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)))
 
-    training = min((draw(number) for number in range(DRAWN)), key=condition)
+    training = min((draw(number) for number in range(MOTION_TRIES)), key=condition)
     return Setup(chain, plant, training, draw(10_000), every)
 
 

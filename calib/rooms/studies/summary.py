@@ -6,8 +6,8 @@ data set go together and their distributions have long tails.
 
 The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
 motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set, are as good
-as the best; a method of fewer than `LEAST` runs is listed and takes no part. Of these one is taken that is cheap: no
-more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
+as the best; a method of fewer than `MIN_DATA_SETS` runs is listed and takes no part. Of these one is taken that is
+cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calib.rooms.studies.conditions import Condition, Study
 from calib.rooms.studies.trial import TrialRow
 
 RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0  # our choices
-LEAST = 6  # common data sets below which the sign test cannot tell at 5 %
+MIN_DATA_SETS = 6  # common data sets below which the sign test cannot tell at 5 %
 FIGURES = (
     "torque_error", "torque_worst", "beta_error", "beta_distance", "beta_sigma", "coverage", "survey_tau", "survey_q",
     "iterations", "simulations", "cpu", "seconds",
@@ -67,7 +67,7 @@ class MethodSummary:
     @property
     def enough(self) -> bool:
         """Whether there are runs enough to tell it from others."""
-        return self.trials >= LEAST
+        return self.trials >= MIN_DATA_SETS
 
     @property
     def estimates(self) -> bool:
@@ -102,8 +102,8 @@ class ConditionSummary:
         if self.chosen or not self.methods:
             return ""
         if not any(one.enough for one in self.methods):
-            return f"fewer than {LEAST} runs of any method tell nothing apart: --runs {LEAST} or more"
-        return f"no method of {LEAST} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
+            return f"fewer than {MIN_DATA_SETS} runs of any method tell nothing apart: --runs {MIN_DATA_SETS} or more"
+        return f"no method of {MIN_DATA_SETS} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
 
 
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
@@ -185,11 +185,11 @@ def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
         one, other: seed → error; seeds in both count, ties do not.
 
     Returns:
-        1 where fewer than `LEAST` data sets tell them apart.
+        1 where fewer than `MIN_DATA_SETS` data sets tell them apart.
     """
     both = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
     larger, smaller = sum(a > b for a, b in both), sum(a < b for a, b in both)
     count, few = larger + smaller, min(larger, smaller)
-    if count < LEAST:
+    if count < MIN_DATA_SETS:
         return 1.0
     return min(1.0, 2.0 * sum(comb(count, k) for k in range(few + 1)) / 2.0**count)

@@ -21,7 +21,7 @@ from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 FOUND = EstimateStatus.FOUND.value
 NOT_RECORDED, FAILED = "not recorded", "failed"  # beside `EstimateStatus`: the true robot, or the method, raised
 STATUSES = (*(one.value for one in EstimateStatus), NOT_RECORDED, FAILED)
-WIDE = 1.959963984540054  # standard deviations that hold 95 %
+NORMAL_95 = 1.959963984540054  # standard deviations that hold 95 %
 NAN = float("nan")
 _CHANGED = " method "
 
@@ -150,7 +150,7 @@ def _merit(data: Experiment, found: MethodEstimate, values: np.ndarray) -> dict[
         "beta_error": _percent(error, truth),
         "beta_distance": float(200.0 * np.mean(np.abs(error) / np.maximum(np.abs(values) + np.abs(truth), 1e-300))),
         "beta_sigma": float(np.sqrt(np.mean(away**2))),
-        "coverage": float(100.0 * np.mean(away < WIDE)) if stated else NAN,
+        "coverage": float(100.0 * np.mean(away < NORMAL_95)) if stated else NAN,
         "torque_error": _percent(wrong, data.torque),
         "torque_worst": float(max(_percent(own, true) for own, true in zip(wrong.T, data.torque.T))),
         "survey_tau": _survey_tau(data, values),

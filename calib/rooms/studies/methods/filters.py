@@ -8,7 +8,8 @@ so no controller is asked for. What the survey tunes by hand, the data tell, or 
 * noise of q: the level of each log's spectrum, the filtered log thinned to `FASTER` times its cut-off;
 * process noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹;
 * parameters have none: they are constants, and a filter that knows its other noise needs none to converge;
-* they start where `calib.rooms.studies.methods.believed` says, as uncertain as `WIDE` standard deviations of least
+* they start where `calib.rooms.studies.methods.believed` says, as uncertain as `START_SIGMAS` standard deviations of
+least
   squares, or as far from it as they are: that is next to nothing beside what a pass tells.
 
 Where innovations are larger than the filter says, the covariance is widened by their mean square.
@@ -34,9 +35,9 @@ from calib.rooms.studies.methods.tangents import Stepper, stepper
 from calib.simulation.loop.closed_loop import forward_dynamics
 
 FASTER = 4.0  # times the positions' cut-off: rate of the filter, at least
-WIDE = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
+START_SIGMAS = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
 NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider ones are no robots
-LONGEST = 2.5e-3  # [s] of a step of the dynamics
+MAX_STEP = 2.5e-3  # [s] of a step of the dynamics
 LOST = 30.0  # times the stated mean square: innovations of a filter that has lost the robot
 
 
@@ -67,7 +68,7 @@ class _KalmanFilter(Method):
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values, sigma = plain.estimate.values, plain.estimate.sigma
         start = start_of(problem, self.name, values, _inertia(problem), lambda x: _moves(robot, problem, x))
-        wide = np.maximum(WIDE * sigma, np.abs(start - values))
+        wide = np.maximum(START_SIGMAS * sigma, np.abs(start - values))
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques
         state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
         for case in problem.cases:
@@ -126,7 +127,7 @@ def _steps(case: Case, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     thin = _thin(case)
     q, tau = motion.q[part], low_passed(case.target[part], motion)  # as the positions were: the same band on both sides
     whole = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
-    steps = max(1, int(np.ceil(thin / (motion.rate * LONGEST) - 1e-6)))
+    steps = max(1, int(np.ceil(thin / (motion.rate * MAX_STEP) - 1e-6)))
     place = np.arange(len(q), dtype=float)
     for k in range(thin, len(q), thin):
         ends = np.linspace(k - thin, k, steps + 1)

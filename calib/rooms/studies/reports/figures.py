@@ -9,7 +9,7 @@ import numpy as np
 from calib.procedure.report.charts import Box, Chart, Line, Panel, Words, picture
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, MARK
-from calib.rooms.studies.summary import LEAST, ConditionSummary
+from calib.rooms.studies.summary import MIN_DATA_SETS, ConditionSummary
 from calib.rooms.studies.trial import TrialRow
 
 LINE = 0.21  # height of one method [in]
@@ -23,7 +23,7 @@ def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
         own = [row.torque_error for row in rows if row.method == method.method and np.isfinite(row.torque_error)]
         every += own
         colour = AFTER if method.as_good else BEFORE
-        if len(own) < LEAST:
+        if len(own) < MIN_DATA_SETS:
             layers.append(Line(own, [place] * len(own), "o", colour, size=4.0))
         else:
             layers.append(Box(own, place, colour))
@@ -35,7 +35,8 @@ def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
     panel = Panel(layers, x="torque error [%]", xlim=(low, high), log="x", ynames=names, grid="x")
     words = (
         "Torque error on unseen motion, noise-free: boxes from quartile to quartile with the median, lines to the 5th "
-        f"and 95th percentile, points beyond; fewer than {LEAST} as points. Dark: as good as the best. Trials without "
+        f"and 95th percentile, points beyond; fewer than {MIN_DATA_SETS} as points. Dark: as good as the best. Trials "
+        "without "
         "an estimate stand at the right."
     )
     return picture(Chart([panel], 0.75 + LINE * len(names)), words)

@@ -15,8 +15,8 @@ from calib.rooms.studies.reports import figures
 from calib.rooms.studies.summary import (
     ALIKE,
     FIGURES,
-    LEAST,
     LEVEL,
+    MIN_DATA_SETS,
     RELIABLE,
     SLACK,
     ConditionSummary,
@@ -31,7 +31,7 @@ RULE = (
     f"test, {LEVEL:.0%}), or, in the median data set, larger by at most {SLACK:.0%}.",
     f"Of these one is taken that is cheap, at most {ALIKE:g} times the processor time of the cheapest: the best such.",
     "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
-    f"A method with fewer than {LEAST} runs is listed, and neither the best nor as good: so few tell nothing apart.",
+    f"A method with fewer than {MIN_DATA_SETS} runs is listed, and neither the best nor as good: too few to compare.",
 )
 MEANING = (
     "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
@@ -85,7 +85,7 @@ def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
         lines.append((one.condition.name, *(_median_cell(own.get(name)) for name in names)))
     note = (
         f"Median over trials [%]; a trial without an estimate counts as ∞. * the one to take; (n) of fewer than "
-        f"{LEAST} runs."
+        f"{MIN_DATA_SETS} runs."
     )
     return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=range(1, len(names) + 1))
 
