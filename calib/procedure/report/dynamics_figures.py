@@ -16,7 +16,7 @@ from calib.identification.cases import Case
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import uncertainty_figures
 from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, save_all
-from calib.procedure.report.style import AFTER, BEFORE, HALF, QUIET, WIDE
+from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, PAGE_WIDTH, QUIET
 
 MAX_HALF_PAGE_ROWS = 8  # torque rows whose figures fit half a page
 
@@ -117,11 +117,13 @@ def errors_by_row(fitted: np.ndarray, unseen: np.ndarray, rows: Sequence[str]) -
     ]
     title = f"at most {max(unseen):.3g} % left" if len(rows) else ""
     panel = Panel(bars, x="torque unexplained [%]", ynames=rows, grid="x")
-    return Chart([panel], 0.8 + 0.21 * len(rows), width=WIDE if len(rows) > MAX_HALF_PAGE_ROWS else HALF, title=title)
+    return Chart(
+        [panel], 0.8 + 0.21 * len(rows), width=PAGE_WIDTH if len(rows) > MAX_HALF_PAGE_ROWS else HALF_WIDTH, title=title
+    )
 
 
 def autocorrelations(
-    found: Sequence[Whiteness | None], rows: Sequence[str], title: str = "", width: float = WIDE
+    found: Sequence[Whiteness | None], rows: Sequence[str], title: str = "", width: float = PAGE_WIDTH
 ) -> Chart:
     """Return the autocorrelation of every row's residual, with the bounds of white noise.
 
@@ -132,7 +134,7 @@ def autocorrelations(
         width: of the figure [in].
     """
     shown = [(row, white) for row, white in zip(rows, found) if white is not None and len(white.acf)]
-    columns = min(7 if len(shown) > MAX_HALF_PAGE_ROWS else 4 if width > HALF else 3, max(1, len(shown)))
+    columns = min(7 if len(shown) > MAX_HALF_PAGE_ROWS else 4 if width > HALF_WIDTH else 3, max(1, len(shown)))
     panels = []
     for k, (row, white) in enumerate(shown):
         inner = k + columns < len(shown)

@@ -12,7 +12,7 @@ from calib.procedure.report import geometry_figures
 from calib.procedure.report.charts import Chart, picture
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.page import Picture, Pictures
-from calib.procedure.report.style import HALF, WIDE
+from calib.procedure.report.style import HALF_WIDTH, PAGE_WIDTH
 from calib.records import read_json
 
 if TYPE_CHECKING:  # the figures of a fit are drawn without loading the dynamics' modules
@@ -114,7 +114,7 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     own = next(iter(unseen.fit.values()))
     sides = [np.nan_to_num(one.raw.joints) for one in (own, proof)]
     name, looked = next(iter((unseen.validation or unseen.fit).items()))
-    width = WIDE if len(unseen.rows) > dynamics_figures.MAX_HALF_PAGE_ROWS else HALF
+    width = PAGE_WIDTH if len(unseen.rows) > dynamics_figures.MAX_HALF_PAGE_ROWS else HALF_WIDTH
     bars = dynamics_figures.errors_by_row(sides[0], sides[1], unseen.rows)
     drawn = dynamics_figures.autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
     shares = f"Share of each torque that the model leaves, on the training motion and on {where}."

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.plans import NEAR
+from calib.data.poses.plans import MAX_JOINT_DIFFERENCE
 from calib.data.recordings.recording import Recording
 from calib.errors import MeasurementError
 from calib.geometry.checks.drift import Drift, drift_between, drift_within, noise_of_difference
@@ -31,7 +31,7 @@ MAX_TORQUE_RATIO = 10.0  # a factor between measured and nominal torques that no
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[str]:
     """Say how far the joints read back are from those commanded (m, n) [rad or m]."""
     distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
-    close = distance <= NEAR
+    close = distance <= MAX_JOINT_DIFFERENCE
     if not close.any():
         return []
     off = np.abs(measured.q[close] - plan[index[close]])
