@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.dynamics.shapes import CODES, SHAPES, V0, Joined, Shape
+from calib.dynamics.shapes import SHAPES, STEPS, V0, Joined, JointRange, Shape
 from calib.errors import CalibError, one_of, require
 
 Motion = tuple[tuple[int, float], ...]
@@ -106,7 +106,7 @@ class DriveTerm:
         acts, out = np.zeros((1, 8)), np.empty((rows, len(seen.v)))
         acts[0, 1 : 1 + len(self.settings)] = self.settings
         x, v, state = map(np.ascontiguousarray, (seen.x, seen.v, seen.v if seen.state is None else seen.state))
-        shape_kernels.fill(CODES[self.shape], acts, x, v, state, out)
+        shape_kernels.fill(getattr(shape_kernels, self.shape.upper()), acts, x, v, state, out)
         return out
 
 
@@ -242,37 +242,11 @@ def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], 
     return Joined(x, v, a, load, state)  # type: ignore[arg-type]
 
 
-def stribeck(joint: int, vs: float, exponent: float = 1.0, v0: float = V0) -> tuple[DriveTerm, ...]:
-    """Return ``Fs``: tau += Fs sign(v) exp(-(abs(v) / vs)^exponent) (Stribeck; exponents 1 and 2 are in use)."""
-    return (term(f"Fs{joint + 1}", "stribeck", joint, vs, exponent, v0),)
-
-
-def load_dependent(joint: int, v0: float = V0, viscous: bool = False, edge: float = math.inf) -> tuple[DriveTerm, ...]:
-    """Return ``Ft`` (and ``Fvt``): tau += Ft abs(load) sign(v) + Fvt abs(load) v.
-
-    The load is the torque the gear transmits (Hamon, Gautier, Garrec 2010); measured or predicted, the caller's choice.
-    """
-    first = term(f"Ft{joint + 1}", "load", joint, v0)
-    return (first, term(f"Fvt{joint + 1}", "load_velocity", joint, edge)) if viscous else (first,)
-
-
-def presliding(joint: int, widths: Sequence[float], v0: float = V0) -> tuple[DriveTerm, ...]:
-    """Return ``Fp3.1 Fp3.2 …``: friction at rest that depends on the past, one stop operator z per width [rad or m].
-
-    tau += Fp (z - sign(v)): z is sign(v) in steady sliding, so that Fc stays the Coulomb friction of steady sliding
-    (our choice; columns z would span the same torques, and share Fc out among themselves).
-    """
-    return tuple(term(f"Fp{joint + 1}.{k + 1}", "presliding", joint, width, v0) for k, width in enumerate(widths))
-
-
-def cable(joint: int, travel: float) -> tuple[DriveTerm, ...]:
-    """Return ``Cs3.1 Cc3.1 …``: a torque that depends on the position, as of cables and hoses, on the link's side.
-
-    The lowest sines and cosines of a period of twice the travel [rad or m]: a smooth function on it.
-    """
-    max_order = 3  # half turns over a joint's travel: smooth, and no more (our choice)
-    return tuple(
-        term(f"{name}{joint + 1}.{k}", shape, joint, k * math.pi / travel, math.inf, side="link")
-        for k in range(1, max_order + 1)
-        for name, shape in (("Cs", "sine"), ("Cc", "cosine"))
-    )
+def offered(step: str, joint: int, seen: JointRange, linear: bool = False) -> tuple[DriveTerm, ...]:
+    """Return the terms of one joint that a step of the friction ladder offers, by what the joint did."""
+    found = [
+        (number, term(f"{one.label}{joint + 1}{end}", one.shape, joint, *settings, side=one.side, linear=linear))
+        for one in STEPS[step]
+        for number, (end, settings) in enumerate(one.settings(seen).items())
+    ]
+    return tuple(one for _, one in sorted(found, key=lambda pair: pair[0]))

@@ -1,7 +1,7 @@
 """Compiled shapes of friction and other drive torques (numba): one formula, with slopes, for arrays and simulations.
 
 A shape's settings stand in one row of `acts`, from column 1 on, in the order of `calib.dynamics.shapes.SHAPES`; the
-other columns are the simulator's. Codes are places in `SHAPES`.
+other columns are the simulator's. The code of a shape is the constant of its name.
 """
 
 from __future__ import annotations

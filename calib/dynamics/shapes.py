@@ -2,7 +2,8 @@
 
 A shape sees x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints, where a gear couples them), the
 torque the joint transmits, and its settings; it says by how much the torque changes per unit of its parameter. To add
-one: a row here, at the end, and its formula there; arrays, simulator, tangents and option files follow from both.
+one: a row here (and in `STEPS`, if the ladder of friction is to try it), and its formula with a code there; arrays,
+simulator, tangents and option files follow from both.
 
 The Coulomb sign is smoothed as s(v) = tanh(v / v0) (v0 = 0: the exact sign; BIRDy's choice is v0 = 0.01 rad/s). It is
 a dead-zone sign where the shape is called ``dead``: 0 where abs(v) <= v0.
@@ -13,7 +14,10 @@ where it is not given): beyond it, friction goes on linearly.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +33,22 @@ class Joined:
     a: np.ndarray
     load: np.ndarray | None = None
     state: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class JointRange:
+    """What a joint did while it was recorded, by which its terms are scaled.
+
+    Attributes:
+        v0: smoothing of its Coulomb sign [rad/s or m/s].
+        peak, edge: speed that it hardly passes, and fastest speed [rad/s or m/s].
+        travel: from end to end [rad or m].
+    """
+
+    v0: float
+    peak: float
+    edge: float
+    travel: float
 
 
 @dataclass(frozen=True)
@@ -82,4 +102,41 @@ SHAPES: dict[str, Shape] = {
     "sine_band": Shape("N m", "N", BAND, slopes=False),
     "cosine_band": Shape("N m", "N", BAND, slopes=False),
 }
-CODES = {name: code for code, name in enumerate(SHAPES)}  # as in `calib.dynamics.shape_kernels`
+
+
+class Offer(NamedTuple):
+    """What a step of the friction ladder offers a joint: parameters ``label + joint + end``, settings by their end."""
+
+    label: str
+    shape: str
+    settings: Callable[[JointRange], Mapping[str, tuple[float, ...]]]
+    side: str = "motor"
+
+
+def _presliding(seen: JointRange) -> dict[str, tuple[float, ...]]:
+    """Offer stop operators of several widths: z - sign(v) each, so that Fc stays the friction of steady sliding."""
+    shares = (0.0005, 0.002, 0.008, 0.03)  # of the joint's travel (our choice)
+    return {f".{k}": (share * seen.travel, seen.v0) for k, share in enumerate(shares, 1)}
+
+
+def _cable(seen: JointRange) -> dict[str, tuple[float, ...]]:
+    """Offer the lowest waves of a period of twice the travel, as of cables and hoses: a smooth function on it."""
+    return {f".{k}": (k * math.pi / seen.travel, math.inf) for k in (1, 2, 3)}  # no more (our choice)
+
+
+def _stribeck(seen: JointRange) -> dict[str, tuple[float, ...]]:
+    return {"": (0.05 * seen.peak, 1.0, seen.v0), ".2": (0.2 * seen.peak, 1.0, seen.v0)}
+
+
+STEPS: dict[str, tuple[Offer, ...]] = {  # in the order of the ladder
+    "load": (
+        Offer("Ft", "load", lambda seen: {"": (seen.v0,)}),
+        Offer("Fvt", "load_velocity", lambda seen: {"": (seen.edge,)}),
+    ),
+    "presliding": (Offer("Fp", "presliding", _presliding),),
+    "cable": (Offer("Cs", "sine", _cable, "link"), Offer("Cc", "cosine", _cable, "link")),
+    "stribeck": (Offer("Fs", "stribeck", _stribeck),),
+    "asymmetric": (Offer("Fva", "speed", lambda seen: {"": (seen.edge,)}),),
+    "root": (Offer("Fvr", "root", lambda seen: {"": (seen.edge, seen.v0)}),),
+    "cubic": (Offer("Fvc", "cubic", lambda seen: {"": (seen.edge,)}),),
+}

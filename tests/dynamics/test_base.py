@@ -12,6 +12,7 @@ from calib.dynamics import base, drives, rigid_body
 from calib.dynamics import drives as friction
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel, from_chain
+from calib.dynamics.shapes import JointRange
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR
 from calib.errors import CalibError
 from calib.robot.load import load
@@ -256,7 +257,11 @@ def test_counts_do_not_depend_on_the_frames():
 
 def test_richer_friction_has_columns_of_its_own():
     chain = load("ur5")
-    rich = (friction.term("Fva2", "speed", 1), *friction.load_dependent(1), *friction.presliding(1, [0.01, 0.05]))
+    rich = (
+        friction.term("Fva2", "speed", 1),
+        friction.term("Ft2", "load", 1, 0.01),
+        *friction.offered("presliding", 1, JointRange(0.01, 1.0, 1.0, 2.0))[:2],
+    )
     plain = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * 6))
     full = IdentificationModel(bodies_of(chain), plain.terms + rich)
     assert base.find(full).b == base.find(plain).b + 4

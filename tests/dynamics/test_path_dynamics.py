@@ -72,7 +72,7 @@ def test_the_torque_along_a_path_is_the_full_inverse_dynamics():
 def test_richer_friction_depends_on_load_and_past_as_far_as_a_path_can_tell():
     chain = load("lwr4plus")
     model, values = driven(chain)
-    model = model.with_terms(*drives.load_dependent(1), *drives.presliding(3, [1e-3]))
+    model = model.with_terms(drives.term("Ft2", "load", 1, 0.01), drives.term("Fp4.1", "presliding", 3, 1e-3, 0.01))
     q, v, a = arms.states(7, 5)
     plain, rich = of_standard(*driven(chain)), of_standard(model, np.append(values, [0.1, 2.0]))
     extra = rich.torque(q, v, a) - plain.torque(q, v, a)

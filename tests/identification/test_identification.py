@@ -52,8 +52,8 @@ def test_nothing_is_added_to_a_plain_robot():
 @pytest.mark.parametrize(
     ("name", "terms", "size"),
     [
-        ("load", friction.load_dependent(1), 0.1),
-        pytest.param("presliding", friction.presliding(1, [0.02]), 2.0, marks=pytest.mark.slow),
+        ("load", (friction.term("Ft2", "load", 1, 0.01),), 0.1),
+        pytest.param("presliding", (friction.term("Fp2.1", "presliding", 1, 0.02, 0.01),), 2.0, marks=pytest.mark.slow),
         pytest.param("asymmetric", (friction.term("Fva2", "speed", 1),), 0.5, marks=pytest.mark.slow),
     ],
 )

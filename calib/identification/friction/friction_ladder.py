@@ -24,6 +24,7 @@ import numpy as np
 from calib.data.signals.decimation import Decimator, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
+from calib.dynamics.shapes import STEPS, JointRange
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of
 from calib.identification.cases import Case
@@ -33,35 +34,12 @@ from calib.identification.rows import ObservationRows, observe_terms, triangulat
 from calib.records import Number, stored
 
 MIN_GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
-WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 MIN_BLOCKS_WON = 0.6  # and on this share of the blocks
 COUPLING_ROWS = 3000  # of the rows that couplings are sought in, about
 MIN_SIGMA = 1e-9  # σ of a term below which its ridge holds it at zero
 MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
 
 
-@dataclass(frozen=True)
-class _JointRange:
-    """What a joint did: smoothing of its sign, speed that it hardly passes, fastest speed [rad/s], travel [rad]."""
-
-    v0: float
-    peak: float
-    edge: float
-    travel: float
-
-
-STEPS: dict[str, Callable[[int, _JointRange], Sequence[DriveTerm]]] = {
-    "load": lambda j, seen: drives.load_dependent(j, seen.v0, viscous=True, edge=seen.edge),
-    "presliding": lambda j, seen: drives.presliding(j, [seen.travel * x for x in WIDTHS], seen.v0),
-    "cable": lambda j, seen: drives.cable(j, seen.travel),
-    "stribeck": lambda j, seen: (
-        drives.term(f"Fs{j + 1}", "stribeck", j, 0.05 * seen.peak, 1.0, seen.v0),
-        drives.term(f"Fs{j + 1}.2", "stribeck", j, 0.2 * seen.peak, 1.0, seen.v0),
-    ),
-    "asymmetric": lambda j, seen: (drives.term(f"Fva{j + 1}", "speed", j, seen.edge),),
-    "root": lambda j, seen: (drives.term(f"Fvr{j + 1}", "root", j, seen.edge, seen.v0),),
-    "cubic": lambda j, seen: (drives.term(f"Fvc{j + 1}", "cubic", j, seen.edge),),
-}
 NAMES = ("auto", "standard", "coupling", *STEPS, "ripple")
 
 Progress = Callable[[str], None]
@@ -291,9 +269,9 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
     for j in range(candidates.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
-        seen = _JointRange(float(candidates.v0[j]), float(np.quantile(v, 0.98)), float(v.max()), travel)
+        seen = JointRange(float(candidates.v0[j]), float(np.quantile(v, 0.98)), float(v.max()), travel)
         if seen.peak > 0.0:
-            found += [replace(one, linear=bool(candidates.linear[j])) for one in STEPS[name](j, seen)]
+            found += drives.offered(name, j, seen, bool(candidates.linear[j]))
     return found
 
 

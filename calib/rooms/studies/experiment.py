@@ -166,7 +166,7 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, Ident
         return true, fitted, bases.regroup(base, fitted), plant
     if condition.mismatch == "friction":
         v0 = float(known_robots.truth(condition.robot)["drives"]["v0"])
-        peaks = tuple(drives.stribeck(joint, SLIP, v0=v0)[-1] for joint in range(chain.n))
+        peaks = tuple(drives.term(f"Fs{joint + 1}", "stribeck", joint, SLIP, 1.0, v0) for joint in range(chain.n))
         coulomb = np.array(known_robots.truth(condition.robot)["drives"]["Fc"])
         values = np.concatenate([plant.parameters, STRIBECK * coulomb])
         return Plant(plant.bodies, (*plant.terms, *peaks), values), model, base, plant

@@ -18,7 +18,6 @@ from scipy.linalg import solve_banded
 from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import CODES
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
@@ -266,6 +265,8 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.ndarray, list]:
     """Return linear (n, 2 n + 1) and the acts: row, code, amount, seven settings, weights (n,)."""
+    from calib.dynamics import shape_kernels
+
     linear, acts = np.zeros((n, 2 * n + 1)), []
     for one, value in zip(terms, values, strict=True):
         for row, motion in one.acts:
@@ -277,7 +278,8 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
                 weights[joint] += weight
             if one.shape not in LINEAR:
                 settings = [*one.settings, RAMP * one.settings[0]] if one.shape == "dead" else [*one.settings]
-                acts.append((row, CODES[one.shape], value, [*settings, *[0.0] * (7 - len(settings))], weights))
+                code = getattr(shape_kernels, one.shape.upper())
+                acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
             else:
                 first = 0 if one.shape == "acceleration" else n
                 linear[row, first : first + n] += value * weights

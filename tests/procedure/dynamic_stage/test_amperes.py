@@ -121,7 +121,7 @@ def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
 
 
 def test_a_step_whose_terms_the_final_fit_switched_off_is_not_kept():
-    terms = tuple(drives.stribeck(joint, 0.1)[0] for joint in (0, 1))
+    terms = tuple(drives.term(f"Fs{joint + 1}", "stribeck", joint, 0.1, 1.0, 0.01) for joint in (0, 1))
     step = FrictionTrial("+ stribeck", 12, 5.0, (5.0, 5.0), (1, 2), terms=("Fs1", "Fs2"))
     one = FrictionSelection(terms, (0, 1), (step,)).fitted(np.array([1e-12, 0.02]))
     assert one.off == ("Fs1",) and one.steps[0].kept_at_joints == (2,) and one.chosen == "standard + stribeck"

@@ -97,7 +97,8 @@ def test_gains_may_follow_the_parameters():
 
 def test_what_has_no_tangents_says_so():
     plant, reference = known_robots.plant("tx40"), short()
-    held = Plant(plant.bodies, (*plant.terms, *drives.presliding(0, [0.01])), np.append(plant.parameters, 0.1))
+    past = drives.term("Fp1.1", "presliding", 0, 0.01, 0.01)
+    held = Plant(plant.bodies, (*plant.terms, past), np.append(plant.parameters, 0.1))
     with pytest.raises(CalibError, match=r"Fp1\.1"):
         simulate_tangents(held, known_robots.controller("tx40"), reference, np.array([0]))
 
