@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -11,8 +12,8 @@ from scipy.spatial import KDTree
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plans import MAX_JOINT_DIFFERENCE
 from calib.data.recordings.recording import Recording
-from calib.errors import MeasurementError
-from calib.geometry.checks.drift import Drift, drift_between, drift_within, noise_of_difference
+from calib.errors import Finding, finding, refuse_data
+from calib.geometry.checks.drift import drift_between, drift_within, noise_of_difference
 from calib.identification.checks.recorded_motion import (
     DesignedMotion,
     DifferentMotion,
@@ -21,6 +22,7 @@ from calib.identification.checks.recorded_motion import (
     locate,
     nominal_share,
 )  # fmt: skip
+from calib.procedure.findings import lines_of
 from calib.robot.chain import Chain
 
 MIN_READBACK_DIFFERENCE = 1e-8  # [rad or m] closer to the commanded joints they were not read back
@@ -28,27 +30,23 @@ MIN_TRACKED_SHARE = 0.98  # of the motion, explained by a recorded period; below
 MAX_TORQUE_RATIO = 10.0  # a factor between measured and nominal torques that no wrong mass explains
 
 
-def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[str]:
-    """Say how far the joints read back are from those commanded (m, n) [rad or m]."""
+def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
+    """Return how far the joints read back are from those commanded (m, n) [rad or m]; nothing of other poses."""
     distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
     close = distance <= MAX_JOINT_DIFFERENCE
     if not close.any():
         return []
     off = np.abs(measured.q[close] - plan[index[close]])
     if off.max() < MIN_READBACK_DIFFERENCE:
-        return ["the joint values are the commanded ones to the last digit; log what the encoders read once it stands"]
-    j = int(np.argmax(off.max(axis=0)))
-    rms = 1e3 * float(np.sqrt(np.mean(off**2)))
-    return [
-        f"joints read back are off the commanded ones by {rms:.2g} mrad rms, {1e3 * off[:, j].max():.2g} at most "
-        f"({measured.joint_names[j]})"
-    ]
+        return [finding("readback-copied")]
+    joint = measured.joint_names[int(np.argmax(off.max(axis=0)))]
+    return [finding("readback", rms=np.sqrt(np.mean(off**2)), largest=off.max(), joint=joint)]
 
 
 def drift(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
-) -> list[str]:
-    """Say how far repeated poses differ: between fitted blocks and what was measured again at the end, and within each.
+) -> list[Finding]:
+    """Return how far repeated poses differ: from those measured again at the end, and within each block.
 
     Args:
         chain: the nominal arm.
@@ -56,30 +54,21 @@ def drift(
         again: files whose name starts with drift.
         sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
     """
-    found = [
-        (f"{Path(later.file).name}: measured again at the end", drift_between(chain, blocks, later)) for later in again
-    ]
-    found += [(f"{Path(block.file).name}: measured more than once", drift_within(chain, block)) for block in blocks]
-    return [_drift_words(label, one, sigma) for label, one in found if one is not None]
-
-
-def _drift_words(label: str, found: Drift, sigma: float) -> str:
-    words = f"{label}, {found.poses} poses differ by {1e3 * found.rms:.3g} mm rms"
-    if not sigma:
-        return words
-    noise = f"{1e3 * noise_of_difference(sigma):.2g} mm"
-    if found.exceeds(sigma):
-        return (
-            f"{words}, where noise alone gives {noise}: did base, tool or instrument move? Measure the "
-            "base again, and the poses from where it began"
+    pairs = [(later.file, "again at the end", drift_between(chain, blocks, later)) for later in again]
+    pairs += [(block.file, "more than once", drift_within(chain, block)) for block in blocks]
+    return [
+        finding(
+            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat", file=Path(file).name, when=when,
+            poses=found.poses, rms=found.rms, noise=noise_of_difference(sigma) if sigma else None,
         )
-    return f"{words}, as noise alone would ({noise})"
+        for file, when, found in pairs if found is not None
+    ]  # fmt: skip
 
 
 def check_motion(
     recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], wanted: int
-) -> tuple[LocatedMotion, list[str]]:
-    """Find the designed motion in a recording, and say what is worth a note.
+) -> tuple[LocatedMotion, list[Finding]]:
+    """Find the designed motion in a recording, and return what is worth a note.
 
     Args:
         recording: of n joints.
@@ -92,42 +81,33 @@ def check_motion(
     """
     found = locate(recording, motion)
     if found is None:
-        raise MeasurementError(_other_motion(recording, motion, explain(recording, motion, others)), recording.file)
+        _refuse(recording, _other_motion(recording, motion, explain(recording, motion, others)))
     notes = []
     if found.periods < wanted:
-        notes.append(f"{found.periods} of {wanted} repetitions of the motion were recorded")
+        notes.append(finding("repetitions-missing", periods=found.periods, wanted=wanted))
     if found.likeness < MIN_TRACKED_SHARE:
-        name = recording.joint_names[found.loosest]
-        explained = f"it explains {found.likeness:.1%}"
-        notes.append(f"the robot follows the motion loosely ({explained}), {name} most: that is allowed")
+        joint = recording.joint_names[found.loosest]
+        notes.append(finding("tracking-loose", share=found.likeness, joint=joint))
     return found, notes
 
 
-def _other_motion(recording: Recording, motion: DesignedMotion, found: DifferentMotion | None) -> str:
+def _other_motion(recording: Recording, motion: DesignedMotion, found: DifferentMotion | None) -> Finding:
     """Return what a recording without the designed motion is."""
+    if found is None and recording.duration < motion.period:
+        return finding("motion-short", duration=recording.duration, period=motion.period)
     if found is None:
-        duration = recording.duration
-        if duration < motion.period:
-            return (
-                f"{duration:.1f} s are shorter than one period of the motion ({motion.period:.1f} s): was it stopped?"
-            )
-        return (
-            "this is another motion than the one designed here, in no order of joints, sign, unit or speed that was "
-            "tried; play 6-excitation's, or set plan = false under [dynamics] in session.toml to identify from this one"
-        )
+        return finding("motion-unknown")
     if found.name:
-        return f"this is the {found.name} motion, which belongs into a file of its own"
+        return finding("motion-exchanged", motion=found.name)
     if found.speed != 1.0:
-        return f"the motion is there at {found.speed:g} times its speed: a rehearsal? Record it at full speed"
-    names, causes = recording.joint_names, []
-    if found.unit != 1.0:
-        causes.append(f"its positions are {'deg' if found.unit < 1.0 else 'rad under a header that says deg'}")
-    if moved := [j for j, column in enumerate(found.order) if column != j]:
-        pairs = ", ".join(f"the column of {names[found.order[j]]} holds {names[j]}" for j in moved)
-        causes.append(f"columns are swapped ({pairs})")
-    if turned := [names[j] for j, sign in enumerate(found.sign) if sign < 0]:
-        causes.append(f"the sign is reversed ({', '.join(turned)})")
-    return f"this is the designed motion if {' and '.join(causes)}; correct the header (or the options file)"
+        return finding("motion-rehearsed", speed=found.speed)
+    names, unit = recording.joint_names, "deg" if found.unit < 1.0 else "rad under a header that says deg"
+    moved = [(names[column], names[j]) for j, column in enumerate(found.order) if column != j]
+    return finding(
+        "motion-altered", unit="" if found.unit == 1.0 else unit,
+        swapped=[f"the column of {column} holds {joint}" for column, joint in moved],
+        reversed=[names[j] for j, sign in enumerate(found.sign) if sign < 0],
+    )  # fmt: skip
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:
@@ -142,21 +122,17 @@ def check_torques(recording: Recording, chain: Chain) -> None:
     sure = np.flatnonzero(np.isfinite(share))
     if not len(sure):
         return
-    names = ", ".join(recording.joint_names[j] for j in sure)
-    size = np.abs(share[sure])
+    joints, size = [recording.joint_names[j] for j in sure], np.abs(share[sure])
     if (size > MAX_TORQUE_RATIO).all() or (size < 1 / MAX_TORQUE_RATIO).all():
-        guess = "are they mNm? Say so in the header (tau_… [mNm])"
-        if np.median(size) < 1:
-            guess = "are they currents (i_… [A]), or torques before the gear?"
-        words = f"the torques of {names} are some {np.median(size):.2g} times what the nominal masses ask for"
-        raise MeasurementError(f"{words}: {guess}", recording.file)
-    if (share[sure] < 0).all():
-        words = f"the torques of {names} push the wrong way for the nominal masses: reverse their sign"
-        raise MeasurementError(words, recording.file)
-    if turned := [recording.joint_names[j] for j in sure if share[j] < 0]:
-        named, column = ", ".join(turned), f"column{'s' if len(turned) > 1 else ''}"
-        raise MeasurementError(
-            f"torque of {named} seems to have the wrong sign: it pushes against what the nominal masses ask for, where "
-            f"the other joints' do not; negate the {column} of {named} in the log (or correct the nominal masses)",
-            recording.file,
+        ratio = float(np.median(size))
+        code = "torques-too-small" if ratio < 1 else "torques-too-large"
+        _refuse(recording, finding(code, joints=joints, ratio=ratio))
+    turned = [recording.joint_names[j] for j in sure if share[j] < 0]
+    if turned:
+        _refuse(
+            recording, finding("torques-reversed" if turned == joints else "torque-of-joint-reversed", joints=turned)
         )
+
+
+def _refuse(recording: Recording, found: Finding) -> NoReturn:
+    refuse_data(recording.file, lines_of([found])[0])

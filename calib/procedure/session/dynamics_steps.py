@@ -23,7 +23,7 @@ from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.validation import Assessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
-from calib.procedure.findings import UNJUDGED, Verdict
+from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.procedure.session.geometry_steps import deliver_identified
@@ -135,7 +135,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
         f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
         f"{1e3 * worst:.2g} mrad rms"
     )
-    return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in loose]
+    return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in lines_of(loose)]
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:

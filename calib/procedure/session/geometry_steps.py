@@ -19,7 +19,7 @@ from calib.data.poses.plans import check_against, filled_in, read_poses
 from calib.errors import CalibError, UsageError
 from calib.folders import write_staged
 from calib.geometry.weighing import Settings
-from calib.procedure.findings import UNJUDGED
+from calib.procedure.findings import UNJUDGED, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
@@ -138,7 +138,10 @@ def check_file(
             notes.append(f"{path.name}: no images, which the instrument takes; fitted all the same")
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:
-            notes += [f"{path.name}: {note}" for note in (*check_against(plan, block), *arrival.readback(plan, block))]
+            notes += [
+                f"{path.name}: {note}"
+                for note in (*check_against(plan, block), *lines_of(arrival.readback(plan, block)))
+            ]
     return notes
 
 
@@ -149,7 +152,7 @@ def _drifts(session: Session, chain: Chain) -> list[str]:
         [block for path in paths for block in inputs.read_file(path, chain, options)]
         for paths in (session.brought("measured"), session.brought("drift"))
     )
-    return arrival.drift(chain, first, again, session.settings.instrument.sigma_position)
+    return lines_of(arrival.drift(chain, first, again, session.settings.instrument.sigma_position))
 
 
 def _fit_settings(session: Session) -> FitSettings:

@@ -9,7 +9,7 @@ import pytest
 
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import take
-from calib.errors import MeasurementError, UsageError
+from calib.errors import Finding, MeasurementError, UsageError
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.session import arrival
 from calib.procedure.session.answers import CAMERA, Answers
@@ -26,7 +26,7 @@ CELL = virtual_cell("lwr4plus")
 Q = random_joints(CELL.nominal, 30, 3)
 
 
-def repeated(drift: float, seed: int) -> list[str]:
+def repeated(drift: float, seed: int) -> list[Finding]:
     first = wandering(measure(CELL, Q, seed), drift, seed)
     again = wandering(measure(CELL, Q[:4], seed + 100), drift, seed, begin=1.0)
     return arrival.drift(CELL.nominal, [first], [replace(again, file="drift.csv")], 60e-6)
@@ -34,20 +34,20 @@ def repeated(drift: float, seed: int) -> list[str]:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drift_is_told_from_noise(seed: int) -> None:
-    assert "as noise alone would" in repeated(0.0, seed)[0]
-    assert "did base, tool or instrument move" in repeated(1e-3, seed)[0]
+    assert [repeated(size, seed)[0].code for size in (0.0, 1e-3)] == ["poses-repeat", "poses-moved"]
 
 
 def test_a_pose_measured_twice_in_one_file_counts() -> None:
     found = measure(CELL, np.concatenate([Q, Q[:3]]), 1)
-    assert "measured more than once, 3 poses" in arrival.drift(CELL.nominal, [found], [], 60e-6)[0]
+    (repeats,) = arrival.drift(CELL.nominal, [found], [], 60e-6)
+    assert (repeats.code, repeats.values["poses"], repeats.values["when"]) == ("poses-repeat", 3, "more than once")
     assert arrival.drift(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
 
 
 def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:
     found = measure(CELL, Q, 1)
-    assert "0.0091 mrad rms" in arrival.readback(Q, found)[0]
-    assert "log what the encoders read" in arrival.readback(Q, replace(found, q=Q))[0]
+    assert arrival.readback(Q, found)[0].values["rms"] == pytest.approx(9.1e-6, rel=0.01)
+    assert arrival.readback(Q, replace(found, q=Q))[0].code == "readback-copied"
 
 
 def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:

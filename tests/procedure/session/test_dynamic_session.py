@@ -223,7 +223,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (numbers(slowed), "0.5 times its speed"),
         (numbers(reversed_torques), "reverse their sign"),
         (numbers(reversed_torque_of_joint4), "training.csv: torque of joint4 .* negate the column of joint4"),
-        (numbers(small), "times what the nominal masses ask for"),
+        (numbers(small), "times those of the nominal masses"),
         (numbers(another), "another motion than the one designed"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
