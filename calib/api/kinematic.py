@@ -144,8 +144,8 @@ class GeometryFit(Judged):
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error, all axes together, at any poses.
 
-        Parameters' covariance and what the model leaves, by rows left out: it grows with the distance from the poses
-        that were learnt from. 95 % of errors are within ``outcome.expected.discrepancy.radius`` times that.
+        Parameters' covariance and unmodelled effects, estimated on held-out rows: it grows with the distance from the
+        poses of the fit. 95 % of errors are within ``outcome.expected.discrepancy.radius`` times that.
 
         Args:
             q: (m, n) joint values [rad or m].

@@ -158,7 +158,7 @@ def find(
     """Choose the base columns of a model.
 
     Args:
-        samples: states to compare columns over; default `random_samples`. Recorded motion tells what that motion
+        samples: states to compare columns over; default `random_samples`. Recorded motion says what that motion
             identifies instead of what any motion could.
         loads: the load cases stacked, each as `carried` of the regressor; default with all payloads and without, if
             the model has any.

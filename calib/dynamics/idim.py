@@ -123,7 +123,7 @@ class IdentificationModel:
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray, columns: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · regressor(q, v, a) by q, v and a, each (N, n), exactly; all bodies carried.
+        """Return the slopes of Σ weights · regressor(q, v, a) by q, v and a, each (N, n), exactly; all bodies on board.
 
         Args:
             weights: (N, rows, c).
@@ -148,7 +148,7 @@ class IdentificationModel:
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · regressor(q, v, a) values by q, v and a, each (N, n); all bodies carried.
+        """Return the slopes of Σ weights · regressor(q, v, a) values by q, v and a, each (N, n); all bodies on board.
 
         Args:
             values: (p,) of the parameters.
@@ -263,7 +263,7 @@ class IdentificationModel:
         return States(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
 
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
-        """Zero the columns of fixed bodies that are not carried."""
+        """Zero the columns of fixed bodies that are absent."""
         if carried is None:
             return
         payloads = {label for label, c in zip(self.bodies.labels, self.bodies.coordinates) if c < 0}

@@ -88,7 +88,7 @@ class PathDynamics:
 
 
 def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
-    """Return the path dynamics of a model with standard (or regrouped) parameters (p,), all payloads carried."""
+    """Return the path dynamics of a model with standard (or regrouped) parameters (p,), all payloads on board."""
     values = shaped(values, (model.p,), "parameters of the model")
     _require_torques(model)
     rubbing = _is_friction(model)
@@ -103,7 +103,7 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
     """Return the path dynamics of base parameters (b,): the regressor is the base regressor.
 
     Raises:
-        CalibError: where friction is regrouped with masses or offsets, so that it cannot be told apart.
+        CalibError: where friction is regrouped with masses or offsets, so that they cannot be distinguished.
     """
     values = shaped(values, (model.base.b,), "base parameters")
     _require_torques(model.model)

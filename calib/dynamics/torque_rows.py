@@ -67,7 +67,7 @@ class TorqueRows:
     Attributes:
         name: what options and files call them.
         blocks: one row per joint each.
-        drives: standard drive terms of a joint that such rows tell apart (`calib.dynamics.drives.standard`).
+        drives: standard drive terms of a joint that such rows distinguish (`calib.dynamics.drives.standard`).
         projection: a map of the blocks' rows; None: the blocks themselves.
     """
 

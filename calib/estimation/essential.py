@@ -1,4 +1,4 @@
-"""From base to essential parameters: leave out, one by one, what the data do not tell, and write down each step."""
+"""From base to essential parameters: leave out, one by one, what the data do not identify, and write down each step."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ class Estimate:
         names, units: p strings each.
         values: (p,) in their units.
         covariance: (p, p).
-        residual_std: standard deviation of the whitened residuals (1 where the stated sigmas tell the whole story).
+        residual_std: standard deviation of the whitened residuals (1 where the stated sigmas explain the residuals).
         dof: degrees of freedom, rows minus parameters.
     """
 

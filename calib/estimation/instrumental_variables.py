@@ -194,7 +194,7 @@ def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: 
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
-    """Return what the instruments tell about the columns; all measures from one R factor.
+    """Return how well the instruments identify the columns; all measures from one R factor.
 
     Args:
         problem: triangles of [Z W y].

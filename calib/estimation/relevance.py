@@ -57,7 +57,7 @@ class Relevance:
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """Coordinates z (r,) of the columns x (p,), r ≤ p, in which all that data tell of every group is told.
+    """Coordinates z (r,) of the columns x (p,), r ≤ p, which hold all the information of the data on every group.
 
     Harmonics of a joint that turns by less than a whole turn are linear combinations of fewer of them, to within
     rounding: their evidence costs r³, not p³.
@@ -184,7 +184,7 @@ def _posterior(
     """Return mean and variances of x from WᵀW and Wᵀy.
 
     A diagonal raised by 1e-12, or by as much more as it takes, keeps it regular to rounding: rows that repeat each
-    other leave columns that no two poses tell apart.
+    other leave columns that no two poses distinguish.
     """
     for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
         system = square.copy()

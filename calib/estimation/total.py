@@ -25,7 +25,7 @@ def tls(
     singular value gives the noisy components of [x; -1], back substitution the exact ones (Golub, Hoffman & Stewart
     1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). Covariance (Fuller 1987,
     theorem 2.3.2, normal noise): V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r Σ_uu,
-    Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). With rows that tell less than they are, the share of V
+    Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). With correlated rows, the share of V
     that M's rows W_g bear is taken by what each of them is worth: V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
 
     Args:

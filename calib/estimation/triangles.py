@@ -1,4 +1,4 @@
-"""All that y = W x tells, in triangles: the R factor of [W y] of every group of rows, updated block by block.
+"""All the information of y = W x, in triangles: the R factor of [W y] of every group of rows, updated block by block.
 
 An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. One triangle is kept
 per group (a joint, a load case, a file), so that weights may change afterwards without another pass over the data: the

@@ -116,7 +116,7 @@ def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
 
 
 def inflation(residual: np.ndarray) -> float:
-    """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals tell as much as N / τ white ones.
+    """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals count as N / τ white ones.
 
     The window is the smallest m >= 5 τ(m) (Sokal 1997): longer sums add noise only. At most N / 4.
     """

@@ -52,7 +52,7 @@ MAX_GUESS_ROWS = 300  # rows of a block that a guess is made from (our choice)
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
     """Return the nominal arm, with deflections known from an earlier fit, stations and tools placed by measurements.
 
-    A tool seen in several blocks takes its guess from the block that tells most (poses before positions before the
+    A tool seen in several blocks takes its guess from the block that constrains most (poses before positions before the
     rest, then the one whose poses turn most, then the most rows); a station likewise. Tools that no block can place
     start at the tip.
 

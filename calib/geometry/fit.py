@@ -37,11 +37,12 @@ def fit(
     drawn: bool = False,
     prior: np.ndarray | None = None,
 ) -> GeometricFit:
-    """Fit what can be told of the parameters `candidates`; the others keep their nominal values.
+    """Fit what can be identified of the parameters `candidates`; the others keep their nominal values.
 
     Minimises Σ ‖(y - f(x)) / σ‖². Three passes: columns that are linear combinations of others are set aside; the rest
-    is fitted with a wide prior (`PLAUSIBLE`), which settles the sigmas; then every parameter that the data do not tell
-    better than half of what is plausible goes back to its nominal, and the others are fitted without any prior.
+    is fitted with a wide prior (`PLAUSIBLE`), which settles the sigmas; then every parameter that the data do not
+    identify better than half of what is plausible goes back to its nominal, and the others are fitted without any
+    prior.
 
     Args:
         cell: where to start; frames placed (`calib.geometry.first_guess`).
@@ -49,8 +50,8 @@ def fit(
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
-        drawn: keep all independent parameters, drawn to their nominal as strongly as the data themselves say
-            (`_shrunk_fit`), in place of sending the untold ones back.
+        drawn: keep all independent parameters, regularised towards their nominal as strongly as the data themselves say
+            (`_shrunk_fit`), in place of sending the unidentified ones back.
         prior: standard deviations of the whole parameter vector about its present values, where something is known
             beforehand; infinite elsewhere. Parameters with a prior always take part.
 
@@ -210,10 +211,10 @@ def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
 
 
 def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
-    """Return which of the fitted parameters the data tell (indices): σ below half the plausible deviation.
+    """Return which of the fitted parameters the data identify (indices): σ below half the plausible deviation.
 
-    Backward elimination: the worst told parameter goes back to its nominal, which changes the covariance C of the
-    others to C - c cᵀ / c_k (c its column), until all that remain are told.
+    Backward elimination: the worst identified parameter goes back to its nominal, which changes the covariance C of the
+    others to C - c cᵀ / c_k (c its column), until all that remain are identified.
     """
     _, matrix = _whitened(found)
     factor = np.linalg.qr(matrix, mode="r")
@@ -256,8 +257,8 @@ def placed_on(
 ) -> GeometricFit:
     """Fit base and tool placement of an arm, deflections included, on a block and nothing else.
 
-    Where that does not settle, since the block hardly tells some of it (the turn about a line that is driven), what it
-    tells by less than `min_column` stays where it is. Whether that settled is the solution's status.
+    Where that does not settle, since the block hardly identifies some of it (the turn about a line that is driven),
+    what it identifies by less than `min_column` stays where it is. Whether that settled is the solution's status.
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))

@@ -1,4 +1,4 @@
-"""Which geometric parameters the poses can tell, and what merges with what, in words."""
+"""Which geometric parameters the poses can identify, and what merges with what, in words."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def _reach(cell: Installation) -> float:
 def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
     """Return groups of columns, first choice first: frames, joint offsets, rotations, translations, deflections.
 
-    Frames come first, so that what cannot be told from the installation (the first joint's placement, the last joint's
-    offset) stays with the installation and the arm keeps its nominal there. Rotations before translations make
+    Frames come first, so that what cannot be distinguished from the installation (the first joint's placement, the last
+    joint's offset) stays with the installation and the arm keeps its nominal there. Rotations before translations make
     Hayati's β win over an offset along parallel axes.
     """
     table = layout(cell)

@@ -1,4 +1,4 @@
-"""What a pose would tell of a robot: the callables that pose selection (package `poses`) works with.
+"""What a pose would reveal of a robot: the callables that pose selection (package `poses`) works with.
 
 Both pickle, so that selection can run on several processes.
 """
@@ -33,7 +33,7 @@ class Observation:
     Attributes:
         cell: the nominal arm, its base at the instrument's origin, with its targets; rigid.
         full: whether orientations are seen, too: six rows per target, not three.
-        free: (p,) the parameters that such measurements can tell, in the full vector.
+        free: (p,) the parameters that such measurements can identify, in the full vector.
         sigmas: of a position [m] and of an orientation [rad].
     """
 
@@ -113,7 +113,7 @@ def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installat
 def observation(
     cell: Installation, kind: str = "pose", sigmas: tuple[float, float] | None = None, seed: int = 0
 ) -> Observation:
-    """Return the observation Jacobian of a nominal arm in the columns that random postures can tell.
+    """Return the observation Jacobian of a nominal arm in the columns that random postures can identify.
 
     Args:
         cell: see `targets_of`.

@@ -52,7 +52,7 @@ class GeometricFit:
         solution: the last Levenberg–Marquardt pass.
         blocks: the prepared measurements.
         pieces: their residual parts at the solution.
-        prior: (f,) standard deviations about the nominal that the fit was drawn with; infinite for none.
+        prior: (f,) standard deviations about the nominal that the fit was regularised with; infinite for none.
     """
 
     cell: Installation

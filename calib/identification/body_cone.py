@@ -1,6 +1,6 @@
 """Base parameters of bodies that can exist: those for which some standard parameters have pseudo-inertias P_i >= 0.
 
-    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not tell of χ is free
+    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not identify of χ is free
 
 (Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the data want to leave that
 convex cone, the optimum on it is found as a semidefinite program (Clarabel), and the cone is replaced by the

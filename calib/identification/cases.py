@@ -22,8 +22,9 @@ class Case:
         motion: q, v, a at the full rate.
         target: (N, rows) what the model's rows have to explain, unfiltered [N m or N; A where no gain is known].
         carried: labels of the payloads on board.
-        present: (N, rows) which rows may be learnt from: no lost samples, and no slow ones where they are cut.
-        noise: (rows,) standard deviation of the targets' samples, as repeats of the motion told it; None: not known.
+        present: (N, rows) which rows may be used: no lost samples, and no slow ones where they are cut.
+        noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
+            known.
         torque_rows: which torques the targets are.
     """
 
@@ -56,8 +57,8 @@ def make_case(
         rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
         gains: (n,) torque per unit of the effort; None: 1.
         carried: labels of payloads.
-        slow: rows of joints slower than this are not learnt from: a share of the peak speed or (n,) speeds; None: all
-            are.
+        slow: rows of joints slower than this are not used: a share of the peak speed or (n,) speeds; None:
+            all are.
     """
     effort = np.array(motion.effort) if gains is None else motion.effort * gains
     if rows.sensed and motion.tau_link is None:

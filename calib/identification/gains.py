@@ -1,4 +1,4 @@
-"""Drive gains from currents: torque = gain · current, told by runs without and with a payload of known mass.
+"""Drive gains from currents: torque = gain · current, identified from runs without and with a payload of known mass.
 
 A model fitted to currents is known up to a scale per joint; what joints share (a link's mass is felt by all before it)
 ties the scales together, and a payload of known mass fixes them (Gautier & Briot 2011, 2014):
@@ -41,7 +41,7 @@ class DriveGains:
         names, values: of all parameters in torque units, base ones and the payload's.
         std: (n,) of the residual currents [A].
         scale: what fixed the scale, in words.
-        own: joints, from 0, whose gain the motion does not tell: one, in amperes of their own.
+        own: joints, from 0, whose gain the motion does not identify: one, in amperes of their own.
     """
 
     gains: np.ndarray
@@ -181,13 +181,13 @@ def identify_gains(
 
 
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
-    """Estimate gains relative to one joint's, and leave at one those that the motion does not tell.
+    """Estimate gains relative to one joint's, and leave at one those that the motion does not identify.
 
     Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
-    which sees part of what the model leaves, times `LEFT`. A gain is told where its sigma is below `max_sigma` of it
-    and it is within a factor `max_factor` of the others: what links share with one motor at the wrist is little beside
-    friction, and a fit then takes what the model leaves for inertia (our choice). Where the search does not settle, the
-    gain that ran away furthest is not told.
+    which sees part of what the model leaves, times `LEFT`. A gain is identified where its sigma is below `max_sigma` of
+    it and it is within a factor `max_factor` of the others: what links share with one motor at the wrist is little
+    beside friction, and a fit then takes what the model leaves for inertia (our choice). Where the search does not
+    settle, the gain that ran away furthest is not identified.
 
     Args:
         data: triangles of [W i] by block and joint, group = block · joints + joint.
@@ -226,7 +226,7 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
 
 
 def _astray(error: NotConverged, reference: int, own: Sequence[int]) -> int:
-    """Return the joint whose gain ran away furthest where gains do not settle: the motion does not tell it.
+    """Return the joint whose gain ran away furthest where gains do not settle: the motion does not identify it.
 
     Raises:
         NotConverged: the error, where no joint is left.
@@ -241,7 +241,7 @@ def _astray(error: NotConverged, reference: int, own: Sequence[int]) -> int:
 
 
 def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Return gains from [i -W] [K; χ] = P m, least squares: drawn towards zero, but a start."""
+    """Return gains from [i -W] [K; χ] = P m, least squares: biased towards zero, but a start."""
     n, size, p = body.shape
     matrix = np.zeros((n, size, n + p))
     for j in range(n):

@@ -51,7 +51,7 @@ class Identification(Generic[Model]):
         elimination: the way to the essential ones; None where not asked for.
         friction: which richer friction the unseen time rewarded.
         settings: how.
-        rows: what was learnt from.
+        rows: the training data.
         condition: of the observation matrix of the base parameters, in its units and with columns of unit norm.
         prior: what was known of the base parameters beforehand, where it was used.
         ripples: gear ripple found above the identification band, by joint; not part of the estimate's covariance.
@@ -295,7 +295,7 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     third, ... one alone.
 
     Too many are more than ``settings.samples``. The band stays: long recordings have rows to spare, but what they show
-    of fast motion no other row tells.
+    of fast motion no other row identifies.
     """
     rates = [case.motion.rate for case in cases]
     if max(rates) > 1.02 * min(rates):
@@ -310,7 +310,7 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the noise (rows,) that repeats of the motion told, its mean square over cases by length; None: not asked.
+    """Return the noise (rows,) by repeats of the motion, its mean square over cases by length; None: not asked.
 
     Raises:
         UsageError: for another method than WLS, or rows with torques that no variance is read for.

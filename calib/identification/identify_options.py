@@ -26,7 +26,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     level = 0.05                     # of the F rule
     keep = ["ZZ1R"]                  # parameters never left out
     drop = ["offl3"]                 # parameters left out first
-    prior = "auto"                   # auto, none, cad: draw what the motion does not tell to the robot's own inertias;
+    prior = "auto"                   # auto, none, cad: regularise what is not identified towards CAD values;
                                      # auto: where there are none, to rods between the joints
     folds = 6                        # time blocks of the cross-validation
     accept = []                      # findings that are meant so: masses, speed, lag, clock, sign, order, zero, limit,
@@ -58,7 +58,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     name = "Ks2"
     shape = "sine"                   # see calib.dynamics.shapes
     joint = 2
-    settings = [1.0, inf]            # order 1 is gravity's own shape: only wide and fast motion tells them apart
+    settings = [1.0, inf]            # order 1 is gravity's own shape: only wide and fast motion distinguishes them
     [payload.tool]                   # a body at the flange
     mass = 2.805                     # known mass [kg]
     com = [0.0, 0.0, 0.05]           # known centre of mass in the tip's frame [m]
@@ -220,7 +220,7 @@ class IdentifyOptions:
         every, files: how recordings are read.
         slow: see the module; None: the default share.
         cut_slow: learn nothing from rows of standing joints.
-        gain_pair: recordings that tell the drive gains.
+        gain_pair: recordings that identify the drive gains.
         accept: findings that do not count against the model, see `FINDINGS`.
         source: the file, for messages.
     """

@@ -14,21 +14,21 @@ the joint's torque, friction and motor inertia are in amperes of its own motor, 
 
 ``torques_N.csv``: ``t [s]``, then measured_1 ... predicted_1 ... of each torque row [N m or N] and the joints q1 ...
 [rad or m], then sigma_1 ... of each torque row, the standard deviation expected of measured - predicted (1.96 of them
-hold 95 %), ``extrapolated``, 1 where the motion leaves what was learnt from, and, of recordings without a payload, v1
-... a1 ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify`` writes
+hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, and, of recordings without a payload,
+v1 ... a1 ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify`` writes
 ``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session writes
 one per validation recording.
 
-``metrics.json``: errors by file under ``identification`` (learnt from) and ``validation`` (``evidence`` false: it
+``metrics.json``: errors by file under ``identification`` (training) and ``validation`` (``evidence`` false: it
 repeats the training). Each has ``raw`` (torque as recorded, full rate), ``filtered`` (both sides low-passed to the
 identification band f_p), ``moving`` and ``standing`` (raw, samples at which the joint is above or below ``slow``), with
 ``relative_error_percent`` 100 |tau - predicted| / |tau| in ``total`` and by ``joints`` (in the order of ``rows``) and
 ``rms`` [N m or N]; ``above_band_percent``: share of the torque above f_p (noise, ripple, elasticity), which no model in
 the band explains; ``whiteness`` of the residuals; ``motion_share``: part of the samples at which joints move; unseen
 ones have ``interval95``: share of the errors within the 95 % interval that the model states, of all rows and by joint,
-its median half width, and how the motion leaves what was learnt from. Then ``parameters`` (standard, base, essential),
-``condition_number`` (raw, and with columns of unit norm), ``friction`` and its ``ladder``, ``elimination``, ``loop``,
-``tracking``, ``filters`` by file, ``geometry``, ``warnings``, ``verdict``, its ``reason``, ``seed``.
+its median half width, and how the motion leaves the training range. Then ``parameters`` (standard, base,
+essential), ``condition_number`` (raw, and with columns of unit norm), ``friction`` and its ``ladder``, ``elimination``,
+``loop``, ``tracking``, ``filters`` by file, ``geometry``, ``warnings``, ``verdict``, its ``reason``, ``seed``.
 
 Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual);
 ``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_friction.png`` (over velocity), and, where the

@@ -331,7 +331,7 @@ def hold(
     Args:
         fit: the free estimate.
         factor: (p + 1, p + 1) triangle [R z; 0 ρ] that it minimises.
-        data: triangles of the rows whose residuals tell the noise, one group per torque row.
+        data: triangles of the rows whose residuals give the noise, one group per torque row.
         std: (g,) of the groups.
         stated: whether the covariance takes `std` as the noise; otherwise σ² of the residuals, of the constrained
             estimate.

@@ -1,4 +1,4 @@
-"""What is known before any data: a proper prior, always on, whose sizes the data's evidence tells.
+"""What is known before any data: a proper prior, always on, whose sizes are estimated by the data's evidence.
 
 Standard parameters χ of one kind (masses, first moments, inertias; rotor inertia, viscous friction, Coulomb friction,
 offsets: whatever has one shape and one unit) are about equally large, and the robot as a whole is about s times a known
@@ -22,9 +22,9 @@ model lacks is no noise, and differs on other motion: where sizes are found resi
 the prior as many times more for the values than for their covariance; more where regimes left out ask for it
 (`calib.identification.left_out.tempering`).
 
-Directions that the motion tells well do not feel the prior; those that it does not tell follow the whole robot. It does
-not make the parameters those of possible bodies: that is the semidefinite fit of another module; but `bounded` keeps
-the drives' inertia positive, and lets friction brake at any speed.
+Directions that the motion identifies well do not feel the prior; those that it does not identify follow the whole
+robot. It does not make the parameters those of possible bodies: that is the semidefinite fit of another module; but
+`bounded` keeps the drives' inertia positive, and lets friction brake at any speed.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Prior:
     def resting(self, covariance: np.ndarray) -> np.ndarray:
         """Return (b,) which parameters rest on the prior: the data lower their variance by less than `RESTING_SHARE`.
 
-        Counted about the whole robot's share: its factor s is one number, and soon told.
+        Counted about the whole robot's share: its factor s is one number, and soon identified.
         """
         b = len(self.own)
         return np.diag(covariance)[:b] > (1.0 - RESTING_SHARE) * self.own**2

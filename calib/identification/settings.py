@@ -70,7 +70,8 @@ class IdentificationSettings:
         essential: when to stop leaving out, one of `RULES`.
         ratio, level: r_σ of the RSD rule, level of the F rule.
         keep, drop: parameters never, or first, left out.
-        prior: of the parameters, its sizes by evidence, drawn to the CAD or to rods (``auto``), to the CAD, or none.
+        prior: of the parameters, its sizes by evidence, regularised towards the CAD or rods (``auto``), to the CAD, or
+            none.
         payloads: label → what is known of it.
         payload_values: label → its ten standard parameters in the tip's frame, where a gain identification found them;
             they, or else the stated mass and centre, serve for predictions where no recording to learn from carries it.

@@ -130,7 +130,7 @@ def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: 
         distances: signed.
         fixed: (pairs,) whether the pair is one with the world.
         margin: the least distance that will be asked for [m].
-        slack: what shapes as coarse as these cannot tell [m].
+        slack: distance that shapes as coarse as these cannot resolve [m].
     """
     near = (distances <= margin).mean(axis=0) >= ALWAYS
     highest = distances.max(axis=0)
@@ -149,7 +149,7 @@ def check_reachable(
         pairs: names of link and thing.
         distances: (N, pairs) [m] in random postures, signed.
         fixed: (pairs,) whether the pair is one with the world.
-        slack: what shapes as coarse as these cannot tell [m].
+        slack: distance that shapes as coarse as these cannot resolve [m].
 
     Raises:
         RobotError: naming links and things.

@@ -51,7 +51,7 @@ class Sheet:
 
     Attributes:
         table: as the file has it.
-        options: names and units that the header does not tell.
+        options: names and units that the header does not state.
         suffixes: that may stand behind our names of columns that go together.
     """
 

@@ -1,9 +1,9 @@
-"""The fit options file: what the headers of the measurement files do not tell, and how to fit.
+"""The fit options file: what the headers of the measurement files do not state, and how to fit.
 
 TOML; every key is optional, and a key that is none of these is refused. Lengths in m, angles in rad::
 
-    kind = "position"                # pose, position, distance, bar, sockets, plane; where the header does not tell
-    format = "csv"                   # csv, robodk, three_smr; where the header does not tell
+    kind = "position"                # pose, position, distance, bar, sockets, plane; where the header does not state it
+    format = "csv"                   # csv, robodk, three_smr; where the header does not state it
     euler = "xyz fixed"              # what rx ry rz (a b c, w p r, roll pitch yaw) mean: turns about fixed axes one
                                      # after the other, "zyx moving" (KUKA's A B C) about axes that turn along, or
                                      # "vector", a rotation vector (UR); wpr is xyz fixed, xyz is xyz moving

@@ -71,7 +71,7 @@ class PoseMeasurements:
 
     @property
     def measured(self) -> np.ndarray:
-        """(m, k) the numbers that tell one measurement from another at the same joints."""
+        """(m, k) the numbers that distinguish one measurement from another at the same joints."""
         return np.zeros((len(self), 0))
 
     @property

@@ -51,7 +51,7 @@ def read_measurements(
 
     Args:
         joints: the robot's n joint names.
-        options: names, units, kind where the header does not tell.
+        options: names, units, kind where the header does not state it.
         kinds: URDF's type of each joint (revolute, continuous, prismatic); all revolute by default.
         limits: lower and upper limits, each (n,) [rad or m].
 

@@ -25,7 +25,7 @@ sigma               of the tool's position [mm] and orientation [mrad] (root of 
                     covariance
 unseen_rms [mm]     rms error of the calibrated arm on poses that its fit has not seen
 expected [mm]       standard deviation of the real tool's position error at this target, all axes together, with all
-                    that the model leaves and the instrument's noise, as the fit found it on rows left out: what to
+                    that the model leaves and the instrument's noise, as the fit found it on held-out rows: what to
                     expect of a real arm there; empty where the fit does not say
 interval95 [mm]     radius within which 95 % of such errors are to be
 extrapolated        1 where a joint stands outside the range that was measured for the fit, else 0

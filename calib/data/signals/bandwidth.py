@@ -143,7 +143,7 @@ def _position_cutoff(
 
 
 def _active(q: np.ndarray, min_speed_share: float = 0.05) -> np.ndarray:
-    """Return (n,) which joints move fast enough to tell of the bandwidth.
+    """Return (n,) which joints move fast enough to show the bandwidth.
 
     `min_speed_share`: a joint of less than this share of the fastest one's speed says nothing.
     """

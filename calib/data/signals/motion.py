@@ -86,7 +86,7 @@ class Motion:
         joint_names, kind, file, drive_gain, effort_variance: the recording's.
         tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
             filtered; or None.
-        sampling, cutoffs: what was found; notes: what a user should be told; jumps: the recording's, in words.
+        sampling, cutoffs: what was found; notes: for the user; jumps: the recording's, in words.
     """
 
     t: np.ndarray

@@ -1,4 +1,4 @@
-"""What a motion can tell, before any model: is it one sine, do joints move together, is it the motion seen before?"""
+"""What a motion can excite, before any model: is it one sine, do joints move together, is it the motion seen before?"""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ExcitationReport:
         functions: number of independent functions of time that all positions are made of (2 for one sine).
         still: (n,) joints that never move.
         seconds: for which any joint moves [s].
-        notes: what a user should be told.
+        notes: for the user.
     """
 
     lines: np.ndarray
@@ -51,7 +51,7 @@ class ExcitationReport:
 def report_excitation(motion: Motion) -> ExcitationReport:
     """Return what the positions of `motion` say of its richness; its longest segment is looked at.
 
-    One frequency cannot tell inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
+    One frequency cannot separate inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
     """
     longest = int(np.bincount(motion.segment).argmax())
     start, stop = (int(i) for i in np.searchsorted(motion.segment, [longest, longest + 1]))

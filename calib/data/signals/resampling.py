@@ -42,7 +42,7 @@ class SamplingReport:
     times: float = np.nan
 
     def lines(self) -> list[str]:
-        """Return what a user should be told, one finding per line."""
+        """Return notes for the user, one finding per line."""
         told = [f"{self.rate:.6g} Hz; the stamps' steps jitter by {self.jitter[0] * 1e3:.3g} ms rms"]
         told[0] += f", {self.jitter[1] * 1e3:.3g} ms at most"
         if self.clock != "stamps":

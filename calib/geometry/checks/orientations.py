@@ -1,4 +1,4 @@
-"""Can these orientations be those of this arm's target? What no file alone can tell, and the nominal arm can.
+"""Can these orientations be those of this arm's target? What no file alone can say, and the nominal arm can.
 
 A quaternion read in another order is still a quaternion, and of two rows the angle |log R_iᵀ R_j| = 2 acos |q_i · q_j|
 does not depend on the order. But to move the w is an odd permutation, a reflection of the quaternions' sphere, so that

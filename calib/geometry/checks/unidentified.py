@@ -18,7 +18,7 @@ PLACES = {"station": "the placement of the instrument", "tool": "the mounting of
 
 
 def unidentified(found: GeometricFit) -> list[Finding]:
-    """Return what a fit's poses could not tell: its rank first, then parameters, then placements."""
+    """Return what a fit's poses could not identify: its rank first, then parameters, then placements."""
     return [*_rank(found), *_merged(found), *_at_nominal(found), *_loose(found)]
 
 
@@ -68,7 +68,7 @@ def _merged(found: GeometricFit) -> list[Finding]:
 
 
 def _at_nominal(found: GeometricFit) -> list[Finding]:
-    """Return arm parameters that are independent but told no better than they are known beforehand."""
+    """Return arm parameters that are independent but identified no better than they are known beforehand."""
     if found.split is None:
         return []
     table = layout(found.start)

@@ -62,7 +62,7 @@ class FoldStatistics:
         groups: (E,) ridge group of each term.
         sizes: (E,) first guess of each coefficient.
         coordinates: of geometry and terms, in which the statistics are.
-        plausible: (rigid,) wide prior on the geometry, so that what a fold cannot tell stays at the optimum.
+        plausible: (rigid,) wide prior on the geometry, so that what a fold cannot identify stays at the optimum.
         training: per fold, statistics of the other folds' rows, whitened.
         held_out: per fold, statistics of its rows [m], and how many.
         rows: per fold.
@@ -189,7 +189,7 @@ def blind_folds(
     folds: Folds,
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> np.ndarray:
-    """Return which folds cannot be judged (folds,): the other rows do not tell where the tool would be in them.
+    """Return which folds cannot be judged (folds,): the other rows do not determine where the tool would be in them.
 
     There the error that geometry and frames would have by their covariance alone, with the nominal arm's residuals
     taken for noise and `plausible_deviation` known beforehand, is above `MAX_BLIND_ERROR` times those residuals.

@@ -27,7 +27,7 @@ class Folds:
         kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (one left out) on request.
         count: number of folds.
         members: per block, (m,) fold of each row.
-        blind: names of what is not left out as a whole, since the rest cannot tell where its tool would be.
+        blind: names of what is not left out as a whole, since the rest does not determine where its tool would be.
     """
 
     kind: str
@@ -62,11 +62,12 @@ def divide(
 ) -> Folds:
     """Return folds in which those that `blind` (count,) marks are divided: each of their regions is left out by itself.
 
-    What is left out as a whole has to be predicted by the rest. Where the rest cannot tell the tool (it holds one
-    orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
+    What is left out as a whole has to be predicted by the rest. Where the rest does not determine the tool (it holds
+    one orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
 
     Args:
-        scattered: in place of a region leave out every third row of one, for rows that do not tell a tool of their own.
+        scattered: in place of a region leave out every third row of one, for rows that do not determine a tool of their
+            own.
     """
     members, count = [np.array(fold) for fold in folds.members], 0
     for fold in range(folds.count):

@@ -1,11 +1,11 @@
-"""A ladder of models, climbed as far as the data carry it.
+"""A ladder of models, climbed as far as held-out errors fall.
 
     frames → offsets → geometry → + stiffness → + bending → + coupling → + harmonics → + wobble
 
 Every rung is judged on rows it was not fitted to (`calib.geometry.model_choice.folds`). Of the effects, the one that
 lowers that error most is taken up, then the one that pays most beside it, until none pays: sag may show only once gear
-errors are gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its nominal as strongly as
-the data say (`calib.geometry.fit`).
+errors are gone. Without an instrument (sockets, planes, distances) the geometry is regularised towards its nominal as
+strongly as the data say (`calib.geometry.fit`).
 """
 
 from __future__ import annotations
@@ -310,7 +310,7 @@ class _Climber:
         return replace(found, start=self.best.start, split=self.best.split, candidates=self.best.candidates)
 
     def _terms(self, effect: str) -> list[Term]:
-        """Return an effect's terms, harmonics only up to what so many poses can ever tell."""
+        """Return an effect's terms, harmonics only up to what so many poses can identify."""
         known = self.torques is not None and all(torque is not None for torque in self.torques)
         highest = sum(len(block) for block in self.measured) // POSES_PER_ORDER
         terms = EFFECTS[effect](self.nominal.cell.chain, known)

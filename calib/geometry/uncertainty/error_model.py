@@ -2,14 +2,14 @@
 
     E |e(q)|² = κ trace J Σ Jᵀ + s(q) v_0 + v_1 d(q)² + v_2 g(q)²
 
-with Σ the parameters' covariance, d the distance of q from the nearest pose that was learnt from and g that from the
-ranges of single joints that were, every joint counting by its lever [m]. s says where errors are larger than elsewhere
-(`calib.geometry.uncertainty.unevenness`). κ and v are the most probable ones of errors on rows left out: at random
-(near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius that
-holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.uncertainty.left_out`): nothing is
-said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the median
-of the ones to that of the others, and is larger outside the range of a joint, by what that end of it showed when it was
-left out; sigmas are stated in units of the larger radius.
+with Σ the parameters' covariance, d the distance of q from the nearest pose of the fit and g that from
+the ranges of single joints that were, every joint counting by its lever [m]. s says where errors are larger than
+elsewhere (`calib.geometry.uncertainty.unevenness`). κ and v are the most probable ones of errors on held-out rows: at
+random (near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius
+that holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.uncertainty.left_out`): nothing
+is said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the
+median of the ones to that of the others, and is larger outside the range of a joint, by what that end of it showed when
+it was left out; sigmas are stated in units of the larger radius.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ PRIOR_SIGMA = 1.0  # what is known beforehand of a parameter that a fold does no
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What makes an error at a pose likely, learnt on rows left out.
+    """What makes an error at a pose likely, estimated on held-out rows.
 
     Attributes:
         parameters: κ, by which the parameters' covariance counts.
-        floor: v_0 [m²], what remains among the poses learnt from, the instrument's noise included, where s is 1.
+        floor: v_0 [m²], what remains among the poses of the fit, the instrument's noise included, where s is 1.
         far: v_1 [m²/m²], per squared distance from the nearest of them.
         beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
-        radii: sigmas within which 95 % of the errors on rows left out were, near and far.
+        radii: sigmas within which 95 % of the errors on held-out rows were, near and far.
         reach: median of d² + g² of the near rows, and of the far ones [m²].
         levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
         profile: log s by joint; empty where errors are even.
         placed: the radii where base and tool are placed on the rows; None where they are the same.
-        wider: by joint, how many times as wide an interval is below and above its range; empty where nothing tells.
+        wider: by joint, how many times as wide an interval is below and above its range; empty where nothing is known.
     """
 
     parameters: float
@@ -85,7 +85,7 @@ class ErrorModel:
     Attributes:
         cell: the installation.
         free, covariance: of its parameters (`calib.geometry.parameters`).
-        learnt: (m, n) poses it was learnt from [rad or m].
+        learnt: (m, n) poses of the fit [rad or m].
         discrepancy: see `Discrepancy`.
     """
 
@@ -156,12 +156,12 @@ class ErrorModel:
         return result
 
     def beyond(self, q: np.ndarray) -> np.ndarray:
-        """Return which joints (m, n) stand outside the range that was learnt from: there a prediction extrapolates."""
+        """Return which joints (m, n) stand outside the training range: there a prediction extrapolates."""
         return outside(q, self.learnt)
 
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
-    """Return which joints (m, n) of poses q (m, n) stand outside the range of those learnt from (k, n) [rad or m]."""
+    """Return which joints (m, n) of poses q (m, n) stand outside the range of the fit's (k, n) [rad or m]."""
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
@@ -179,7 +179,7 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
     """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
 
     The latter is, joint by joint, the way to where `NEAR_SHARE` of the learnt poses are within reach: a few of them far
-    off the others do not tell how a joint is there.
+    off the others do not say how a joint is there.
     """
     nearest = np.asarray(KDTree(learnt * levers).query(q * levers)[0]) ** 2
     alone, count = np.zeros(len(q)), len(learnt)
@@ -211,7 +211,7 @@ def learn_errors(
     torques: Sequence[np.ndarray | None] | None = None,
     seed: int = 0,
 ) -> ErrorModel | None:
-    """Learn what errors to expect from those on rows left out; None without positions, or with too few.
+    """Learn what errors to expect from those on held-out rows; None without positions, or with too few.
 
     For every fold the geometry and the ridges of all effects that were taken up are found anew: ridges of all rows know
     what was left out. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.

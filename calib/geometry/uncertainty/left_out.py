@@ -1,4 +1,4 @@
-"""What errors on rows left out of a fit tell of errors to come: what they grow with, and what holds 95 % of them.
+"""What held-out errors of a fit say of errors to come: what they grow with, and what holds 95 % of them.
 
 A quantile is taken at the level (n + 1) / n · 95 % of n poses (conformal prediction; Vovk, Gammerman & Shafer 2005). As
 those rows have also chosen the variances, an interval is as much wider as it has to be to hold 95 % of a fold whose
@@ -29,7 +29,7 @@ MIN_ROWS = 5  # rows of a kind that the poses outside a fold must have to tell a
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Errors on rows left out.
+    """Errors on held-out rows.
 
     Attributes:
         squares: (m,) |e|² [m²].

@@ -1,4 +1,4 @@
-"""How well a fit knows where the tool is: the covariance of its parameters, carried to poses."""
+"""How well a fit knows where the tool is: the covariance of its parameters, propagated to poses."""
 
 from __future__ import annotations
 

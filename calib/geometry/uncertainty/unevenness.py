@@ -3,8 +3,8 @@
     log s(q) = Σ_j f_j(q_j),    f_j ~ GP(0, a_j² exp(-|Δ| / (CORRELATION_LENGTH · range)))
 
 by regression of the logarithms of squared errors on joint values (Harvey 1976, Econometrica 44: multiplicative
-heteroscedasticity), every a_j at its most probable (`calib.estimation.relevance`): 0 where a joint tells nothing.
-Stated is exp(E f + var f / 2), the mean of s: it is larger where few poses, or none, were learnt from.
+heteroscedasticity), every a_j at its most probable (`calib.estimation.relevance`): 0 where a joint has no influence.
+Stated is exp(E f + var f / 2), the mean of s: it is larger where few poses, or none, were measured.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
 
 
 class Unevenness:
-    """What squared errors tell of s.
+    """What squared errors say of s.
 
     Args:
         q: (m, n) poses [rad or m].

@@ -50,8 +50,8 @@ class RecordingSizes:
         follows: (n,) correlation of the measured velocities' integrals with the positions; NaN as `speed`.
         counted: whether the samples are dated by the measured velocities.
         rate: of the samples, by their dates [Hz].
-        lag: of the torques; None where the recording is too short to tell.
-        clock: inertias beside masses; None where the motion does not tell.
+        lag: of the torques; None where the recording is too short to estimate it.
+        clock: inertias beside masses; None where the motion does not identify it.
         other: order or zeros of the joints that explain more than those recorded; None where none is looked for.
         jumps: of positions, in words.
     """

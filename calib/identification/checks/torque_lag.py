@@ -4,9 +4,9 @@ One model of all joints is fitted at every lag that is tried: bodies shared by t
 squares weighed by what is left of each joint. Bodies of each joint's own bend after a late torque: they find 148 ms
 where torques are 100 ms late. Friction turns over later than its speed does, as long as joints bend before they slide,
 and would pass for a lag of 20 ms (the Panda's wrist); so sign(v) may come `FREE` earlier and later, at each joint, and
-friction tells nothing of the lag: masses and inertias do. The least of the residual is found by a parabola; its sigma
-takes each joint's vote for one draw, and both halves of the recording for two: short ones agree on none. All of this
-and its thresholds are our choice.
+friction holds no information on the lag: masses and inertias do. The least of the residual is found by a parabola; its
+sigma takes each joint's vote for one draw, and both halves of the recording for two: short ones agree on none. All of
+this and its thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Lag:
 
 
 def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
-    """Return the lag of the torques; None where the motion is too short to tell.
+    """Return the lag of the torques; None where the motion is too short to estimate it.
 
     Args:
         samples: of the recording.

@@ -1,10 +1,11 @@
 """Torques beside those of the whole robot: does its clock run right, are signs, order and zeros of its joints as said?
 
 A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
-while masses, which gravity tells, stay as they are. How large inertias are beside masses, lengths alone say nearly: for
-rods between the joints their ratio is known up to 17 % on every recording at hand that tells it (Panda, LWR4+, TX40,
+while masses, which gravity identifies, stay as they are. How large inertias are compared with masses, lengths alone say
+nearly: for rods between the joints their ratio is known up to 17 % on every recording at hand that identifies it
+    (Panda, LWR4+, TX40,
 11 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or more; arms of two,
-whose last link no length tells, are not looked at: one gave 45. All thresholds are our choice.
+whose last link has no known length, are not looked at: one gave 45. All thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class ReversedSigns:
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
-    """Return how large inertias are beside masses; None where neither motion nor arm tell both.
+    """Return how large inertias are compared with masses; None where neither motion nor arm identify both.
 
     Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
     gravity beside any torque of motion; drives free in both.

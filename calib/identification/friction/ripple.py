@@ -8,16 +8,16 @@ gear 1 explains more of joint 3's ripple than joint 3's own does. Beyond the pos
 
 Orders come in families: a gear of N motor turns per turn shows at N, a harmonic drive (whose wave has two lobes) above
 all at 2 N against the flexspline and at 2 N + 2 against the output, and at twice those. A motion of three radians
-hardly tells orders two apart, and single ones that fit one place do not carry over to another: on the Panda, with the
-same search, free orders explain less of unseen motion than the family does. So a gear's N is found first, joints of
-similar gears sharing it; free orders are offered where no family pays. What repeats shows in how far the residual's
-waves agree in phase between blocks of time:
+hardly distinguishes orders two apart, and single ones that fit one place do not carry over to another: on the Panda,
+with the same search, free orders explain less of unseen motion than the family does. So a gear's N is found first,
+joints of similar gears sharing it; free orders are offered where no family pays. What repeats shows in how far the
+residual's waves agree in phase between blocks of time:
 
     S(k) = Σ_b (|Σ_c F_bc(k)|² - Σ_c |F_bc(k)|²) / N_b,    F_bc(k) = Σ residual · exp(-i k q)
 
 over speed bins b and time blocks c, for all whole orders at once by FFT over the position (our choice: neither noise
-nor a single loud moment has a part in it). How strongly the columns are drawn to zero, how finely frequency is told
-apart, and whether an order stays at all, time blocks that are left out decide.
+nor a single loud moment has a part in it). How strongly the columns are regularised towards zero, how finely frequency
+is told apart, and whether an order stays at all, time blocks that are left out decide.
 """
 
 from __future__ import annotations

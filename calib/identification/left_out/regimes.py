@@ -1,8 +1,8 @@
-"""Regimes of a motion that models are judged on without having learnt from them: each joint's extremes.
+"""Regimes of a motion that models are judged on without having been fitted to them: each joint's extremes.
 
 A model that is right goes on being right where a joint is faster, accelerates more, or stands farther out than anything
-it learnt from, and in the direction of travel that it has not seen. Blocks of time hardly ask for that: each holds some
-of everything.
+of its training data, and in the direction of travel that it has not seen. Blocks of time hardly ask for that: each holds
+some of everything.
 """
 
 from __future__ import annotations

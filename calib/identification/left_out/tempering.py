@@ -18,7 +18,7 @@ MIN_GAIN = 0.08  # in the logarithm of squared errors, by which a stronger prior
 def tempered_prior(
     find: Callable[[float, Prior | None], Prior], rows: Sequence[ObservationRows], regimes: Regimes
 ) -> Prior:
-    """Return the prior of the tempering with which the regimes are predicted best by what is learnt from the rest.
+    """Return the prior of the tempering with which the regimes are predicted best by what the rest identifies.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
     one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by

@@ -131,8 +131,8 @@ def estimate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values (p,) and prior standard deviations (p,; infinite where there is no ridge, 0 where switched off).
 
-    Columns with a group are drawn to zero as strongly as the evidence says (`calib.estimation.relevance`); with none,
-    this is weighted least squares. Directions without any data stay where they are: at zero.
+    Columns with a group are regularised towards zero as strongly as the evidence says (`calib.estimation.relevance`);
+    with none, this is weighted least squares. Directions without any data stay where they are: at zero.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     stacked = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)

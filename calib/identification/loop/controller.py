@@ -26,7 +26,7 @@ ORDERS = (0, 1)  # of a PD; more for a controller with memory, at the price of n
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedController:
-    """What a log tells about a controller.
+    """What a log says about a controller.
 
     Attributes:
         controller: PD or PID with the gains found.

@@ -85,7 +85,7 @@ def require_robot(settings: IdentificationSettings) -> IdentificationSettings:
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
     """Return what instruments from simulation say of an estimate's problem; nothing without a loop.
 
-    An estimate that came from them is the comparison itself; beside another method's, their failure is told.
+    An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
     if problem.loop is None:
         return LoopTest()

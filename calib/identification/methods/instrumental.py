@@ -161,7 +161,7 @@ class Instrumental:
     def shift(self) -> np.ndarray:
         """(p,) distance of least squares from this estimate, in standard deviations.
 
-        The test finds any bias that the data can tell; this says whether it matters.
+        The test finds any bias that the data can detect; this says whether it matters.
         """
         estimate = self.fit.estimate
         return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
@@ -203,7 +203,7 @@ def identify_instrumental(
         limit: most iterations.
 
     Raises:
-        Unidentifiable: where the instruments do not tell the parameters apart.
+        Unidentifiable: where the instruments do not identify the parameters separately.
         NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where they led away.
         CannotSimulate: where the loop is unstable with the robot it starts from, or with an estimate and all near it.
     """

@@ -64,8 +64,8 @@ class _LeastSquares(Method):
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
     """Return the scaled TLS fit: columns that move have noise of `COLUMN_NOISE` of their size, y that of its residuals.
 
-    The common level is the smallest singular value's; the ratio of the noises, which no single recording tells, is our
-    choice.
+    The common level is the smallest singular value's; the ratio of the noises, which no single recording identifies, is
+    our choice.
 
     Args:
         pooled: triangles, one group per torque row.
@@ -164,8 +164,8 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
 class _ConstrainedLeastSquares(Method):
     """A method that solves the rows directly, under constraints: physically consistent least squares.
 
-    Weights are those that the residuals of the free estimate tell; only IRLS weighs by those of the constrained one,
-    as there a sample's weight hangs on it.
+    Weights are those that come from the residuals of the free estimate; only IRLS weighs by those of the constrained
+    one, as there a sample's weight hangs on it.
 
     Attributes:
         free: the method without constraints.

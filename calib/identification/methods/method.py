@@ -256,7 +256,7 @@ class MethodEntry:
         method: itself.
         description: one line.
         source: whose it is.
-        tunes: what of it is chosen beforehand and not told by the data; () for nothing.
+        tunes: what of it is chosen beforehand and not estimated from the data; () for nothing.
         version: raised whenever it gives another estimate, or another count of rounds, of the same data: what studies
             have kept of it from before then does not count, and is run again.
     """

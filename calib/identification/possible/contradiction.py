@@ -2,7 +2,7 @@
 
 Where the model is right, 95 % of all estimates are within √χ²(b) of a possible robot. Honest recordings are farther:
 friction of another form has no place in a possible body, and the data's sigmas do not know of it. Only a distance
-several times that bound tells of signs, orders and robots; what it means is for a verdict to say.
+several times that bound points to signs, orders and robots; what it means is for a verdict to say.
 """
 
 from __future__ import annotations

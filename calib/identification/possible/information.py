@@ -1,8 +1,8 @@
 """What an identification's data say about the standard parameters: ‖R T χ - z‖², and nothing else.
 
-T regroups the p parameters χ of the model into the b that the motion tells apart. R and z are the estimate β and its
-covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, or constraints hold it, they are
-the data's own triangle instead (``information.csv``), so that what was known beforehand is not counted twice.
+T regroups the p parameters χ of the model into the b that the motion identifies separately. R and z are the estimate β
+and its covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, or constraints hold it,
+they are the data's own triangle instead (``information.csv``), so that what was known beforehand is not counted twice.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The bodies that consistent parameters are drawn to: the CAD's, or rods between the joints where there is none."""
+"""The bodies that consistent parameters are regularised towards: the CAD's, else rods between the joints."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ what no model explains must not pass for a wrong CAD. Only where a possible robo
 and the result is not, γ is lowered until it is.
 
 Where even the nearest possible robot, whatever its CAD, is d > √b standard deviations from the estimate, the data's
-sigmas do not tell the errors of the model, and count d / √b times (Birge 1932): poor motion with a small residual would
-otherwise overrule any CAD.
+sigmas do not cover the errors of the model, and count d / √b times (Birge 1932): poor motion with a small residual
+would otherwise overrule any CAD.
 
 Newton's method solves it in milliseconds, strictly inside the cone; the nearest possible robot without any prior lies
 on the border, a semidefinite program for Clarabel (`nearest`).

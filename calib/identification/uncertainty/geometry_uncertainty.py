@@ -122,7 +122,7 @@ def propagate(
     Args:
         found: the identification.
         robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact.
-        cases: those it learnt from.
+        cases: its training data.
     """
     robot = as_calibrated(robot)
     chain, covariance = robot.chain, robot.covariance

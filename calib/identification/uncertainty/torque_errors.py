@@ -3,14 +3,14 @@
     E e_j² = κ_j w_j Σ w_jᵀ + v_j + u_j log(1 + d_j²)
 
 with w_j the torque row's regressor, Σ the parameters' covariance, and d_j the distance of its joint's q, v, a from the
-range that was learnt from, each in units of its standard deviation. What parameters do far from there is in Σ; what no
-parameter explains (friction of another form, ripple) is of one size and soon forgets where it was: the logarithm. κ, v
-and u are the most probable ones of errors on time left out: block by block, and each half from the other. A few blocks
-of one joint tell the three badly apart, and κ = 0 would deny what the covariance says of itself: each joint's are drawn
-to those of all, and to κ = 1. Such an error is what the model leaves of the torque as recorded, ripple and noise above
-its band included, and what its prediction changes by where the parameters are estimated without that time. How much
-the sizes of these errors differ from one block to another says how far those of other motion may: the stated sigma is
-that of which 1.96 hold 95 % where the logarithm of their size has a t distribution.
+training range, each in units of its standard deviation. What parameters do far from there is in Σ; what
+no parameter explains (friction of another form, ripple) is of one size and soon forgets where it was: the logarithm. κ,
+v and u are the most probable ones of errors on time left out: block by block, and each half from the other. A few
+blocks of one joint identify the three badly, and κ = 0 would deny what the covariance says of itself: each joint's are
+regularised to those of all, and to κ = 1. Such an error is what the model leaves of the torque as recorded, ripple and
+noise above its band included, and what its prediction changes by where the parameters are estimated without that time.
+How much the sizes of these errors differ from one block to another says how far those of other motion may: the stated
+sigma is that of which 1.96 hold 95 % where the logarithm of their size has a t distribution.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class TorqueDiscrepancy:
     Attributes:
         parameters: (rows,) κ, by which the parameters' variance counts.
         floor: (rows,) v [N² m² or N²], of what no parameter of the model explains.
-        beyond: (rows,) u, the same per log(1 + d²), d the distance from what was learnt from.
-        lower, upper, scale: (3, n) least and largest q, v, a that were learnt from, and their standard deviations.
+        beyond: (rows,) u, the same per log(1 + d²), d the distance from the training data.
+        lower, upper, scale: (3, n) least and largest q, v, a of the training data, and their standard deviations.
     """
 
     parameters: tuple[float, ...]
@@ -80,7 +80,7 @@ class TorqueDiscrepancy:
         return np.log1p(np.broadcast_to(away.sum(axis=1)[:, None], (len(q), rows)) if left else np.tile(away, own))
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return by which of q, v, a and at which joint (3, N, n) states leave what was learnt from."""
+        """Return by which of q, v, a and at which joint (3, N, n) states leave the training range."""
         return self._outside(q, v, a) > MAX_OUTSIDE * (np.array(self.upper) - np.array(self.lower))[:, None]
 
     def _outside(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -130,7 +130,7 @@ class TorqueIntervals:
         sigma: (M, rows) standard deviations stated [N m or N].
         inside: (M, rows) whether the errors found are within 1.96 of them.
         known: (M,) False at lost samples, which count nowhere.
-        extrapolated: (3, M, n) by which of q, v, a and at which joint the motion leaves what was learnt from.
+        extrapolated: (3, M, n) by which of q, v, a and at which joint the motion leaves the training range.
     """
 
     index: np.ndarray
@@ -173,7 +173,7 @@ class TorqueIntervals:
         )  # fmt: skip
 
     def ways(self, joints: Sequence[str]) -> list[str]:
-        """Say how the motion leaves what was learnt from: in which of q, v, a, and at which of the joints named."""
+        """Say how the motion leaves the training range: in which of q, v, a, and at which of the joints named."""
         outside = np.asarray(self.extrapolated.any(axis=1))
         return [
             f"{words} {', '.join(name for name, out in zip(joints, own.tolist()) if out)}"
@@ -327,7 +327,7 @@ def _left_out(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return errors (m, rows) on blocks that the parameters did not see, and what they may grow by, (m, rows, 3).
 
-    No error counts for more than the torque itself: a fold that fails wholly tells nothing of how the whole model errs.
+    No error counts for more than the torque itself: a fold that fails wholly says nothing of how the whole model errs.
     """
     inside, size = np.isin(samples.block, run), np.sqrt(np.mean(samples.torque**2, axis=0))
     others = [k for k in range(samples.triangles.groups // samples.error.shape[1]) if k not in run]
@@ -340,11 +340,11 @@ def _left_out(
 
 
 def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int) -> np.ndarray:
-    """Return weights (rows, 3) of what errors may grow by, each torque row's drawn to those of all.
+    """Return weights (rows, 3) of what errors may grow by, each torque row's regularised towards those of all.
 
     In units of a row's own mean square every row's κ, and its u over v, are of one kind. Behind a row's errors stand
     those of all others, worth `BORROWED` blocks, and what is known beforehand: the covariance is as it says, worth a
-    block, and errors grow beyond what was learnt from, which folds hardly leave where motion repeats itself.
+    block, and errors grow beyond the training range, which folds hardly leave where motion repeats itself.
 
     Args:
         folds: errors (m, rows) and shapes (m, rows, 3) of each.

@@ -49,7 +49,7 @@ class IdentificationOutcome:
 
     @property
     def fit(self) -> Mapping[str, Score]:
-        """Case name → its score, of the recordings learnt from."""
+        """Case name → its score, of the training recordings."""
         return self.assessment.fit
 
     @property
@@ -96,7 +96,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
 def judged(
     inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
 ) -> IdentificationOutcome:
-    """Predict every recording by what was identified from the inputs, and judge.
+    """Predict every recording by the training data the inputs, and judge.
 
     Raises:
         MeasurementError: where friction would drive most joints.

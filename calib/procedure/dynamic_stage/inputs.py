@@ -81,7 +81,7 @@ class IdentificationInputs:
         return self.robot.chain
 
     def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
-        """Return inputs with more recordings that were not learnt from.
+        """Return inputs with more recordings that were not used for training.
 
         Args:
             validate: paths, each with a cut if wanted, or recordings in memory.

@@ -79,7 +79,7 @@ class Assessment:
         verdict: as of `calib.procedure.dynamic_stage.verdict`.
         warnings: what a user should know of the recordings, and of the model.
         tracking: with the model fed forward.
-        intervals: unseen case (without any, the first learnt from) → what errors were expected there, and found.
+        intervals: unseen case (without any, the first of the training) → what errors were expected there, and found.
     """
 
     fit: Mapping[str, Score]
@@ -100,7 +100,7 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[str]:
-    """Return which samples of files are to be unseen and yet learnt from, in words."""
+    """Return which samples of files are to be unseen and yet training data, in words."""
     told = []
     for case, own in product(unseen, cases):
         first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])

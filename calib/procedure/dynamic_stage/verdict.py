@@ -190,7 +190,7 @@ def with_intervals(verdict: Verdict, expected: Mapping[str, TorqueIntervals], ro
 
 
 def extrapolates(name: str, expected: TorqueIntervals) -> list[str]:
-    """Say how a recording leaves what was learnt from."""
+    """Say how a recording leaves the training range."""
     if not (share := float(expected.beyond.mean())):
         return []
     joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]
@@ -276,7 +276,7 @@ def beyond(case: Case, chain: Chain) -> list[str]:
 
 
 def resting_parameters(found: Identification[Any]) -> Resting:
-    """Return the base parameters that the motion does not tell."""
+    """Return the base parameters that the motion does not identify."""
     if found.prior is None:
         return Resting(of=found.base.b)
     on = found.prior.resting(found.fitted.estimate.covariance)

@@ -41,7 +41,7 @@ class Intervals:
         sigma: (m,) standard deviation of the tool position error, all axes together [m].
         radius: (m,) within which 95 % of such errors are to be [m].
         size: (m,) the errors found [m].
-        beyond: (m,) whether a joint stands outside the range that was learnt from.
+        beyond: (m,) whether a joint stands outside the training range.
         joints: names of those that do.
     """
 

@@ -195,7 +195,7 @@ def _found_of(
 
 
 def _cross_validated(found: ModelSelection) -> float:
-    """Return the error of the chosen model on rows left out [m]: that of the last rung kept."""
+    """Return the error of the chosen model on held-out rows [m]: that of the last rung kept."""
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 
 

@@ -132,7 +132,7 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
 
     Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
     deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
-    such errors are to be, ``extrapolated`` 1 where a joint stands outside the range that was learnt from.
+    such errors are to be, ``extrapolated`` 1 where a joint stands outside the training range.
     """
     named = {(each.file, each.row) for each in outcome.outliers}
     weights = _weights(outcome)

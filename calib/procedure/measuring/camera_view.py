@@ -166,7 +166,7 @@ class ImageObservation:
 
     Attributes:
         view: camera and board.
-        free: (p,) the parameters that images can tell, in the full vector.
+        free: (p,) the parameters that images can identify, in the full vector.
     """
 
     view: CameraView

@@ -198,7 +198,7 @@ def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistic
 
 
 def _ladder_table(metrics: FitMetrics) -> Table:
-    """Return the models tried with their error on rows left out."""
+    """Return the models tried with their error on held-out rows."""
     rows, strong = [], set()
     for step in metrics.ladder:
         error = step.cross_validated_mm

@@ -68,7 +68,7 @@ class ParallelDynamics(JudgedResult):
         model: what was identified.
         options: how recordings were read.
         found: the model with numbers, estimate and elimination.
-        cases, unseen: recordings learnt from, and others.
+        cases, unseen: training recordings, and others.
         fit, validation: case name → score.
         verdict: pass, marginal or fail, by the rules of serial arms (`calib.procedure.dynamic_stage.verdict`).
         notes: what a user should know.

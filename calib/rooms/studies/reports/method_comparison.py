@@ -1,7 +1,7 @@
 """``calib compare``: every method on the same recordings, ranked by what they predict of other motion.
 
 All estimate the same columns (base parameters and standard friction, unless another is asked for), each as
-`calib identify --method` does it: wls draws what the motion does not tell to a prior. Errors are relative, in the
+`calib identify --method` does it: wls draws what the motion does not identify to a prior. Errors are relative, in the
 identification band, over all unseen recordings together; their standard errors, and those of differences between
 methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white. Methods within `APART`
 standard errors of the best, or within `SLACK` of its error, are as good; of these one is taken that is fast: at most
@@ -50,7 +50,7 @@ class ComparedMethod:
         rank: by the error on unseen motion, from 1; 0 without an estimate.
         unseen, sigma: error on unseen motion in the band, and its standard error [%].
         raw: the same against the torque as recorded [%].
-        training: in the band, of what was learnt from [%].
+        training: in the band, of the training data [%].
         worst: joint with the largest error on unseen motion, counted from 1, and that [%].
         behind, behind_sigma: difference from the best, and its standard error [%].
         good, chosen: whether it is as good as the best, and the one to take.
@@ -104,7 +104,7 @@ def compare_methods(
         each: called with every method when it is done, not yet ranked.
 
     Raises:
-        UsageError: where no recording is unseen, or one shares time with those learnt from; where a name is none of
+        UsageError: where no recording is unseen, or one shares time with the training recordings; where a name is none of
             a method.
     """
     require(inputs.unseen, "methods are ranked by motion that none has seen: give some with --validate", UsageError)
