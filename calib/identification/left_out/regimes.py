@@ -1,7 +1,7 @@
 """Regimes of a motion that models are judged on without having been fitted to them: each joint's extremes.
 
-A model that is right goes on being right where a joint is faster, accelerates more, or stands farther out than anything
-of its training data, and in the direction of travel that it has not seen. Blocks of time hardly ask for that: each holds
+A model that is right goes on being right where a joint is faster, accelerates more, or stands farther out than in
+its training data, and in the direction of travel that it has not seen. Blocks of time hardly ask for that: each holds
 some of everything.
 """
 

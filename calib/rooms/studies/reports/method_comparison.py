@@ -104,7 +104,7 @@ def compare_methods(
         each: called with every method when it is done, not yet ranked.
 
     Raises:
-        UsageError: where no recording is unseen, or one shares time with the training recordings; where a name is none of
+        UsageError: where no recording is unseen, or one overlaps the training recordings; where a name is none of
             a method.
     """
     require(inputs.unseen, "methods are ranked by motion that none has seen: give some with --validate", UsageError)
