@@ -66,6 +66,14 @@ class RobotError(CalibError):
     """A robot description that cannot be read or does not hold together."""
 
 
+class NoPosture(CalibError):
+    """Samples at which the loops do not close, or a posture is singular; ``samples`` are their numbers from 0."""
+
+    def __init__(self, message: str, samples: Sequence[int] = ()):
+        self.samples = tuple(samples)
+        super().__init__(message)
+
+
 class MeasurementError(CalibError):
     """Measured data that cannot be what they claim to be.
 

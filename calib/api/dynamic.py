@@ -164,7 +164,7 @@ def identify_dynamics(
     if (stage := stage_of(robot, "identify", base, tip)) is not None:
         return stage.run(
             listed(recordings), listed(validate), options=chosen, method=method, friction=friction, seed=seed,
-            progress=progress,
+            on_read=on_read, progress=progress,
         )  # fmt: skip
     given = inputs.gather(
         cast(Any, robot), listed(recordings), listed(validate), options=chosen, method=method, friction=friction,

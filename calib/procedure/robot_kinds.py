@@ -21,10 +21,12 @@ class Stage:
     Attributes:
         run: takes the robot and what the verb of `calib` takes; returns a result as of a serial arm.
         check: takes the folder for the results and the files read; raises UsageError for what would be written over.
+        judge: takes inputs, model and findings of an identification; returns its assessment on all recordings.
     """
 
     run: Callable[..., Any]
     check: Callable[..., None]
+    judge: Callable[..., Any] | None = None
 
 
 @runtime_checkable
@@ -35,15 +37,28 @@ class Mechanism(Protocol):
         kind: what it is, in words: ``parallel robot``.
         source: the file it came from.
         joints: what recordings are held against: names, kinds, limits.
+        chain: its actuated joints as those of an arm: name, n, joint_names, joints.
         instead: verb that it does not have → what to do, in a clause.
     """
 
-    kind: str
-    source: Path
-    instead: Mapping[str, str]
-
+    @property
+    def kind(self) -> str: ...
+    @property
+    def source(self) -> Path: ...
+    @property
+    def instead(self) -> Mapping[str, str]: ...
     @property
     def joints(self) -> Joints: ...
+    @property
+    def chain(self) -> Any: ...
+
+    def write(self, folder: Path) -> None:
+        """Write ``robot.toml`` into a folder, by which the folder is this robot."""
+        ...
+
+    def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, Any]:
+        """Return an identified model as ``dynamics.json`` holds it."""
+        ...
 
 
 @runtime_checkable

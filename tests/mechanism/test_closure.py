@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.errors import RobotError
+from calib.errors import NoPosture, RobotError
 from calib.rooms.parallel.mechanism import library, parallel_files
-from calib.rooms.parallel.mechanism.closure import NoPosture, closed, coordinates_of
+from calib.rooms.parallel.mechanism.closure import closed, coordinates_of
 from calib.rooms.parallel.mechanism.leg_links import leg_links
 from calib.rooms.parallel.mechanism.velocities import of_platform, of_readings
 

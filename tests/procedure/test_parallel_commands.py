@@ -79,7 +79,7 @@ def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, 
     assert abs(table["values"]["M5"] / 5.37 - 1.0) < 0.02
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["validation"]["other.csv"]["filtered"]["relative_error_percent"]["total"] < 5.0
-    assert metrics["verdict"]["level"] == "pass"
+    assert metrics["verdict"] == "pass"
     assert metrics["rows"] == (["power"] if options == "power" else ["x", "y", "rz"])
     if options == "power":  # the folder of an identification is a robot
         words = ["--options", folder / "options.toml", "--out", tmp_path / "again", "--no-plots"]

@@ -28,6 +28,7 @@ from calib.procedure.dynamic_stage.loop_tables import INSTRUMENTAL, write_instru
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
+from calib.procedure.robot_kinds import Mechanism
 from calib.records import plain, read_json
 from calib.robot import calibrated
 from calib.units import per_ampere
@@ -149,8 +150,11 @@ def write_folder(
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     inputs, found = outcome.inputs, outcome.found
-    robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
-    calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
+    if isinstance(inputs.robot, Mechanism):
+        inputs.robot.write(folder)
+    else:
+        robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
+        calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
     write_estimate(folder, HEADER, _estimate_rows(outcome))
     estimate = found.fitted.estimate
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
@@ -164,7 +168,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     expected = outcome.assessment.intervals.get(first.name)
     _write_torques(first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
-    table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gains}
+    made = inputs.robot.model_table if isinstance(inputs.robot, Mechanism) else to_table
+    table = made(found.dynamics, found.base, inputs.unit) | {"drive_gains": gains}
     files.write_json(folder / MODEL, table)
     if gains is not None:
         header = ("joint", f"gain [{gains.unit}]", "sigma", "told")

@@ -78,6 +78,8 @@ def find_gains(
             f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): amperes and N m do "
             "not go into one model; state gains for all of them"
         )
+    if not isinstance(chain, Chain):
+        raise UsageError(f"{bare[0]}: currents without drive gains; state gains = [...] (N m/A) in the options file")
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare])
 

@@ -20,6 +20,7 @@ from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, assess
 from calib.procedure.dynamic_stage.verdict import model_warnings, resting_parameters
 from calib.procedure.findings import Verdict
+from calib.procedure.robot_kinds import stage_of
 from calib.units import TORQUE
 
 
@@ -119,7 +120,10 @@ def judged(
 
 def assessed(outcome: IdentificationOutcome, inputs: IdentificationInputs) -> IdentificationOutcome:
     """Return an outcome judged anew on the unseen recordings of `inputs`; nothing is identified."""
-    result = assess(inputs, outcome.found.dynamics, outcome.findings, outcome.errors)
+    if (stage := stage_of(inputs.robot, "identify")) is not None and stage.judge is not None:
+        result = stage.judge(inputs, outcome.found, outcome.findings)
+    else:
+        result = assess(inputs, outcome.found.dynamics, outcome.findings, outcome.errors)
     return replace(outcome, inputs=inputs, assessment=result)
 
 

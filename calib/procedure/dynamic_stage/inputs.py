@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +16,13 @@ from calib.data.signals.decimation import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
 from calib.data.signals.reference_files import with_reference
 from calib.data.signals.resampling import Resampled
-from calib.errors import UsageError, suggestion
+from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
+from calib.procedure.robot_kinds import Mechanism
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.description_checks import remarks
@@ -39,7 +41,8 @@ class IdentificationInputs:
     """A robot and its recordings.
 
     Attributes:
-        robot: as a geometric fit has left it, or as it was described; joint corrections left out.
+        robot: `CalibratedChain` as a geometric fit has left it, or as it was described, joint corrections left out;
+            or a `calib.procedure.robot_kinds.Mechanism`.
         source: the file it came from.
         cases: recordings to learn from.
         unseen: recordings to be predicted.
@@ -48,7 +51,7 @@ class IdentificationInputs:
         currents: how currents become torques.
     """
 
-    robot: CalibratedChain
+    robot: Any
     source: Path
     cases: tuple[Case, ...]
     unseen: tuple[Case, ...]
@@ -76,8 +79,8 @@ class IdentificationInputs:
         return self.currents.found
 
     @property
-    def chain(self) -> Chain:
-        """The arm that is identified."""
+    def chain(self) -> Any:
+        """The arm that is identified; of another robot its actuated joints, with names and limits like an arm's."""
         return self.robot.chain
 
     def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
@@ -90,14 +93,15 @@ class IdentificationInputs:
         names = case_names([*(case.name for case in (*self.cases, *self.unseen)), *paths])[-len(paths) :]
         cases, notes = [], []
         for name, path, each in zip(names, paths, validate):
-            motion = read_motion(each, self.chain, self.options.file_settings(path), self.cases[0].motion)
+            joints = joints_of(self.chain) if isinstance(self.robot, CalibratedChain) else self.robot.joints
+            motion = read_motion(each, joints, self.options.file_settings(path), self.cases[0].motion)
             cases.append(_read_case(path, name, motion, self.options, self.currents))
             notes += [f"{name}: {note}" for note in motion.notes]
         return replace(self, unseen=(*self.unseen, *cases), notes=(*self.notes, *notes))
 
 
 def gather(
-    robot: str | Path | CalibratedChain,
+    robot: str | Path | CalibratedChain | Mechanism,
     recordings: Sequence[str | Path | Recording],
     validate: Sequence[str | Path | Recording] = (),
     *,
@@ -126,9 +130,10 @@ def gather(
     given = [*recordings, *validate]
     paths = [_path(each) for each in given]
     _check_files(options, paths)
-    known = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
-    source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
-    chain = known.chain
+    known = load_calibrated(robot, base, tip) if isinstance(robot, (str, Path)) else robot
+    source = resolve(robot) if isinstance(robot, (str, Path)) else Path(known.source or known.chain.name)
+    chain, arm = known.chain, isinstance(known, CalibratedChain)
+    joints = joints_of(chain) if isinstance(known, CalibratedChain) else known.joints
     if options.settings.loop is not None:
         options.settings.loop.check_lengths(chain.n)
     names = case_names(paths)
@@ -136,10 +141,10 @@ def gather(
     for name, path, each in zip(names, paths, given):
         say(f"reading {name}")
         like = motions[0] if len(motions) >= len(recordings) else None
-        motion = read_motion(each, chain, options.file_settings(path), like)
+        motion = read_motion(each, joints, options.file_settings(path), like)
         motions.append(_referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
     notes = [
-        *remarks(chain, bodies=False),
+        *(remarks(chain, bodies=False) if arm else ()),
         *(f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes),
     ]
     count = len(recordings)
@@ -148,7 +153,8 @@ def gather(
     cases = [_read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     _check_payloads(cases[:count], cases[count:], options.settings)
     return IdentificationInputs(
-        known.without_corrections(), source, tuple(cases[:count]), tuple(cases[count:]), options,
+        known.without_corrections() if isinstance(known, CalibratedChain) else known, source, tuple(cases[:count]),
+        tuple(cases[count:]), options,
         (*notes, *found.notes), found,
     )  # fmt: skip
 
@@ -192,9 +198,13 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, f
     """Return the case of one recording; payload and gains as the options, or the gain identification, say."""
     own = options.file_settings(path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
-    return make_case(
-        name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload, slow=slow
-    )  # fmt: skip
+    try:
+        return make_case(
+            name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own),
+            carried=own.payload, slow=slow,
+        )  # fmt: skip
+    except NoPosture as error:
+        raise MeasurementError(f"{error}", name) from error
 
 
 def read_motion(

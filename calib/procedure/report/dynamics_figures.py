@@ -17,6 +17,7 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import uncertainty_figures
 from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, save_all
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, PAGE_WIDTH, QUIET
+from calib.procedure.robot_kinds import Mechanism
 
 MAX_HALF_PAGE_ROWS = 8  # torque rows whose figures fit half a page
 
@@ -31,7 +32,8 @@ def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
     """Return the figures of an identification by name: torques of every file, residuals, friction."""
     cases = enumerate((*outcome.inputs.cases, *outcome.inputs.unseen), start=1)
     drawn = {f"torque_{number}": file_torques(case, outcome.predictions[case.name], outcome) for number, case in cases}
-    return drawn | {"residuals": _autocorrelations(outcome), "friction": _friction(outcome)}
+    drawn |= {"residuals": _autocorrelations(outcome)}
+    return drawn if isinstance(outcome.inputs.robot, Mechanism) else drawn | {"friction": _friction(outcome)}
 
 
 def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -> Chart:

@@ -23,6 +23,7 @@ from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
 from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text, relative_sigma
 from calib.records import read_rows, typed_rows
+from calib.robot.chain import Chain
 from calib.units import small
 
 MAX_RSD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
@@ -94,8 +95,10 @@ def read(folder: Path) -> DynamicReport:
 def read_blocks(inputs: IdentificationInputs) -> list[Block]:
     """Return robot and recordings as they were read, in sentences."""
     chain = inputs.chain
-    how = "calibrated" if inputs.robot.moved else "nominal geometry"
-    lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {how}"]
+    lines = [str(inputs.robot)]
+    if isinstance(chain, Chain):
+        how = "calibrated" if inputs.robot.moved else "nominal geometry"
+        lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {how}"]
     for case in (*inputs.cases, *inputs.unseen):
         motion = case.motion
         role = "unseen" if any(case is other for other in inputs.unseen) else "to learn from"

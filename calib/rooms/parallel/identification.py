@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from calib import files
+from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
 from calib.data.signals.persistency import ExcitationReport, report_excitation
-from calib.dynamics.base import expressions
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import MeasurementError, UsageError, refuse_option
-from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
-from calib.estimation.estimate import Estimate
-from calib.identification.cases import Case, case_names, make_case
+from calib.errors import UsageError
+from calib.identification.cases import Case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
-from calib.identification.model_file import MODEL
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
-from calib.procedure.dynamic_stage.inputs import read_motion
-from calib.procedure.dynamic_stage.validation import repeated_motion
+from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
+from calib.procedure.dynamic_stage.tracking import Tracking
+from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, repeated_motion
 from calib.procedure.dynamic_stage.verdict import (
     judge,
     motion_warnings,
@@ -38,66 +36,20 @@ from calib.procedure.dynamic_stage.verdict import (
 )
 from calib.procedure.findings import Verdict
 from calib.procedure.robot_kinds import refuse_unread
-from calib.robot.calibrated import ROBOT
-from calib.rooms.parallel.mechanism.closure import NoPosture
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
-from calib.rooms.parallel.results import JudgedResult, ResultFolder, finite
 from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from calib.procedure.report.charts import Chart
-
 OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # settings
 APART = 1e-3  # rms by which redundant encoders contradict each other from which it is said [rad or m] (our choice)
-RATE = 100.0  # of torques_1.csv [Hz]
 FEW = 200  # samples of a recording at which they are asked
 DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.MIN_ENERGY_SHARE`
 
 Recorded = str | Path | Recording
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ParallelDynamics(JudgedResult):
-    """What an identification of a parallel robot came to.
-
-    Attributes:
-        robot: with its file.
-        model: what was identified.
-        options: how recordings were read.
-        found: the model with numbers, estimate and elimination.
-        cases, unseen: training recordings, and others.
-        fit, validation: case name → score.
-        verdict: pass, marginal or fail, by the rules of serial arms (`calib.procedure.dynamic_stage.verdict`).
-        notes: what a user should know.
-    """
-
-    robot: ParallelMechanism
-    model: ParallelModel
-    options: IdentifyOptions
-    found: Identification[RegressorModel]
-    cases: tuple[Case, ...]
-    unseen: tuple[Case, ...]
-    fit: Mapping[str, Score]
-    validation: Mapping[str, Score]
-    verdict: Verdict
-    notes: tuple[str, ...]
-    folder: ClassVar = ResultFolder(
-        (MODEL, ESTIMATE, COVARIANCE, "torques_1.csv", "plot_*.png"), (MODEL,), "identification"
-    )
-
-    @property
-    def estimate(self) -> Estimate:
-        """The base parameters with their covariance."""
-        return self.found.fitted.estimate
-
-    @property
-    def _essential(self) -> Mapping[str, float]:
-        """The essential parameters' values by their names; empty where none were asked for."""
-        gone = self.found.elimination
-        return {} if gone is None else dict(zip(gone.essential.estimate.names, gone.essential.estimate.values))
+class ParallelDynamics(DynamicsModel):
+    """Identified dynamics of a parallel robot: what `calib.identify_dynamics` returns of one."""
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -106,96 +58,8 @@ class ParallelDynamics(JudgedResult):
         Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
         their power [W]: as the model was identified.
         """
-        return self.model.torque(self.found.dynamics.values, q, v, a, ())
-
-    @one_blas_thread()
-    def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: measured and predicted rows."""
-        from calib.procedure.report import charts
-
-        return charts.figures(self._charts())
-
-    def _charts(self) -> dict[str, Chart]:
-        from calib.procedure.report.dynamics_figures import torques
-
-        drawn, prismatic = {}, [joint.kind == "prismatic" for joint in self.robot.known.robot.joints]
-        for number, case in enumerate((*self.cases, *self.unseen), 1):
-            target, model = (case.motion.in_band(x) for x in (case.target, predict(self.found.dynamics, case)))
-            rows, units = case.torque_rows.numbered(case.motion.n), case.torque_rows.units(prismatic)
-            drawn[f"torque_{number}"] = torques(case.motion.t, target, model, rows, units, case.name)
-        return drawn
-
-    def write(self, folder: Path, plots: bool) -> None:
-        """Write estimate, model, torques and figures."""
-        found, estimate, essential = self.found, self.estimate, self._essential
-        words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
-        write_estimate(folder, ("name", "expression", "unit", "value", "sigma", "rsd", "essential"), [
-            [name, expression, unit, float(value), finite(sigma), finite(rsd), essential.get(own)]
-            for name, expression, unit, value, sigma, rsd, own in zip(
-                found.names, words, estimate.units, estimate.values, estimate.sigma, estimate.rsd, estimate.names
-            )
-        ])  # fmt: skip
-        write_covariance(folder / COVARIANCE, found.names, estimate.covariance)
-        files.write_json(folder / MODEL, {
-            "robot": ROBOT, "kind": self.model.torque_rows.name, "payloads": list(self.model.payloads),
-            "v0": found.settings.v0[0], "values": dict(zip(self.model.names, map(float, found.dynamics.values))),
-            "base": dict(zip(found.names, words)), "covariance": COVARIANCE,
-        })  # fmt: skip
-        case = (*self.unseen, *self.cases)[0]
-        step, labels = max(1, round(case.motion.rate / RATE)), case.torque_rows.numbered(case.motion.n)
-        header = ["t [s]", *(f"{what}_{label}" for what in ("measured", "predicted") for label in labels)]
-        table = np.column_stack([case.motion.t, case.target, predict(found.dynamics, case)])
-        files.write_table(folder / "torques_1.csv", header, table[::step].tolist())
-        if plots:
-            from calib.procedure.report.charts import save_all
-
-            save_all(self._charts(), folder)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the metrics as ``metrics.json`` holds them."""
-        found, gone = self.found, self.found.elimination
-        return {
-            "robot": self.robot.known.robot.name,
-            "rows": list(self.model.torque_rows.numbered(self.model.n)),
-            "method": found.fitted.method,
-            "verdict": {"level": self.verdict.level, "reason": self.verdict.reason},
-            "identification": {name: _errors(one) for name, one in self.fit.items()},
-            "validation": {name: _errors(one) for name, one in self.validation.items()},
-            "parameters": {
-                "standard": self.model.p, "base": found.base.b,
-                "essential": found.base.b if gone is None else len(gone.kept),
-            },
-            "condition_number": dict(zip(("raw", "normalised"), map(finite, found.condition))),
-            "elimination": [] if gone is None else [{"name": one.name, "rsd": finite(one.rsd)} for one in gone.steps],
-            "notes": list(self.notes),
-            "seed": found.settings.seed,
-        }  # fmt: skip
-
-    def lines(self) -> list[str]:
-        """Return what the command prints."""
-        robot, found, rows = self.robot.known.robot, self.found, self.model.torque_rows
-        lines = [
-            f"{robot.name}: {len(robot.legs)} legs, {robot.n} actuators, {robot.r} freedoms "
-            f"({', '.join(robot.freedom)}); rows: {rows.name}, {found.base.b} base parameters of {self.model.p}, by "
-            f"{found.fitted.method}"
-        ]
-        essential, estimate = self._essential, self.estimate
-        for name, own, unit, value, sigma, rsd in zip(
-            found.names, estimate.names, estimate.units, estimate.values, estimate.sigma, estimate.rsd
-        ):
-            kept = "" if not essential or own in essential else "  not essential"
-            lines.append(f"  {name:8} {value:12.5g} ± {sigma:.2g} {unit} ({rsd:.3g} %){kept}")
-        for what, scores in (("learnt from", self.fit), ("unseen", self.validation)):
-            lines += [
-                f"{name} ({what}): {one.filtered.total:.3g} % of the {rows.name} rows" for name, one in scores.items()
-            ]
-        return [*lines, *self.notes]
-
-    def with_unseen(self, validate: Sequence[Recorded]) -> ParallelDynamics:
-        """Return an outcome judged anew on more unseen recordings; nothing is identified."""
-        known = (*self.cases, *self.unseen)
-        more = _cases(self.robot, self.model, self.options, validate, known, lambda words: None)
-        return _assessed(self.robot, self.model, self.options, self.found, self.cases, (*self.unseen, *more))
+        dynamics: Any = self.outcome.found.dynamics
+        return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)), ())
 
 
 def identify_parallel(
@@ -207,6 +71,7 @@ def identify_parallel(
     method: str | None = None,
     friction: str | None = None,
     seed: int = 0,
+    on_read: Callable[[IdentificationInputs], None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelDynamics:
     """Identify the dynamics of a parallel robot from recordings of its actuated joints, and judge it.
@@ -221,65 +86,42 @@ def identify_parallel(
         UsageError: for options that only serial arms know.
         MeasurementError: for recordings that cannot be right.
     """
-    say, options = progress or (lambda words: None), options or IdentifyOptions()
-    chosen = {"method": method, "friction": friction}
-    settings = replace(
-        options.settings, seed=seed, **{key: value for key, value in chosen.items() if value is not None}
-    )
-    _refuse(settings, options)
-    known = robot.known
-    wanted = settings.torque_rows.name
+    options, known = options or IdentifyOptions(), robot.known
+    wanted = options.settings.torque_rows.name
     rows = rows_named(known, "" if wanted == "motor" else wanted)
+    chosen = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
+    options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
+    _refuse(options.settings, options)
+    settings = options.settings
+    inputs = gather(robot, recordings, validate, options=options, seed=seed, progress=progress)
+    if on_read is not None:
+        on_read(inputs)
     model = make_parallel_model(
         known, settings.sets, per_joint(settings.v0, 1, "v0")[0], rows, tuple(settings.payloads), settings.passive
     )
-    learnt = _cases(robot, model, options, recordings, (), say)
-    unseen = _cases(robot, model, options, validate, learnt, say)
-    settings = replace(settings, torque_rows=rows)
-    found = identify_model(model, learnt, settings, cad=model.known_parameters(), progress=progress)
-    return _assessed(robot, model, options, found, learnt, unseen)
+    found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
+    notes = (*parameter_warnings(found), *_payload_notes(model, found, inputs.cases), *_redundancy_notes(model))
+    findings = ModelFindings(resting_parameters(found), notes)
+    assessment = assess(inputs, found, findings)
+    return ParallelDynamics(IdentificationOutcome(inputs, found, findings, assessment, seed=settings.seed))
 
 
-def _cases(
-    robot: ParallelMechanism, model: ParallelModel, options: IdentifyOptions, given: Sequence[Recorded],
-    before: Sequence[Case], say: Callable[[str], None],
-) -> tuple[Case, ...]:  # fmt: skip
-    """Return the cases of recordings; the band of those `before` serves where the options state none."""
-    paths = [str(each.file if isinstance(each, Recording) else each) for each in given]
-    names = case_names([*(case.name for case in before), *paths])[len(before) :]
-    cases = []
-    for name, path, each in zip(names, paths, given):
-        say(f"reading {name}")
-        own = options.file_settings(path)
-        motion = read_motion(each, robot.joints, own, before[0].motion if before else None)
-        gains = None if own.gains is None else np.array(per_joint(own.gains, model.n, "gains"))
-        if motion.kind == "current" and gains is None and motion.drive_gain is None:
-            refuse_option(name, "currents without drive gains; state gains = [...] (N m/A) in the options file")
-        gains = motion.drive_gain if gains is None and motion.kind == "current" else gains
-        try:
-            cases.append(make_case(name, motion, model.torque_rows, gains=gains, carried=own.payload))
-        except NoPosture as error:
-            raise MeasurementError(f"{error}", name) from error
-    return tuple(cases)
-
-
-def _assessed(
-    robot: ParallelMechanism, model: ParallelModel, options: IdentifyOptions, found: Identification[RegressorModel],
-    cases: tuple[Case, ...], unseen: tuple[Case, ...],
-) -> ParallelDynamics:  # fmt: skip
-    """Return the outcome: every recording predicted, and the verdict that follows."""
-    scores = {case.name: score(case, predict(found.dynamics, case)) for case in (*cases, *unseen)}
-    fit, validation = ({case.name: scores[case.name] for case in part} for part in (cases, unseen))
+def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
+    """Predict every recording, and judge."""
+    model, cases, unseen = found.dynamics.model, inputs.cases, inputs.unseen
+    assert isinstance(model, ParallelModel)
+    predictions = {case.name: predict(found.dynamics, case) for case in (*cases, *unseen)}
+    fit, validation = ({case.name: score(case, predictions[case.name]) for case in part} for part in (cases, unseen))
     repeated = repeated_motion(cases, unseen)
     excitation = {case.name: report_excitation(case.motion) for case in cases}
     proofs = {name: one for name, one in validation.items() if name not in repeated}
+    validation |= {name: replace(one, evidence=name in proofs) for name, one in validation.items()}
     notes = (
         *_contradictions(model, (*cases, *unseen)), *motion_warnings(validation, repeated, excitation),
-        *parameter_warnings(found), *_payload_notes(model, found, cases), *_redundancy_notes(model),
-        *_recording_notes(model, (*cases, *unseen)),
+        *findings.notes, *_recording_notes(model, (*cases, *unseen)),
     )  # fmt: skip
     verdict = _judged(model, found, cases, fit, proofs, repeated, excitation)
-    return ParallelDynamics(robot, model, options, found, cases, unseen, fit, validation, verdict, notes)
+    return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, Tracking())
 
 
 def _judged(
@@ -344,22 +186,11 @@ def _of_arms(method: Method) -> bool:
     return method.needs_simulation or method.name == "ml"
 
 
-def _errors(one: Score) -> dict[str, Any]:
-    return {
-        key: {
-            "relative_error_percent": {"total": finite(part.total), "rows": [finite(x) for x in part.joints]},
-            "rms": [finite(x) for x in part.rms],
-        }
-        for key, part in (("raw", one.raw), ("filtered", one.filtered))
-    }
-
-
 def _recording_notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
-    """Return how the files were understood, and what they hold that takes no part."""
+    """Return what the files hold that takes no part."""
     robot, notes = model.known.robot, []
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
-        notes += [f"{case.name}: {note}" for note in case.motion.notes]
         unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
         if named := [name for name in passive if name in unread]:
             notes.append(

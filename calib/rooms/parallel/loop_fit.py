@@ -12,23 +12,24 @@ tell neither scale nor place; else pass.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from calib.api.rendering import as_text, data_frame
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
-from calib.errors import CalibError, MeasurementError, UsageError, refuse_data, refuse_option, suggestion
+from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, refuse_data, refuse_option, suggestion
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict, limit
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
-from calib.rooms.parallel.mechanism.closure import ClosedRobot, NoPosture
+from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.geometric_fit import (
     LoopFit,
     contradictions,
@@ -37,7 +38,7 @@ from calib.rooms.parallel.mechanism.geometric_fit import (
     platform_errors,
 )
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, ParallelRobot
-from calib.rooms.parallel.results import JudgedResult, ResultFolder, finite
+from calib.rooms.parallel.results import ParallelResult, ResultFolder, finite
 from calib.rooms.parallel.robots import ParallelMechanism
 
 FOLDS = 4  # of the rows, where none are unseen
@@ -60,7 +61,7 @@ class _Rows:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ParallelFit(JudgedResult):
+class ParallelFit(ParallelResult):
     """A geometric calibration and its files.
 
     Attributes:
@@ -118,6 +119,26 @@ class ParallelFit(JudgedResult):
     def judged(self) -> Mapping[str, np.ndarray]:
         """Errors of unseen rows, by name; of the fitted ones where there are none."""
         return self.unseen or {"fitted": self.own}
+
+    def to_dataframe(self) -> Any:
+        """Return the estimate as a pandas DataFrame: name, unit, value, sigma."""
+        found = self.estimate
+        rows = zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
+        return data_frame(rows, ["name", "unit", "value", "sigma"])
+
+    def renderables(self) -> Iterator[Any]:
+        """Yield what ``print`` shows, for a rich console."""
+        from calib.procedure.report.console import section
+        from calib.procedure.report.page import Section
+
+        yield from self.lines()
+        yield from section(Section("", (), self.verdict.level, self.verdict.reason))
+
+    def __repr__(self) -> str:
+        return f"<ParallelFit of {self.robot.known.robot.name}: {self.verdict.level}>"
+
+    def __str__(self) -> str:
+        return as_text(self.renderables())
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""

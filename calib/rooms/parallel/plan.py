@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from calib.data.csv_table import read_table
-from calib.errors import MeasurementError, UsageError, refuse_data, refuse_option
+from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.motion_bounds import MotionBounds
@@ -25,7 +25,7 @@ from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.design import actuator_bounds
 from calib.rooms.parallel.excite import read_model
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows
-from calib.rooms.parallel.mechanism.closure import ClosedRobot, NoPosture, coordinates_of
+from calib.rooms.parallel.mechanism.closure import ClosedRobot, coordinates_of
 from calib.rooms.parallel.mechanism.distribution import distributed
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model
 from calib.rooms.parallel.results import ParallelResult, ResultFolder, write_motion

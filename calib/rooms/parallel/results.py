@@ -1,15 +1,15 @@
 """Results on parallel robots: the members of those of serial arms, and folders that the next command takes as robots.
 
-``robot.toml`` comes first. identify: ``dynamics.json`` (values of all parameters, base expressions), ``estimate.csv``,
-``covariance.csv``, ``metrics.json`` (errors by recording, parameters, elimination, notes), ``torques_1.csv`` and
-figures. fit: ``estimate.csv`` (changes of the loops' constants), ``covariance.csv``, ``metrics.json``. excite:
-``motion.csv`` (time, platform coordinates, and position, speed, torque of each actuator), ``trajectory.toml`` (the
-actuators' positions as Fourier series, for `calib recall`) and ``metrics.json``. plan: the same without series.
+``robot.toml`` comes first. identify: ``dynamics.json`` (values of all parameters, base expressions); the others are
+those of a serial arm (``calib formats identified``). fit: ``estimate.csv`` (changes of the loops' constants),
+``covariance.csv``, ``metrics.json``. excite: ``motion.csv`` (time, platform coordinates, and position, speed, torque of
+each actuator), ``trajectory.toml`` (the actuators' positions as Fourier series, for `calib recall`) and
+``metrics.json``. plan: the same without series.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,13 +17,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from calib import files
-from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
-from calib.estimation.estimate import Estimate
 from calib.folders import METRICS, check_target, write_staged
 from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.motion_bounds import MotionBounds
-from calib.procedure.findings import Verdict
 from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism import parallel_files
 from calib.rooms.parallel.robots import ParallelMechanism
@@ -86,33 +83,6 @@ class ParallelResult:
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
-
-
-class JudgedResult(ParallelResult):
-    """A fit or an identification: an estimate and a verdict."""
-
-    verdict: Verdict
-    estimate: Estimate
-
-    def to_dataframe(self) -> Any:
-        """Return the estimate as a pandas DataFrame: name, unit, value, sigma."""
-        found = self.estimate
-        rows = zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
-        return data_frame(rows, ["name", "unit", "value", "sigma"])
-
-    def renderables(self) -> Iterator[Any]:
-        """Yield what ``print`` shows, for a rich console."""
-        from calib.procedure.report.console import section
-        from calib.procedure.report.page import Section
-
-        yield from self.lines()
-        yield from section(Section("", (), self.verdict.level, self.verdict.reason))
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {self.robot.known.robot.name}: {self.verdict.level}>"
-
-    def __str__(self) -> str:
-        return as_text(self.renderables())
 
 
 def finite(value: float) -> float | None:

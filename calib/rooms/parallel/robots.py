@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +13,12 @@ from calib.data.recordings.recording import Joints
 from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism import library, parallel_files
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
+from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
+
+if TYPE_CHECKING:
+    from calib.dynamics.base import Base
+    from calib.identification.prediction import Dynamics
+    from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 
 INSTEAD = {
     "choosing poses": "spread poses over its workspace by hand",
@@ -31,6 +38,29 @@ class ParallelMechanism:
     instead: Mapping[str, str] = field(default_factory=lambda: INSTEAD)
 
     @property
+    def chain(self) -> ParallelRobot:
+        """The actuated joints, as those of an arm."""
+        return self.known.robot
+
+    def write(self, folder: Path) -> None:
+        """Write ``robot.toml``."""
+        parallel_files.write(folder / ROBOT, self.known.robot, f"from {self.source}")
+
+    def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
+        """Return the model as ``dynamics.json`` holds it; `calib.rooms.parallel.excite.read_model` reads it."""
+        from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
+        from calib.dynamics.shapes import V0
+        from calib.estimate_files import COVARIANCE
+
+        model = dynamics.model
+        return {
+            "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
+            "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
+            "values": dict(zip(model.names, map(float, dynamics.values))),
+            "base": dict(zip(base.names, expressions(base))), "covariance": COVARIANCE,
+        }  # fmt: skip
+
+    @property
     def joints(self) -> Joints:
         """What recordings are held against: the actuated joints."""
         joints = self.known.robot.joints
@@ -45,6 +75,9 @@ class ParallelMechanism:
             f"<ParallelMechanism {robot.name}: {len(robot.legs)} legs, {robot.n} actuators, {robot.r} freedoms "
             f"({', '.join(robot.freedom)})>"
         )
+
+    def __str__(self) -> str:
+        return repr(self)[1:-1].replace("ParallelMechanism", self.kind)
 
 
 def path_of(robot: object) -> Path | None:

@@ -22,7 +22,7 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen, shaped
-from calib.errors import CalibError, refuse_robot
+from calib.errors import NoPosture, refuse_robot
 from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links, pseudo_inverse, times
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 
@@ -33,14 +33,6 @@ BOUND = 0.5  # of one step [rad or m]
 SINGULAR = 1e-4  # reciprocal condition below which a posture is called singular (our choice)
 NEAR = 0.02  # the same, where Newton's steps fail: that explains it (our choice)
 STEP = 16  # samples of a record of which the first is reached from home, the others from it
-
-
-class NoPosture(CalibError):
-    """Samples at which the loops do not close, or a posture is singular; ``samples`` are their numbers from 0."""
-
-    def __init__(self, message: str, samples: Sequence[int] = ()):
-        self.samples = tuple(samples)
-        super().__init__(message)
 
 
 @dataclass(frozen=True, eq=False)
