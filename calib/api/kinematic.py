@@ -57,7 +57,7 @@ class PoseSelection:
 
     @checked
     def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
-        """Write the poses as CSV under the joints' names [rad or m], and beside it what they will tell.
+        """Write the poses as CSV under the joints' names [rad or m], and next to it what they predict.
 
         That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`. Files that no
         earlier selection left, or that hold measurements since, are refused unless `overwrite`.
@@ -81,7 +81,7 @@ class PoseSelection:
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: sigma of the tool's position over the workspace, and by number of poses.
 
-        There are none where the poses do not tell all parameters.
+        There are none where a parameter is not identifiable.
         """
         from calib.procedure.report.charts import figure
         from calib.procedure.report.geometry_figures import predicted_map
@@ -318,7 +318,7 @@ def fit_geometry(
 
     Raises:
         MeasurementError: for files that cannot be right, naming row and column.
-        Unidentifiable: where the poses tell no parameter.
+        Unidentifiable: where no parameter is identifiable.
         NotConverged: where the fit did not come to an end.
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))

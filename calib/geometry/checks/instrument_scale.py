@@ -29,7 +29,7 @@ Torques = Sequence[np.ndarray | None] | None
 
 @dataclass(frozen=True)
 class Scale:
-    """One factor on all measured lengths, fitted beside base and tool placement of the nominal arm.
+    """One factor on all measured lengths, fitted together with base and tool placement of the nominal arm.
 
     Attributes:
         factor: measured over the arm's.

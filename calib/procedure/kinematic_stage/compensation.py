@@ -4,7 +4,7 @@ Frames are a matter of convention, since an arm that is measured from outside te
 the placement of the instrument and of the target:
 
     --frame base      targets stand in the base of the calibrated robot, as its robot.toml has it: base link and flange
-                      stay where the nominal description has them (the elements that cannot be told stay nominal)
+                      stay where the nominal description has them (elements that are not identifiable stay nominal)
     --frame nominal   targets stand in the base of the nominal robot, placed in the cell where it fits the measurements
                       best: commands change least on the whole
     --frame NAME      targets stand in the frame of that instrument placement (a station of the fit)

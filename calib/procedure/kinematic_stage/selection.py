@@ -44,7 +44,7 @@ TYPICAL = 300  # poses all over the workspace, seen or not, at which the tool's 
 
 @dataclass(frozen=True, eq=False)
 class PoseOutlook:
-    """What a selection will tell, before anything is moved.
+    """What the chosen poses will determine, before anything is moved.
 
     Attributes:
         poses: of the fit on the chosen poses.
@@ -68,12 +68,12 @@ class Chosen:
     Attributes:
         chain: the nominal arm.
         selection: see `poses.select`.
-        parameters: how many the measurements can tell.
+        parameters: how many are identifiable from the measurements.
         existing: index of the poses measured before alone; None without them, or where they are too few.
         checked, unchecked: what the poses were held against, and what they could not be, in words.
         notes: what else a user should know.
-        outlook: what the poses will tell.
-        prediction: the same, as it is kept beside the poses; None where they do not tell all parameters.
+        outlook: predicted accuracy with these poses and with others.
+        prediction: the same, as kept next to the poses; None where a parameter is not identifiable.
         by_images: whether the poses are those at which a camera sees its board.
         run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
     """
@@ -93,7 +93,7 @@ class Chosen:
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """The names of figures that there are of it; none where the poses do not tell all parameters."""
+        """The names of figures that there are of it; none where a parameter is not identifiable."""
         return () if self.prediction is None else FIGURES if self.outlook.others else FIGURES[:1]
 
     def kept(self) -> list[str]:
@@ -215,7 +215,7 @@ def _outlook(
     before: np.ndarray | None,
     comparable: float,
 ) -> PoseOutlook:
-    """Return what chosen poses q (m, n) will tell, and what others would."""
+    """Return the predicted accuracy with chosen poses q (m, n), and with others."""
     space, free = limits.space(seen), limits.space(seen, sight=False)
     typical = _typical_poses(limits, seen, search.seed)
     rows = space.jacobian(q)
@@ -227,7 +227,7 @@ def _outlook(
 
 
 def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
-    """Return what is kept of an outlook; None where the poses do not tell all parameters."""
+    """Return what is kept of an outlook; None where a parameter is not identifiable."""
     own = outlook.poses
     if not np.isfinite(own.rms):
         return None
@@ -235,7 +235,7 @@ def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
 
 
 def _typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
-    """Return poses (s, n) all over the workspace, seen or not, at which the tool's sigma is told."""
+    """Return poses (s, n) all over the workspace, seen or not, at which the tool's σ is predicted."""
     free = limits.space(seen, sight=False)
     stream = np.random.default_rng([seed, 2])
     return draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
@@ -244,7 +244,7 @@ def _typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
 def _blind(
     seen: Seen, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
 ) -> tuple[float, Prediction]:
-    """Return the index that would be reached if every pose were seen, by the same choice, and what would be known."""
+    """Return index and predicted σ when line-of-sight constraints are ignored."""
     quick = replace(search, method="detmax", climbs=0)
     other = select_poses(None, m, quick, space=free, existing=past if len(past) else None)
     return other.value, foretold(seen, np.concatenate([free.jacobian(other.joints), past]), typical, m)
@@ -263,7 +263,7 @@ def targets(out: Path, plots: bool) -> files.Results:
 
 
 def write(chosen: Chosen, path: Path) -> Path:
-    """Write the chosen poses under the joints' names [rad or m], and beside them what they will tell."""
+    """Write the chosen poses under the joints' names [rad or m], and next to them what they predict."""
     if chosen.prediction is not None:
         write_prediction(chosen.prediction, path)
     else:
@@ -276,7 +276,7 @@ def bound_words(found: Selection) -> str:
     climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
     if not climbs:
         return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
-    return f"of all feasible poses, as far as {climbs} searches for better ones can tell; loose by at most {gap:.2g} %"
+    return f"of all feasible poses, as far as {climbs} searches for better ones can show; loose by at most {gap:.2g} %"
 
 
 def record(chosen: Chosen) -> dict[str, Any]:
@@ -306,7 +306,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
     found = chosen.selection
     rows = [
         ("index", f"{found.index}" + (" (its ranking does not depend on units)" if found.index == "O1" else "")),
-        ("parameters that can be told", str(chosen.parameters)),
+        ("identifiable parameters", str(chosen.parameters)),
         ("best of 1000 random sets", f"{found.random_baseline:.6g}"),
     ]
     if chosen.existing is not None:
@@ -321,7 +321,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return what the poses will tell, and what it costs that the instrument has to see them where that is asked."""
+    """Return the predicted accuracy, and what it costs that the instrument has to see them where that is asked."""
     rows = outlook_table(chosen.outlook.poses, chosen.outlook.others)
     if chosen.outlook.blind is None:
         return rows

@@ -1,4 +1,4 @@
-"""What a set of poses will tell, before anything is moved: sigmas of parameters and of the tool's position.
+"""Predicted accuracy of a set of poses, before anything is moved: σ of parameters and of the tool's position.
 
 With W the whitened observation Jacobian of the poses, C = (WᵀW)⁻¹ is the covariance that the fit will state if the
 measurements are as noisy as said and the model is the geometry that the poses were chosen for; a tool's position then
@@ -32,7 +32,7 @@ class Prediction:
     Attributes:
         poses: m.
         points, spread: (s, 3), (s,) where the tool is at typical poses, and sigma of its position there [m]; infinite
-            where the poses do not tell all parameters.
+            where a parameter is not identifiable.
         names, units, sigmas: (p,) of the parameters [m, rad].
     """
 
@@ -68,10 +68,10 @@ def predicted(seen: Seen, jacobians: np.ndarray, typical: np.ndarray, poses: int
     scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
     _, s, vt = np.linalg.svd(rows / scale, full_matrices=False)
     count = len(jacobians) if poses is None else poses
-    told = len(rows) >= rows.shape[1] and len(s) == rows.shape[1] and s[-1] > 1e-9 * s[0]
-    root = (vt.T / s) / scale[:, None] if told else np.full((rows.shape[1], 1), np.inf)
+    identifiable = len(rows) >= rows.shape[1] and len(s) == rows.shape[1] and s[-1] > 1e-9 * s[0]
+    root = (vt.T / s) / scale[:, None] if identifiable else np.full((rows.shape[1], 1), np.inf)
     points, slopes = seen.position(typical)
-    spread = np.sqrt(((slopes @ root) ** 2).sum((1, 2))) if told else np.full(len(typical), np.inf)
+    spread = np.sqrt(((slopes @ root) ** 2).sum((1, 2))) if identifiable else np.full(len(typical), np.inf)
     return Prediction(
         count, points, spread, tuple(names[k] for k in seen.free), tuple(units[k] for k in seen.free),
         np.linalg.norm(root, axis=1),
@@ -111,7 +111,7 @@ def by_count(
 def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, str]]:
     """Return pairs of words and numbers: what is known of the tool and of the parameters, and with more poses."""
     if not np.isfinite(one.rms):
-        return [("predicted σ of the tool's position", "none: the poses do not tell all parameters")]
+        return [("predicted σ of the tool's position", "none: not all parameters are identifiable from these poses")]
     rows = [("predicted σ of the tool's position", f"{1e3 * one.rms:.3g} mm rms, {1e3 * one.worst:.3g} mm at 95 %")]
     worst = []
     for unit, words, shown in (("m", "lengths", "mm"), ("rad", "angles", "mrad")):

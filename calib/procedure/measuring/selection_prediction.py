@@ -49,7 +49,7 @@ def beside(poses: Path) -> Path:
 
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:
-    """Write what a selection predicts beside its CSV."""
+    """Write what a selection predicts next to its CSV."""
     return files.write_json(beside(poses), asdict(prediction))
 
 
@@ -69,7 +69,7 @@ def read(selection: Path) -> SelectionPrediction:
         found = sorted(selection.glob(f"*{SUFFIX}"))
         require(len(found) <= 1, f"{selection} holds {len(found)} predictions: name one CSV of poses", UsageError)
         path = found[0] if found else selection / f"*{SUFFIX}"
-    words = f"there is no {path}: give the CSV that calib select wrote, its prediction beside it, or their folder"
+    words = f"there is no {path}: give the CSV that calib select wrote, its prediction next to it, or their folder"
     require(path.is_file(), words, UsageError)
     return read_json(path, "choose the poses again", SelectionPrediction)
 

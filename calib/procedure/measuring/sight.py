@@ -1,7 +1,7 @@
 """Whether an instrument sees its targets: cone of acceptance, range, and no link of the arm in between.
 
 With several targets (reflectors on one plate, each with a direction of its own) a pose counts if one of them is seen,
-and only the rows of those that are seen count in the observation Jacobian: what faces away tells nothing.
+and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Sight:
         return (PoseConstraint("line of sight to one of the targets", self._best, self._best_gradient),)
 
     def visible(self, q: np.ndarray) -> np.ndarray:
-        """Tell (m, T) which targets are seen at poses q (m, n)."""
+        """Return (m, T) which targets are seen at poses q (m, n)."""
         return self._values(q).max(axis=2) <= SEEN
 
     def _values(self, q: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ ISO_NOTE = (
 )
 ALONE_NOTE = (
     "A URDF cannot hold the joint corrections of the chosen model: robot.urdf is the best geometry without them, and "
-    "its errors stand beside; robot_for_corrections.urdf with joint_corrections.csv has those of the calibrated arm."
+    "its errors are listed, too; robot_for_corrections.urdf with joint_corrections.csv has those of the calibrated arm."
 )
 
 
@@ -87,7 +87,7 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
     blocks.append(_pictures("What the camera saw", drawn, [name for name in drawn if name.startswith("coverage")]))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
-    blocks.append(Text("What the poses can tell", _identifiability(report)))
+    blocks.append(Text("Identifiability", _identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks.append(_parameter_table(report))
     if metrics.outliers:
@@ -211,7 +211,7 @@ def _ladder_table(metrics: FitMetrics) -> Table:
 
 
 def _counted(step: LadderStep) -> str:
-    """Return how many parameters a model has: of the geometry, and the small joint corrections beside them."""
+    """Return how many parameters a model has: of the geometry, and the small joint corrections as well."""
     rigid = step.parameters - step.corrections
     return f"{rigid} + {step.corrections}" if step.corrections else str(rigid)
 
@@ -287,20 +287,20 @@ def _outlier_table(metrics: FitMetrics) -> Table:
 
 
 def _identifiability(report: Report) -> list[str]:
-    """Return what the poses can and cannot tell, in sentences."""
+    """Return which parameters are identifiable from the poses, in sentences."""
     values, rank, lines = report.singular_values, report.rank, []
     unclear, fitted = report.metrics.not_identifiable, report.metrics.fit.parameters
     if values and not unclear:
-        lines.append(f"All {len(values)} candidate parameters can be told apart.")
+        lines.append(f"All {len(values)} candidate parameters are identifiable.")
     if values and fitted < rank:
         lines.append(
-            f"{fitted} of them are fitted: the others are told less exactly than an arm of this kind may be off, so "
+            f"{fitted} of them are fitted: the others are less certain than an arm of this kind may be off, so "
             "they keep their nominal values."
         )
     lines += [f"{line[0].upper()}{line[1:]}" for line in unclear]
     strong = [f"{pair.first} with {pair.second} ({pair.correlation:+.2f})" for pair in report.correlations[:8]]
     if strong:
-        lines.append(f"Told apart only weakly (correlation above 0.9): {', '.join(strong)}.")
+        lines.append(f"Strongly correlated (abs. ρ > 0.9): {', '.join(strong)}.")
     else:
         lines.append("No two parameters correlate by more than 0.9.")
     return lines
@@ -311,7 +311,7 @@ def _pictures(title: str, drawn: Mapping[str, Picture], names: Sequence[str]) ->
 
 
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:
-    """Return for each set of rows with repeated poses what they tell."""
+    """Return for each set of rows with repeated poses their accuracy and repeatability."""
     sets = {"fitted": metrics.fit, **metrics.validation}
     return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
 
