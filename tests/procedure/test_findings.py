@@ -30,6 +30,11 @@ def test_an_entry_is_short_plain_and_complete(code):
         assert len(words.split()) <= 13, "a verdict has 25 words, figures included"
 
 
+def test_every_entry_is_used():
+    sources = "".join(path.read_text(encoding="utf-8") for path in Path(findings.__file__).parents[1].rglob("*.py"))
+    assert [code for code in CODES if f'"{code}"' not in sources] == []
+
+
 def test_every_finding_of_the_code_has_the_values_its_entry_needs():
     made = {}
     for path in Path(findings.__file__).parents[1].rglob("*.py"):
