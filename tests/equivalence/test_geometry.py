@@ -134,8 +134,9 @@ def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[
     if case is spoiled:
         assert two.verdict == "pass", "one wrong cell neither draws the fit nor fails it"
         assert not command("fit", robot, fit, "--loss", "none", "--model", "geometry", "--out", tmp_path / "none")
-        told = " ".join(read(tmp_path / "none/metrics.json")["warnings"])
-        assert "1 row is grossly off" in told and "measured.csv row 9" in told and "no rigid geometry" not in told
+        noticed = {one["code"]: one["values"] for one in read(tmp_path / "none/metrics.json")["noticed"]}
+        assert noticed["gross-rows"]["count"] == 1 and noticed["gross-rows"]["rows"][0].startswith("measured.csv row 9")
+        assert "rigid-misfit" not in noticed
 
 
 def test_a_robot_that_comes_with_corrections_keeps_them_as_its_nominal(files: Path, tmp_path: Path) -> None:

@@ -79,23 +79,22 @@ def test_ur10_another_station(data, calib, here):
 def test_motoman_small_box(data, calib, here):
     """A small box with a still wrist: good within it, and the tool cannot be told from the base."""
     folder = data / "motoman_leica"
-    found, out = metrics_of(calib, folder / "model_right.urdf", folder / "right_6x6x6_150.csv", "--holdout", "0.3333")
+    found, _ = metrics_of(calib, folder / "model_right.urdf", folder / "right_6x6x6_150.csv", "--holdout", "0.3333")
     unseen = found["validation"]["right_6x6x6_150.csv"]
     assert (found["fit"]["poses"], unseen["poses"]) == (100, 50)
     assert unseen["calibrated"]["position_mm"]["rms"] < 0.07
-    assert "cannot be told from" in out
+    assert any("it trades with the placement of" in line for line in found["not_identifiable"])
 
 
 def test_motoman_wide(data, calib, here):
     """No rigid geometry explains it; the early poses behave like another set-up."""
     folder = data / "motoman_leica"
-    found, out = metrics_of(calib, folder / "model_right.urdf", folder / "right_wide_386.csv", "--holdout", "0.259")
+    found, _ = metrics_of(calib, folder / "model_right.urdf", folder / "right_wide_386.csv", "--holdout", "0.259")
     unseen = found["validation"]["right_wide_386.csv"]
     assert unseen["poses"] == 100
     assert unseen["calibrated"]["position_mm"]["rms"] < 1.3
-    assert found["verdict"] == "marginal"
-    assert "no rigid geometry explains" in found["reason"]
-    assert "another set-up" in out
+    assert (found["verdict"], found["code"]) == ("marginal", "rigid-misfit")
+    assert "set-up-changed" in {one["code"] for one in found["noticed"]}
 
 
 @pytest.mark.parametrize(("robot", "position", "distance"), [("panda_2", 0.79, 0.21), ("panda_3", 0.23, 0.05)])
