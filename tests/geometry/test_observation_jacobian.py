@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arms import motley_with_follower
 from differences import check
-from planted import cell, load, measure, mixed_arm, perturb, random_joints
+from planted import cell, load, measure, perturb, random_joints
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.model_choice.effects import EFFECTS
@@ -16,7 +17,7 @@ from calib.geometry.parameters import layout, step
 from calib.robot.deflection import Deflection, Term
 from calib.transforms import pose
 
-CHAINS = {"lwr4plus": lambda: load("lwr4plus"), "ur5": lambda: load("ur5"), "mixed": mixed_arm}
+CHAINS = {"lwr4plus": lambda: load("lwr4plus"), "ur5": lambda: load("ur5"), "mixed": motley_with_follower}
 
 
 def every_basis(chain) -> Deflection:
@@ -177,4 +178,4 @@ def test_parameters_of_a_step_add_up_and_a_zero_step_changes_nothing():
     there = step(truth, free, 1e-3 * np.ones(len(free)))
     assert there.chain.values == pytest.approx(truth.chain.values + 1e-3)
     assert np.asarray(there.deflection.coefficients) == pytest.approx(np.asarray(truth.deflection.coefficients) + 1e-3)
-    assert q.shape == (3, 4)
+    assert q.shape == (3, 5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.robot.chain import Chain, Element, Joint
@@ -44,14 +46,6 @@ def states(n: int, count: int = 20, seed: int = 0) -> np.ndarray:
 
 
 def motley_with_follower() -> Chain:
-    """Return another with prismatic joints, axes x, y, z, signs, a mimic follower, gravity askew."""
-    rng = np.random.default_rng(3)
-    elements = []
-    for j, axis in enumerate(("rx", "tz", "ry", "rz", "tx")):
-        sign = -1.0 if j in (1, 3) else 1.0
-        placement = displace(np.eye(4), rng.normal(size=6) * 0.5)
-        elements.append(Element(f"moving{j}", axis, 0.3, j, j, sign=sign, placement=placement))
-    elements.append(Element("follower", "ry", 0.1, 3, 2, ratio=0.5))
-    kinds = ("revolute", "prismatic", "revolute", "revolute", "prismatic")
-    joints = tuple(Joint(f"joint{j + 1}", kind, -2.0, 2.0) for j, kind in enumerate(kinds))
-    return Chain("motley", joints, tuple(elements), gravity=np.array([1.0, -2.0, -9.0]))
+    """Return the motley arm with a joint that follows another at half its angle."""
+    chain = motley()
+    return replace(chain, elements=(*chain.elements, Element("follower", "ry", 0.1, 4, 2, ratio=0.5)))

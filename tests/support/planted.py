@@ -13,7 +13,7 @@ from calib.data.poses.measurements import KINDS, Planes, PoseMeasurements, Socke
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import observe, prepare, stack
 from calib.geometry.result import GeometricFit
-from calib.robot.chain import Chain, Element, Joint, random_joints
+from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import joint_jacobian
 from calib.robot.load import load
 from calib.transforms import pose
@@ -176,28 +176,4 @@ def position_error(found: Installation, truth: Installation, q: np.ndarray) -> n
     return np.linalg.norm(see(found, q).point - see(truth, q).point, axis=0)
 
 
-def mixed_arm() -> Chain:
-    """Return an arm with revolute, prismatic, mimicked and reversed joints and a fixed placement."""
-    turn = pose(Rotation.from_euler("xyz", [0.3, -0.4, 1.1]), [0.1, 0.05, 0.3])
-    joints = (Joint("lift", "prismatic", -0.2, 0.4), Joint("a", lower=-2, upper=2), Joint("b", lower=-2, upper=2))
-    joints += (Joint("c", lower=-2, upper=2),)
-    specs = [("s1", "tz", 0), ("x1", "rx", None), ("y1", "ty", None), ("t1", "rz", 1), ("x2", "rx", None)]
-    specs += [
-        ("d2", "tx", None),
-        ("t2", "ry", 2),
-        ("d3", "tx", None),
-        ("f3", "ry", 2),
-        ("z4", "tz", None),
-        ("t4", "rx", 3),
-    ]
-    extra = {"t1": {"placement": turn}, "f3": {"ratio": -0.5}, "t4": {"sign": -1.0}, "s1": {"ratio": 0.5}}
-    owners = {"s1": 0, "x1": 1, "y1": 1, "t1": 1, "x2": 2, "d2": 2, "t2": 2, "d3": 3, "f3": 3, "z4": 3, "t4": 3}
-    values = np.random.default_rng(3).uniform(-0.6, 0.6, len(specs))
-    elements = tuple(
-        Element(name, axis, float(v), owners[name], joint, **extra.get(name, {}))
-        for (name, axis, joint), v in zip(specs, values)
-    )
-    return Chain("mixed", joints, elements, tail=turn)
-
-
-__all__ = ["cell", "deviation", "frames", "load", "measure", "mixed_arm", "perturb", "position_error", "random_joints"]
+__all__ = ["cell", "deviation", "frames", "load", "measure", "perturb", "position_error", "random_joints"]
