@@ -14,10 +14,10 @@ from calib.dynamics import drives
 from calib.dynamics.shapes import Joined
 from calib.identification.cases import Case
 from calib.identification.friction.drive_table import drive_table
-from calib.identification.friction.passivity import braking
+from calib.identification.friction.passivity import braking, driven
 from calib.identification.identify import Identification, identify
 from calib.identification.left_out.regimes import regimes
-from calib.identification.prediction import predict
+from calib.identification.prediction import Dynamics, predict
 from calib.identification.settings import IdentificationSettings
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
@@ -101,3 +101,13 @@ def test_regimes_hold_each_joints_extremes_and_with_the_rest_are_everything():
     np.testing.assert_allclose(share[2:4], 0.15, atol=0.01)
     np.testing.assert_allclose(share[4] + share[5], 1.0, atol=0.01)
     np.testing.assert_allclose(own.squares[4] + own.squares[5], own.whole, rtol=0.02, atol=1e-3 * own.whole.max())
+
+
+def test_friction_drives_a_joint_only_where_it_moves():
+    case, model, values = planted.case("log", 0), planted.model(), planted.truth()
+    values[[model.names.index(name) for name in ("Fv2", "Fc2")]] *= -1.0
+    speeds = np.array(case.motion.v)
+    speeds[:, 1] = 1e-5 * np.random.default_rng(0).normal(size=len(speeds))
+    still = replace(case, motion=replace(case.motion, v=frozen(speeds)))
+    assert driven(Dynamics(model, values), [case]) == (1,)
+    assert driven(Dynamics(model, values), [still]) == ()
