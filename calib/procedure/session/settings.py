@@ -173,7 +173,7 @@ class DynamicsSection:
         options: a TOML file beside this one; see `calib formats identify-options`
         holdout: share of each recording, its end, that is not identified from but judged on, for want of another; 0:
             none
-        tolerance_percent: largest torque error on unseen motion that is good enough; 0: none
+        tolerance_percent: largest torque error of the exported robot on unseen motion that is good enough [%]; 0: none
         payloads: label = mass [kg] of bodies at the flange: loaded = 3.28
     """
 

@@ -22,7 +22,7 @@ GAINS = np.array([10.0, 12.0, 8.0])
 
 def currents(folder: Path, name: str, seed: int, payload: bool = False) -> Path:
     """Write a recording of currents, torque = gain · current."""
-    t, q, v, a = planted.motion(seed)
+    t, q, v, a = planted.motion(seed, duration=12.0)
     tau = planted.torques(q, v, a, payload=payload)
     rng = np.random.default_rng(seed)
     path = folder / name

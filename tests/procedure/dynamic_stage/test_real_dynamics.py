@@ -334,7 +334,7 @@ LOGS = {
 }
 
 
-@pytest.mark.parametrize("log", LOGS)
+@pytest.mark.parametrize("log", [pytest.param(one, marks=[pytest.mark.slow] * ("tx40" not in one)) for one in LOGS])
 def test_no_sign_and_no_order_of_a_sound_recording_is_called_wrong(data, log):
     robot, (start, middle, end) = (data / log).parent / "model.urdf", LOGS[log]
     for part in ((start, end), (start, middle), (middle, end)):
