@@ -324,11 +324,12 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
     assert not Path("e").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extra", "changed", "words"),
     [
         ("[torque]\nall = 0.05", {"lock": ("joint2=1.57",)}, r"breaks the torque limit .*that of \[torque\]"),
-        pytest.param("", {"hard": ("wrist=0.9",)}, "hard goal torque slack of joints 6, 7", marks=pytest.mark.slow),
+        ("", {"hard": ("wrist=0.9",)}, "hard goal torque slack of joints 6, 7"),
     ],
 )
 def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, changed, words):

@@ -42,8 +42,12 @@ def recorded(folder: Path, what: str) -> Session:
     return session
 
 
-def test_it_ends_in_a_certificate_and_says_how_well_the_exported_robot_predicts(tmp_path: Path) -> None:
-    session = recorded(tmp_path, "tau")
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return recorded(tmp_path_factory.mktemp("alone"), "tau")
+
+
+def test_it_ends_in_a_certificate_and_says_how_well_the_exported_robot_predicts(session: Session) -> None:
     assert [state.step.name for state in steps.states(session)] == [
         "describe", "excite", "record", "identify", "predict", "export", "certificate",
     ]  # fmt: skip
@@ -76,8 +80,7 @@ def test_torques_in_amperes_are_good_for_prediction_only(tmp_path: Path, capsys:
     assert run("next", session.folder) == 0 and "no robot was exported" in capsys.readouterr().out
 
 
-def test_no_file_says_another_verdict_than_that_of_what_is_delivered(tmp_path: Path) -> None:
-    session = recorded(tmp_path, "tau")
+def test_no_file_says_another_verdict_than_that_of_what_is_delivered(session: Session) -> None:
     for tolerance, exports, verdict, why in (
         (1e-6, True, "fail", "the exported robot leaves"), (0.0, False, PREDICTION_ONLY, "no such robot"),
     ):  # fmt: skip
