@@ -6,11 +6,11 @@ Layers are lines, bars, marked levels, words, coloured dots, heat maps, histogra
 from __future__ import annotations
 
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial, wraps
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,200 +25,128 @@ from calib.procedure.report.style import AFTER, INK, MARK, PAGE_WIDTH, QUIET, lo
 SIZE = 16.0  # of a coloured dot [pt²]
 
 
-class Layer(Protocol):
-    """Something that a panel shows."""
-
-    def draw(self, axes: Axes) -> None:
-        """Draw onto axes whose scales are set."""
-        ...
+P = ParamSpec("P")
+Layer = Callable[..., None]  # draws onto the axes of a panel, whose scales are set
 
 
-@dataclass(frozen=True, eq=False)
-class Line:
-    """A curve or points (k,), in matplotlib's letters (``-``, ``o``, ``o-``); `spread` (k,): half lengths of bars."""
+def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
+    """Return the function that takes all but the axes of a drawing function, and returns the layer it draws.
 
-    x: Any
-    y: Any
-    form: str = "-"
-    colour: str = AFTER
-    width: float = 0.9
-    size: float = 3.5
-    hollow: bool = False
-    label: str = ""
-    spread: Any = None
+    What it returns can be pickled, which the cache of drawn pictures needs.
+    """
 
-    def draw(self, axes: Axes) -> None:
-        """Draw it, long curves thinned."""
-        x, y = np.asarray(self.x, dtype=float), np.asarray(self.y, dtype=float)
-        if self.form == "-":
-            x, y = style.thinned(x, y)
-        axes.errorbar(
-            x, y, self.spread, fmt=self.form, color=self.colour, linewidth=self.width, markersize=self.size,
-            markerfacecolor="white" if self.hollow else self.colour, label=self.label,
-            markeredgewidth=0.8 if self.hollow or self.form == "+" else 0.0,
-        )  # fmt: skip
+    @wraps(draw)
+    def made(*given: Any, on: Axes | None = None, **options: Any) -> Any:
+        return partial(made, *given, **options) if on is None else draw(on, *given, **options)
+
+    return made
 
 
-@dataclass(frozen=True, eq=False)
-class Bars:
-    """Bars (k,) from `base` at 0, 1, …, in one colour or one each, sideways or upright, with bars of error or none."""
+@layer
+def line(
+    axes: Axes, x: Any, y: Any, form: str = "-", colour: str = AFTER, width: float = 0.9, size: float = 3.5,
+    hollow: bool = False, label: str = "", spread: Any = None,
+) -> None:  # fmt: skip
+    """Draw a curve or points (k,), in matplotlib's letters (``-``, ``o``, ``o-``); long curves are thinned.
 
-    values: Any
-    colours: Any = AFTER
-    upright: bool = False
-    shift: float = 0.0
-    thick: float = 0.7
-    base: float = 0.0
-    spread: Any = None
-    label: str = ""
-
-    def draw(self, axes: Axes) -> None:
-        """Draw them."""
-        values = np.asarray(self.values, dtype=float)
-        place = np.arange(len(values)) + self.shift
-        kind, error = (axes.bar, "yerr") if self.upright else (axes.barh, "xerr")
-        bars: Any = {error: self.spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
-        given = (values - self.base, self.thick, self.base)
-        kind(place, *given, color=self.colours, label=self.label, **(bars if self.spread is not None else {}))
+    Args:
+        spread: (k,) half lengths of error bars; None: none.
+    """
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    if form == "-":
+        x, y = style.thinned(x, y)
+    axes.errorbar(
+        x, y, spread, fmt=form, color=colour, linewidth=width, markersize=size, label=label,
+        markerfacecolor="white" if hollow else colour, markeredgewidth=0.8 if hollow or form == "+" else 0.0,
+    )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Level:
-    """A dashed line across the panel, horizontal or upright; words beside an upright one stand at this height."""
-
-    at: float
-    colour: str = MARK
-    form: str = "--"
-    upright: bool = False
-    words: str = ""
-    height: float = 0.98
-
-    def draw(self, axes: Axes) -> None:
-        """Draw it."""
-        (axes.axvline if self.upright else axes.axhline)(self.at, color=self.colour, linewidth=0.8, linestyle=self.form)
-        if not self.words:
-            return
-        where = axes.transAxes.inverted().transform(axes.transData.transform((self.at, self.at)))
-        right = not self.upright or where[0] < 0.6
-        point, frame = ((self.at, self.height), ("data", "axes fraction"))
-        if not self.upright:
-            point, frame = (0.0, self.at), ("axes fraction", "data")
-        axes.annotate(
-            self.words, point, xycoords=frame, xytext=(3 if right else -3, 0 if self.upright else 1),
-            textcoords="offset points", color=self.colour, va="top" if self.upright else "bottom",
-            ha="left" if right else "right",
-        )  # fmt: skip
+@layer
+def bars(
+    axes: Axes, values: Any, colours: Any = AFTER, upright: bool = False, shift: float = 0.0, thick: float = 0.7,
+    base: float = 0.0, spread: Any = None, label: str = "",
+) -> None:  # fmt: skip
+    """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half lengths of error bars."""
+    values = np.asarray(values, dtype=float)
+    kind, error = (axes.bar, "yerr") if upright else (axes.barh, "xerr")
+    errors: Any = {error: spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
+    place = np.arange(len(values)) + shift
+    kind(place, values - base, thick, base, color=colours, label=label, **({} if spread is None else errors))
 
 
-@dataclass(frozen=True)
-class Words:
-    """Words at a point, moved by an offset [pt]."""
-
-    words: str
-    x: float
-    y: float
-    offset: tuple[float, float] = (4, 4)
-    colour: str = INK
-    size: float = 7.0
-    across: str = "left"
-    along: str = "baseline"
-
-    def draw(self, axes: Axes) -> None:
-        """Write them."""
-        axes.annotate(
-            self.words, (self.x, self.y), self.offset, textcoords="offset points", color=self.colour,
-            fontsize=self.size, ha=self.across, va=self.along,
-        )  # fmt: skip
+@layer
+def level(
+    axes: Axes, at: float, colour: str = MARK, form: str = "--", upright: bool = False, words: str = "",
+    height: float = 0.98,
+) -> None:  # fmt: skip
+    """Draw a line across the panel, horizontal or upright; words at an upright one stand at this height."""
+    (axes.axvline if upright else axes.axhline)(at, color=colour, linewidth=0.8, linestyle=form)
+    right = not upright or axes.transAxes.inverted().transform(axes.transData.transform((at, at)))[0] < 0.6
+    axes.annotate(
+        words, (at, height) if upright else (0.0, at),
+        xycoords=("data", "axes fraction") if upright else ("axes fraction", "data"),
+        xytext=(3 if right else -3, 0 if upright else 1), textcoords="offset points", color=colour,
+        va="top" if upright else "bottom", ha="left" if right else "right",
+    )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Dots:
-    """Points (k,) coloured by their values (k,) up to `most`, which a scale explains where it has a `unit`."""
-
-    x: Any
-    y: Any
-    values: Any
-    most: float
-    unit: str = ""
-
-    def draw(self, axes: Axes) -> None:
-        """Draw them, the largest values on top."""
-        order = np.argsort(self.values)
-        x, y, values = (np.asarray(each)[order] for each in (self.x, self.y, self.values))
-        drawn = axes.scatter(
-            x, y, SIZE, values, cmap="cividis_r", vmin=0.0, vmax=self.most, edgecolors=QUIET, linewidths=0.25
-        )
-        if self.unit:
-            _scale(axes, drawn, self.unit, extend="max" if values[-1] > self.most else "neither")
+@layer
+def text(
+    axes: Axes, words: str, x: float, y: float, offset: tuple[float, float] = (4, 4), colour: str = INK,
+    size: float = 7.0, across: str = "left", along: str = "baseline",
+) -> None:  # fmt: skip
+    """Write words at a point, moved by an offset [pt]."""
+    axes.annotate(words, (x, y), offset, textcoords="offset points", color=colour, fontsize=size, ha=across, va=along)
 
 
-@dataclass(frozen=True, eq=False)
-class Heat:
-    """A map (rows, columns) of values, row 0 above; NaN stays white.
+@layer
+def dots(axes: Axes, x: Any, y: Any, values: Any, most: float, unit: str = "") -> None:
+    """Draw points (k,) coloured by their values (k,) up to `most`; a scale explains them where there is a `unit`."""
+    order = np.argsort(values)  # the largest on top
+    x, y, values = (np.asarray(each)[order] for each in (x, y, values))
+    drawn = axes.scatter(x, y, SIZE, values, cmap="cividis_r", vmin=0.0, vmax=most, edgecolors=QUIET, linewidths=0.25)
+    if unit:
+        _scale(axes, drawn, unit, extend="max" if values[-1] > most else "neither")
 
-    Attributes:
+
+@layer
+def heat(
+    axes: Axes, values: Any, unit: str = "", extent: tuple[float, float, float, float] | None = None,
+    limits: tuple[float, float | None] = (0.0, None), colours: str = "cividis_r", written: bool = False,
+) -> None:  # fmt: skip
+    """Draw a map (rows, columns) of values with its scale, row 0 above; NaN stays white.
+
+    Args:
         extent: left, right, bottom, top; by default cell k is at k.
         limits: of the colours; from 0 by default.
         written: whether values stand in their cells.
     """
-
-    values: Any
-    unit: str = ""
-    extent: tuple[float, float, float, float] | None = None
-    limits: tuple[float, float | None] = (0.0, None)
-    colours: str = "cividis_r"
-    written: bool = False
-
-    def draw(self, axes: Axes) -> None:
-        """Draw it, and its scale."""
-        low, high = self.limits
-        drawn = axes.imshow(
-            self.values, self.colours, vmin=low, vmax=high, extent=self.extent, interpolation="nearest",
-            aspect="equal" if self.extent else "auto",
-        )  # fmt: skip
-        for (i, j), value in np.ndenumerate(self.values) if self.written else ():
-            axes.text(
-                j,
-                i,
-                f"{value:.2f}",
-                ha="center",
-                va="center",
-                fontsize=5.5,
-                color=INK if abs(value) <= 0.6 else "white",
-            )
-        _scale(axes, drawn, self.unit)
+    drawn = axes.imshow(
+        values, colours, vmin=limits[0], vmax=limits[1], extent=extent, interpolation="nearest",
+        aspect="equal" if extent else "auto",
+    )  # fmt: skip
+    for (i, j), value in np.ndenumerate(values) if written else ():
+        colour = INK if abs(value) <= 0.6 else "white"
+        axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=5.5, color=colour)
+    _scale(axes, drawn, unit)
 
 
-@dataclass(frozen=True, eq=False)
-class Histogram:
-    """Counts (k,) between edges (k + 1,)."""
-
-    counts: Any
-    edges: Any
-    colour: str = AFTER
-
-    def draw(self, axes: Axes) -> None:
-        """Draw it."""
-        axes.stairs(self.counts, self.edges, fill=True, color=self.colour, alpha=0.9)
-        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+@layer
+def histogram(axes: Axes, counts: Any, edges: Any, colour: str = AFTER) -> None:
+    """Draw counts (k,) between edges (k + 1,)."""
+    axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
-@dataclass(frozen=True, eq=False)
-class Box:
-    """Values (k,) at a place of the y axis: quartiles and median, 5th and 95th percentile, points beyond."""
-
-    values: Any
-    place: float
-    colour: str = AFTER
-
-    def draw(self, axes: Axes) -> None:
-        """Draw it."""
-        axes.boxplot(
-            [self.values], positions=[self.place], orientation="horizontal", whis=(5, 95), widths=0.56,
-            patch_artist=True, manage_ticks=False, boxprops={"facecolor": self.colour, "linewidth": 0},
-            medianprops={"color": "white", "linewidth": 1.4}, whiskerprops={"color": QUIET}, capprops={"linewidth": 0},
-            flierprops={"marker": ".", "markersize": 2.0, "markeredgecolor": QUIET},
-        )  # fmt: skip
+@layer
+def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
+    """Draw values (k,) at a place of the y axis: quartiles and median, 5th and 95th percentile, points beyond."""
+    axes.boxplot(
+        [values], positions=[place], orientation="horizontal", whis=(5, 95), widths=0.56, patch_artist=True,
+        manage_ticks=False, boxprops={"facecolor": colour, "linewidth": 0}, whiskerprops={"color": QUIET},
+        medianprops={"color": "white", "linewidth": 1.4}, capprops={"linewidth": 0},
+        flierprops={"marker": ".", "markersize": 2.0, "markeredgecolor": QUIET},
+    )  # fmt: skip
 
 
 def _scale(axes: Axes, drawn: Any, unit: str, **options: Any) -> None:
@@ -280,8 +208,8 @@ class Panel:
             axes.yaxis.set(major_formatter=lambda value, _: style.number(value), minor_locator=NullLocator())
         if self.equal:
             axes.set_aspect("equal", adjustable="datalim")
-        for layer in self.layers:
-            layer.draw(axes)
+        for show in self.layers:
+            show(on=axes)
         if self.grid:
             axes.grid(axis=self.grid)  # type: ignore[arg-type]
         axes.tick_params(labelbottom="x" not in self.bare, labelleft="y" not in self.bare)

@@ -15,7 +15,7 @@ from calib.estimation.whiteness import Whiteness
 from calib.identification.cases import Case
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import uncertainty_figures
-from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, save_all
+from calib.procedure.report.charts import Chart, Panel, bars, level, line, save_all
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, PAGE_WIDTH, QUIET
 from calib.procedure.robot_kinds import Mechanism
 
@@ -101,9 +101,9 @@ def torques(
     for j, (row, unit) in enumerate(zip(rows, units)):
         left = f": {errors[j]:.3g} % left" if j < len(errors) and np.isfinite(errors[j]) else ""
         lines = [
-            Line(t, measured[:, j], "-", BEFORE, 1.4, label="measured"),
-            Line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
-            Line(t, measured[:, j] - predicted[:, j], "-", QUIET, 0.5, label="measured - predicted"),
+            line(t, measured[:, j], "-", BEFORE, 1.4, label="measured"),
+            line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
+            line(t, measured[:, j] - predicted[:, j], "-", QUIET, 0.5, label="measured - predicted"),
         ]
         inner = j + columns < len(rows)
         words = "" if inner else "time [s]"
@@ -113,12 +113,12 @@ def torques(
 
 def errors_by_row(fitted: np.ndarray, unseen: np.ndarray, rows: Sequence[str]) -> Chart:
     """Return the relative error of every row [%], on the training and on unseen motion."""
-    bars = [
-        Bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
-        Bars(unseen, AFTER, shift=0.19, thick=0.36, label="unseen motion"),
+    shown = [
+        bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
+        bars(unseen, AFTER, shift=0.19, thick=0.36, label="unseen motion"),
     ]
     title = f"at most {max(unseen):.3g} % left" if len(rows) else ""
-    panel = Panel(bars, x="torque unexplained [%]", ynames=rows, grid="x")
+    panel = Panel(shown, x="torque unexplained [%]", ynames=rows, grid="x")
     return Chart(
         [panel], 0.8 + 0.21 * len(rows), width=PAGE_WIDTH if len(rows) > MAX_HALF_PAGE_ROWS else HALF_WIDTH, title=title
     )
@@ -142,7 +142,7 @@ def autocorrelations(
         inner = k + columns < len(shown)
         panels.append(
             Panel(
-                [Bars([0.0, *white.acf], upright=True, thick=0.4), Level(white.bound), Level(-white.bound)],
+                [bars([0.0, *white.acf], upright=True, thick=0.4), level(white.bound), level(-white.bound)],
                 row,
                 "" if inner else "lag [samples]",
                 ylim=(-1.0, 1.0),
@@ -170,9 +170,9 @@ def friction(
     columns, step = min(len(rows), 4), max(1, len(velocity) // 1400)
     panels = []
     for j, row in enumerate(rows):
-        dots = Line(velocity[::step, j], observed[::step, j], ".", BEFORE, size=1.5, label="model + residual")
+        cloud = line(velocity[::step, j], observed[::step, j], ".", BEFORE, size=1.5, label="model + residual")
         words = f"friction [{units[j][1]}]" if j % columns == 0 or units[j] != units[j - 1] else ""
-        layers = [dots, Line(*curves[j], width=1.2, label="model")]
+        layers = [cloud, line(*curves[j], width=1.2, label="model")]
         panels.append(Panel(layers, row, f"velocity [{units[j][0]}]", words))
     return Chart(panels, 0.5 + 1.55 * -(-len(rows) // columns), columns, title=title)
 
@@ -185,7 +185,7 @@ def significance(names: Sequence[str], values: np.ndarray, sigma: np.ndarray) ->
         values, sigma: (p,), in each parameter's unit.
     """
     share = np.maximum(np.abs(values) / np.maximum(sigma, 1e-300), 0.1)
-    bars = Bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
+    shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
     title = f"{int((share > 2).sum())} of {len(names)} parameters differ from zero by two sigmas"
     limits = 0.1, 2.0 * float(share.max(initial=2.0))
-    return Chart([Panel([bars, Level(2.0)], title, y="|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
+    return Chart([Panel([shown, level(2.0)], title, y="|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.procedure.report.charts import Bars, Chart, Dots, Heat, Histogram, Level, Line, Panel, Words
+from calib.procedure.report.charts import Chart, Panel, bars, dots, heat, histogram, level, line, text
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
 from calib.units import ERRORS
 
@@ -37,10 +37,10 @@ def error_histogram(
     counts = [np.histogram(sizes, edges)[0] for sizes in (one, two)]
     panel = Panel(
         [
-            *(Histogram(count, edges, colour) for count, colour in zip(counts, (BEFORE, AFTER))),
-            Level(rms[0], BROWN, upright=True, words="nominal"),
-            Level(rms[1], AFTER, upright=True, words="calibrated"),
-            *([Level(seen, INK, ":", upright=True, words="instrument", height=0.89)] if noise else []),
+            *(histogram(count, edges, colour) for count, colour in zip(counts, (BEFORE, AFTER))),
+            level(rms[0], BROWN, upright=True, words="nominal"),
+            level(rms[1], AFTER, upright=True, words="calibrated"),
+            *([level(seen, INK, ":", upright=True, words="instrument", height=0.89)] if noise else []),
         ],
         f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after", f"{nature} error [{unit}]", "poses",
         xlim=(edges[0], edges[-1]), ylim=(0.0, 1.2 * max(1, *map(max, counts))), log="x" if apart else "",
@@ -74,14 +74,14 @@ def residuals_by_joint(
     panels = []
     for j in range(n):
         x = q[:, j] if slides[j] else np.rad2deg(q[:, j])
-        dots = [
-            Line(x, factor * errors, ".", colour, size=4.5, label=label)
+        cloud = [
+            line(x, factor * errors, ".", colour, size=4.5, label=label)
             for errors, colour, label in ((before, BEFORE, "nominal"), (after, AFTER, "calibrated"))
         ]
         inner = j % columns > 0
         panels.append(
             Panel(
-                dots,
+                cloud,
                 x=f"{joint_names[j]} [{'m' if slides[j] else 'deg'}]",
                 y="" if inner else f"error [{unit}]",
                 ylim=limits,
@@ -116,8 +116,8 @@ def error_map(
     panels = [
         Panel(
             [
-                Dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), most, "[mm]" if j == 2 else ""),
-                Line([0.0], [0.0], "+", INK, size=9.0), Words("base", 0.0, 0.0, (0, -5), across="center", along="top"),
+                dots(points[:, 0], points[:, j], 1e3 * np.asarray(values), most, "[mm]" if j == 2 else ""),
+                line([0.0], [0.0], "+", INK, size=9.0), text("base", 0.0, 0.0, (0, -5), across="center", along="top"),
             ],
             title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True, ticks=6,
         )
@@ -145,7 +145,7 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
         (rms, "[px]", "reprojection error, rms"),
     )
     panels = [
-        Panel([Heat(np.where(count > 0, values, np.nan), unit, (0, wide, high, 0))], title, "u [px]", "v [px]", ticks=5)
+        Panel([heat(np.where(count > 0, values, np.nan), unit, (0, wide, high, 0))], title, "u [px]", "v [px]", ticks=5)
         for values, unit, title in shown
     ]
     return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * high / wide, 2)
@@ -170,10 +170,10 @@ def parameter_changes(
             continue
         value, spread = 1e3 * changes[chosen], 2e3 * sigmas[chosen]
         clear = np.abs(value) > spread
-        bars = Bars(value, [AFTER if one else PALE for one in clear], spread=spread)
+        shown = bars(value, [AFTER if one else PALE for one in clear], spread=spread)
         words = f"{int(clear.sum())} of {len(chosen)} {what} clearly changed"
         labels = [names[k] for k in chosen]
-        panels.append(Panel([bars], words, f"calibrated - nominal [{unit}], bars ±2σ", ynames=labels, grid="x"))
+        panels.append(Panel([shown], words, f"calibrated - nominal [{unit}], bars ±2σ", ynames=labels, grid="x"))
         longest = max(longest, len(chosen))
     return Chart(panels, 0.65 + 0.155 * longest, max(1, len(panels)))
 
@@ -189,12 +189,12 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
     shown = np.maximum(values, max(values[0] * 1e-17, 1e-17))
     count = np.arange(1, len(values) + 1)
     layers: list = [
-        Line(count[:rank], shown[:rank], "o"), Line(count[rank:], shown[rank:], "o", MARK, hollow=True),
+        line(count[:rank], shown[:rank], "o"), line(count[rank:], shown[rank:], "o", MARK, hollow=True),
     ]  # fmt: skip
     if 0 < rank < len(values):
         last, first = shown[rank - 1], shown[rank]
         middle = rank + 0.5, float(np.sqrt(last * first))
-        layers.append(Words(f"gap {number(last / first)}", *middle, (-6, 0), MARK, across="right", along="center"))
+        layers.append(text(f"gap {number(last / first)}", *middle, (-6, 0), MARK, across="right", along="center"))
     title = f"{rank} of {len(values)} parameters are identifiable"
     limits = 0.3 * float(shown.min()), 3.0 * float(shown.max())
     return Chart(
@@ -221,12 +221,12 @@ def ladder(
     errors, x, taken = 1e3 * np.asarray(unseen, dtype=float), np.arange(len(models)), np.flatnonzero(kept)
     left_out, last = np.setdiff1d(x, taken), taken[-1:]
     layers: list = [
-        Line(x[taken], errors[taken], "o-", size=5.0), Line(x[left_out], errors[left_out], "o", size=5.0, hollow=True),
-        Line(x[last], errors[last], "o", size=8.0),
-        *(Words(f"{error:.3g}", place, error, (0, 8), across="center") for place, error in enumerate(errors)),
+        line(x[taken], errors[taken], "o-", size=5.0), line(x[left_out], errors[left_out], "o", size=5.0, hollow=True),
+        line(x[last], errors[last], "o", size=8.0),
+        *(text(f"{error:.3g}", place, error, (0, 8), across="center") for place, error in enumerate(errors)),
     ]  # fmt: skip
     if noise:
-        layers.append(Level(1e3 * noise, INK, ":", words="instrument"))
+        layers.append(level(1e3 * noise, INK, ":", words="instrument"))
     limits = 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max()
     title = f"{str(models[last[0]]).removeprefix('+ ')} is where the gain ends: {errors[last[0]]:.3g} mm"
     names = [f"{model}\n{count}" for model, count in zip(models, parameters)]
@@ -253,8 +253,8 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
     chosen = np.sort(chosen[np.argsort(-off[chosen])][:most])
     labels = [str(names[k]) for k in chosen]
     title = f"correlations up to {off[chosen].max():.2f}" if len(chosen) > 1 else ""
-    heat = Heat(correlation[np.ix_(chosen, chosen)], limits=(-1.0, 1.0), colours="PuOr", written=len(labels) <= 10)
+    matrix = heat(correlation[np.ix_(chosen, chosen)], limits=(-1.0, 1.0), colours="PuOr", written=len(labels) <= 10)
     longest = max(map(len, labels), default=0)
     side = max(HALF_WIDTH, 0.13 * len(labels) + 0.05 * longest + 1.0)  # long names widen the figure, and never overlap
-    panel = Panel([heat], title, xnames=labels, ynames=labels)
+    panel = Panel([matrix], title, xnames=labels, ynames=labels)
     return Chart([panel], side - 0.3, width=side)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib.procedure.report.charts import Chart, Level, Line, Panel, Words, save_all
+from calib.procedure.report.charts import Chart, Panel, level, line, save_all, text
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.procedure.report.uncertainty_figures import outlook_figure
 from calib.robot.kinematics import sweep
@@ -42,11 +42,11 @@ def motion_sheet(
     for j, k in ((j, k) for j in range(n) for k in range(columns)):
         values, lower, upper, quantity = series[k]
         last = j == n - 1
-        bounds = [Level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
+        bounds = [level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
         label = names[j].replace("_", "_\n") if len(names[j]) > 12 else names[j]
         panels.append(
             Panel(
-                [Line(times, values[:, j]), *bounds],
+                [line(times, values[:, j]), *bounds],
                 f"{quantity} [{units[k]}]" if j == 0 else "",
                 "time [s]" if last else "",
                 label if k == 0 else "",
@@ -89,8 +89,8 @@ def _path_figure(designed: Designed) -> Chart:
     panels = [
         Panel(
             [
-                Line(tool[0], tool[j], form="-"), Line(tool[0, :1], tool[j, :1], "o", MARK),
-                Words("start", tool[0, 0], tool[j, 0]), Line([0.0], [0.0], "+", QUIET), Words("base", 0.0, 0.0),
+                line(tool[0], tool[j], form="-"), line(tool[0, :1], tool[j, :1], "o", MARK),
+                text("start", tool[0, 0], tool[j, 0]), line([0.0], [0.0], "+", QUIET), text("base", 0.0, 0.0),
             ],
             title, "x [m]", f"{'xyz'[j]} [m]", grid="both", equal=True,
         )
@@ -103,7 +103,7 @@ def _history_figure(designed: Designed) -> Chart:
     """Return the improving feasible motions of the best start."""
     history = np.asarray(designed.found.history, dtype=float)
     title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
-    curve = Line(np.arange(len(history)), history)
+    curve = line(np.arange(len(history)), history)
     return Chart([Panel([curve], title, "improving feasible motions", "objective")], 2.2, width=HALF_WIDTH)
 
 
@@ -111,7 +111,7 @@ def _front_figure(front: Front) -> Chart:
     """Return the trade-off the engineer chooses from; open points are beaten by others."""
     good = front.values[front.best]
     good, rest = good[np.argsort(good[:, 1])], front.values[~front.best]
-    points = [Line(good[:, 1], good[:, 0], "o-", size=4.0), Line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
+    points = [line(good[:, 1], good[:, 0], "o-", size=4.0), line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
     title = f"{len(good)} motions to choose from"
     return Chart([Panel(points, title, front.names[1], front.names[0])], 2.5, width=HALF_WIDTH)
 
@@ -176,12 +176,12 @@ def _profile_figure(planned: Planned) -> Chart:
     above, below, start = [], [], 0.0
     for one in planned.timings:
         times = start + one.profile.times
-        above.append(Line(times, np.sqrt(one.profile.x)))
+        above.append(line(times, np.sqrt(one.profile.x)))
         instants = np.repeat(times[:-1], len(one.sampled.s) // (len(times) - 1))
         for (name, used), colour in zip(one.used.items(), (BEFORE, AFTER, QUIET)):
-            below.append(Line(instants, used.max(axis=1), colour=colour, label=name if start == 0.0 else ""))
+            below.append(line(instants, used.max(axis=1), colour=colour, label=name if start == 0.0 else ""))
         start = float(times[-1])
-    below.append(Level(1.0))
+    below.append(level(1.0))
     share = np.average([one.active_share for one in planned.timings], weights=[one.duration for one in planned.timings])
     panels = [
         Panel(below, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),

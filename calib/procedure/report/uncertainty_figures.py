@@ -14,7 +14,7 @@ import numpy as np
 
 from calib import files
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
-from calib.procedure.report.charts import Bars, Chart, Level, Line, Panel, Words, picture
+from calib.procedure.report.charts import Chart, Panel, bars, level, line, picture, text
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.records import read_rows
@@ -35,9 +35,9 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
     points = np.array(sorted(others)).reshape(-1, 2)
     low, high = np.vstack([points, [own]]).min(axis=0), np.vstack([points, [own]]).max(axis=0)
     layers = [
-        Line(points[:, 0], points[:, 1], "o-", BEFORE),
-        Line([own[0]], [own[1]], "o", MARK, size=5.5),
-        Words("this plan", *own),
+        line(points[:, 0], points[:, 1], "o-", BEFORE),
+        line([own[0]], [own[1]], "o", MARK, size=5.5),
+        text("this plan", *own),
     ]
     panel = Panel(
         layers, "predicted, before anything is moved", along, across, (0.8 * low[0], 1.25 * high[0]),
@@ -80,22 +80,22 @@ def write(folder: Path) -> None:
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
-    """Return each parameter on both geometries with error bars, and the difference in sigmas."""
+    """Return each parameter on both geometries with error shown, and the difference in sigmas."""
     table = np.array([(row.nominal, row.sigma_nominal, row.calibrated, row.sigma_calibrated) for row in rows])
     nominal, s_nominal, own, s_own = table.T
     x, percent = np.arange(len(rows)), 100.0 / np.abs(own)
     size = np.divide(nominal - own, s_own, out=np.zeros(len(rows)), where=s_own > 0.0)
     above = [
-        Line(x + shift, percent * (values - own), "o", colour, 1.0, 2.5, label=label, spread=2.0 * percent * sigma)
+        line(x + shift, percent * (values - own), "o", colour, 1.0, 2.5, label=label, spread=2.0 * percent * sigma)
         for values, sigma, colour, shift, label in (
             (nominal, s_nominal, BEFORE, -0.15, "nominal (CAD) geometry"), (own, s_own, AFTER, 0.15, "calibrated"),
         )
     ]  # fmt: skip
     moved = np.abs(size) > 2.0
-    bars = Bars(size, [MARK if one else QUIET for one in moved], upright=True)
+    shown = bars(size, [MARK if one else QUIET for one in moved], upright=True)
     panels = [
         Panel(above, y="from calibrated [%]", xnames=[""] * len(rows), grid="y", symlog=1.0),
-        Panel([bars], y="difference [σ]", xnames=[row.name for row in rows], grid="y", symlog=2.0),
+        Panel([shown], y="difference [σ]", xnames=[row.name for row in rows], grid="y", symlog=2.0),
     ]
     title = f"{int(moved.sum())} of {len(rows)} parameters move by two sigmas with the geometry"
     return Chart(panels, 4.2, title=title)
@@ -105,8 +105,8 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     """Return the ranked geometric errors by the largest shift they cause."""
     size = np.array([row.shift_sigma or 0.0 for row in rows])
     layers = [
-        Bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), Level(MIN_SHIFT, upright=True),
-        *(Words(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
+        bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), level(MIN_SHIFT, upright=True),
+        *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
     ]  # fmt: skip
     labels = [f"{row.element} ({_milli(row)})" for row in rows]
     title = f"{int((size > MIN_SHIFT).sum())} of these {len(rows)} geometric errors matter"

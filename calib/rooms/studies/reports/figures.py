@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.procedure.report.charts import Box, Chart, Line, Panel, Words, picture
+from calib.procedure.report.charts import Chart, Panel, box, line, picture, text
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, MARK
 from calib.rooms.studies.summary import MIN_DATA_SETS, ConditionSummary
@@ -24,13 +24,13 @@ def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
         every += own
         colour = AFTER if method.as_good else BEFORE
         if len(own) < MIN_DATA_SETS:
-            layers.append(Line(own, [place] * len(own), "o", colour, size=4.0))
+            layers.append(line(own, [place] * len(own), "o", colour, size=4.0))
         else:
-            layers.append(Box(own, place, colour))
+            layers.append(box(own, place, colour))
     low, high = 0.8 * max(min(every, default=0.1), 1e-6), 1.25 * max(max(every, default=1.0), 1.1e-6)
     for place, method in enumerate(one.methods):
         if failed := sum(method.failures.values()):
-            layers.append(Words(f"{failed} failed", high, place, (3, 0), MARK, along="center"))
+            layers.append(text(f"{failed} failed", high, place, (3, 0), MARK, along="center"))
     names = [method.method for method in one.methods]
     panel = Panel(layers, x="torque error [%]", xlim=(low, high), log="x", ynames=names, grid="x")
     words = (
