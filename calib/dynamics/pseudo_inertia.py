@@ -96,3 +96,9 @@ def _units() -> np.ndarray:
 
 
 BASIS, UNITS = _basis(), _units()
+
+
+def unknown_bodies(count: int, others: int) -> np.ndarray:
+    """Return P (count, 4, 4, 10 count + others) as linear in unknowns: ten by body in `UNITS`, then others."""
+    bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS).reshape(count, 4, 4, 10 * count)
+    return np.concatenate([bodies, np.zeros((count, 4, 4, others))], axis=3)

@@ -70,9 +70,7 @@ class BodyCone:
         made = np.asarray(
             block_diag(made, np.eye(p - base))
         )  # b of bodies and terms, and of columns that are none of theirs
-        free = made.shape[1] - 10 * count
-        bodies = np.einsum("ij,krs->irsjk", np.eye(count), pseudo_inertia.UNITS).reshape(count, 4, 4, 10 * count)
-        bodies = np.concatenate([bodies, np.zeros((count, 4, 4, free))], axis=3)
+        bodies = pseudo_inertia.unknown_bodies(count, made.shape[1] - 10 * count)
         max_trace = 1e4  # of a body in those units: keeps finite what the data do not tell
         rows = [-np.einsum("irrj->ij", bodies) / max_trace]
         rows.append(np.eye(made.shape[1])[10 * count : 10 * count + len(self.positive)][self.positive])

@@ -1,4 +1,4 @@
-"""The cone program behind constrained least squares, in units of its own, by Clarabel (Goulart & Chen 2024)."""
+"""Least squares over cones by Clarabel (Goulart & Chen 2024), and matrices that must be definite."""
 
 # pyright: reportAttributeAccessIssue=false
 # clarabel is a compiled extension without stubs
@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import shaped
 from calib.errors import NotConverged
-from calib.estimation.triangles import require_rank
 
 ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
 
@@ -41,47 +39,6 @@ class Definite:
         """Say whether smallest eigenvalues (K,), as above `least`, are those of definite matrices."""
         max_violation = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
         return bool((sizes >= -max_violation * self.least).all())
-
-
-@dataclass(frozen=True, eq=False)
-class Scaled:
-    """The problem in b / unit, with columns of R of unit norm and ‖z‖ = 1, rows A of unit norm.
-
-    Attributes:
-        upper, target: R (p, p), z (p,).
-        unit, length: (p,) of b, and ‖z‖ as they were.
-        rows, offset, sizes: A (c, p), c (c,), and the norms (c,) that A had in these units.
-    """
-
-    upper: np.ndarray
-    target: np.ndarray
-    unit: np.ndarray
-    length: float
-    rows: np.ndarray
-    offset: np.ndarray
-    sizes: np.ndarray
-
-    def h(self, b: np.ndarray) -> np.ndarray:
-        return np.asarray(self.rows @ b + self.offset)
-
-
-def scale(factor: np.ndarray, rows: np.ndarray, offset: np.ndarray) -> Scaled:
-    """Return min ½ ‖R b - z‖² under A b + c >= 0 in units of its own.
-
-    Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
-        rows, offset: A (c, p), c (c,).
-    """
-    factor = shaped(factor, (len(factor), len(factor)), "triangle [R z]")
-    p = len(factor) - 1
-    norms = np.linalg.norm(factor[:p, :p], axis=0)
-    upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
-    require_rank(upper, [f"x{k + 1}" for k in range(p)])
-    length = float(np.linalg.norm(factor[:p, p])) or 1.0
-    unit = length / norms
-    sizes = np.linalg.norm(rows * unit, axis=1)
-    sizes = np.where(sizes > 0.0, sizes, 1.0)
-    return Scaled(upper, factor[:p, p] / length, unit, length, rows * unit / sizes[:, None], offset / sizes, sizes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,9 @@ import scipy.linalg
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, require
-from calib.estimation.convex.cone_program import Definite, minimise, scale
+from calib.estimation.convex.cone_program import Definite, minimise
 from calib.estimation.convex.constraint_relations import from_free
+from calib.estimation.triangles import require_rank
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +85,23 @@ def within(
 
 
 class _Planes:
-    """The problem without matrices: A b >= e and E b = d."""
+    """The problem without matrices, A b >= e and E b = d, and in units of its own.
 
-    def __init__(self, factor: np.ndarray, rows: np.ndarray, edges: np.ndarray, equal: np.ndarray, held: np.ndarray):
-        self.factor, self.rows, self.edges, self.equal, self.held = factor, rows, edges, equal, held
+    Columns of R and rows of A and E of unit norm, ‖z‖ = 1: `upper`, `target`, `scaled` and `edges` in b / `unit`.
+    """
+
+    def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, held: np.ndarray):
         p = len(factor) - 1
-        self.problem, self.fixed = scale(factor, rows, -edges), scale(factor, equal, -held)
-        self.normals, self.sides = np.vstack([rows, equal]), np.concatenate([edges, held])
-        self.free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+        norms = np.linalg.norm(factor[:p, :p], axis=0)
+        self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
+        require_rank(self.upper, [f"x{k + 1}" for k in range(p)])
+        self.length = float(np.linalg.norm(factor[:p, p])) or 1.0
+        self.unit, self.target = self.length / norms, factor[:p, p] / self.length
+        self.normals, self.sides, self.count = np.vstack([rows, equal]), np.concatenate([sides, held]), len(rows)
+        sizes = np.linalg.norm(self.normals * self.unit, axis=1)
+        self.sizes = np.where(sizes > 0.0, sizes, 1.0)
+        self.scaled, self.edges = self.normals * self.unit / self.sizes[:, None], self.sides / self.sizes
+        self.factor, self.free = factor, scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
         self._require_solvable()
 
     def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
@@ -99,9 +109,9 @@ class _Planes:
 
         `max_contradiction`: of an equality, by which the best point may miss it.
         """
-        if not len(self.equal):
+        scaled, wanted = self.scaled[self.count :], self.edges[self.count :]
+        if not len(scaled):
             return
-        scaled, wanted = self.fixed.rows, -self.fixed.offset
         acts = scaled.any(axis=1)
         require(acts.all(), f"equality {int(np.argmin(acts)) + 1} acts on no parameter")
         origin, _, rank, _ = np.linalg.lstsq(scaled, wanted, rcond=1e-10)
@@ -111,31 +121,28 @@ class _Planes:
 
     def optimum(self, active: np.ndarray) -> Constrained:
         """Return the optimum on the equalities and the inequalities that are active (c,), whatever the others say."""
-        binding = np.append(active, np.ones(len(self.held), dtype=bool))
+        binding = np.append(active, np.ones(len(self.sides) - self.count, dtype=bool))
         normals, sides = self.normals[binding], self.sides[binding]
         values, multipliers = np.array(self.free), np.zeros(len(binding))
         if len(normals):
-            p = len(values)
             values = from_free(self.factor, self.free, normals, sides)
             for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):  # bounds on single parameters
                 place = int(np.flatnonzero(normals[row])[0])
                 values[place] = sides[row] / normals[row, place]
-            slope = self.factor[:p, :p].T @ (self.factor[:p, :p] @ values - self.factor[:p, p])
-            unit = 1.0 / np.linalg.norm(self.factor[:p, :p], axis=0)
-            size = np.linalg.norm(normals * unit, axis=1)
-            multipliers[binding] = np.linalg.lstsq((normals * unit / size[:, None]).T, slope * unit)[0] / size
+            slope = self.upper.T @ (self.upper @ (values / self.unit) - self.target)
+            multipliers[binding] = np.linalg.lstsq(self.scaled[binding].T, slope)[0]
         slack = np.where(binding, 0.0, self.normals @ values - self.sides)
-        return _frozen(values, multipliers, slack, binding, self.normals)
+        return _frozen(values, multipliers * self.length**2 / self.sizes, slack, binding, self.normals)
 
     def bounded(self) -> Constrained:
         """Return the optimum under the inequalities, exactly on those that bind.
 
         As the solver has it where that is degenerate: a multiplier would change its sign, or another be violated.
         """
-        c, p = len(self.rows), len(self.free)
+        c, p = self.count, len(self.free)
         found = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
         exact = self.optimum(found.binding[:c])
-        away = np.linalg.norm(self.problem.upper @ ((exact.values - found.values) / self.problem.unit))
+        away = np.linalg.norm(self.upper @ ((exact.values - found.values) / self.unit))
         max_move = 1e-3  # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
         good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= max_move
         return exact if good else found
@@ -146,17 +153,17 @@ class _Planes:
         Of many matrices few bind: those most indefinite enter, until all others are definite; what does not bind may
         go, since the least misfit rises from one set to the next and none comes back (our choice).
         """
-        problem, fixed = self.problem, self.fixed
-        small = Definite(matrices.matrices * problem.unit, matrices.least)
+        c, rows, edges = self.count, self.scaled, self.edges
+        small = Definite(matrices.matrices * self.unit, matrices.least)
         used = np.zeros(0, dtype=int) if matrices.likely is None else matrices.likely
         min_multiplier = 1e-6  # of the scaled problem, multipliers of matrices above which bind
         max_entering = 8  # matrices that enter at once, the most indefinite (our choice)
         max_drops = 30  # rounds in which what does not bind may go: rounding could let it come back
         for rounds in count():
             if not len(used):
-                used = np.argsort(small.least_eigenvalues(self.free / problem.unit)[0])[:max_entering]
-            goal = problem.upper, problem.target, problem.rows, problem.offset
-            solved = minimise(*goal, small.matrices[used], small.least, fixed.rows, -fixed.offset)
+                used = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
+            goal = self.upper, self.target, rows[:c], -edges[:c]
+            solved = minimise(*goal, small.matrices[used], small.least, rows[c:], edges[c:])
             b, mu, pushes, rates = solved.values, solved.rows, solved.matrices, solved.equalities
             sizes, normals = small.least_eigenvalues(b)
             traces = np.einsum("kii->k", pushes)
@@ -171,14 +178,14 @@ class _Planes:
         normals[used[bind]] = held_by / traces[bind, None]
         force = np.zeros(len(small.matrices))
         force[used[bind]] = traces[bind]
-        slack = np.maximum(problem.h(b), 0.0)
-        whole = np.vstack([problem.rows, normals, fixed.rows])
+        slack = np.maximum(rows[:c] @ b - edges[:c], 0.0)
+        whole = np.vstack([rows[:c], normals, rows[c:]])
         binding = np.concatenate([mu > slack, force > 0.0, np.ones(len(rates), dtype=bool)])
-        scales = np.concatenate([problem.sizes, np.ones(len(force)), fixed.sizes])
+        scales = np.concatenate([self.sizes[:c], np.ones(len(force)), self.sizes[c:]])
         apart = np.concatenate([slack, np.where(force > 0.0, np.maximum(sizes, 0.0), sizes), np.zeros(len(rates))])
         return _frozen(
-            b * problem.unit, np.concatenate([mu, force, rates]) * problem.length**2 / scales, apart * scales, binding,
-            whole * scales[:, None] / problem.unit,
+            b * self.unit, np.concatenate([mu, force, rates]) * self.length**2 / scales, apart * scales, binding,
+            whole * scales[:, None] / self.unit,
         )  # fmt: skip
 
 

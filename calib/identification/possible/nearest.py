@@ -42,8 +42,7 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     if pull > 0.0:
         goal = np.vstack([goal, _pulling(problem, pull)])
     goal = goal / max(1.0, float(np.linalg.norm(goal[:, -1])))
-    bodies = np.einsum("ij,krs->irsjk", np.eye(count), pseudo_inertia.UNITS).reshape(count, 4, 4, 10 * count)
-    bodies = np.concatenate([bodies, np.zeros((count, 4, 4, len(problem.sizes)))], axis=3)
+    bodies = pseudo_inertia.unknown_bodies(count, len(problem.sizes))
     positive = [k for k in np.flatnonzero(problem.positive) if count + k != spared]
     rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * MAX_TRACE), np.eye(len(matrix))[10 * count :][positive]])
     offset = np.repeat([1.0, 0.0], [count, len(positive)])

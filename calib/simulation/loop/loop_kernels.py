@@ -508,6 +508,13 @@ def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish
         wish[j] = total
 
 
+@njit(**JOINED)
+def _reading(place, encoder, quantum, k, j):
+    """Return what the encoder of joint j says of a position in period k, with its noise and resolution."""
+    read = place + (encoder[k, j] if encoder.shape[0] else 0.0)
+    return quantum[j] * np.floor(read / quantum[j] + 0.5) if quantum[j] > 0.0 else read
+
+
 @njit(**OPTIONS)
 def closed_loop(
     tree, body, linear, kinds, acts, model, gains, reference, encoder, quantum, push, period, smoothing, late, every,
@@ -530,9 +537,7 @@ def closed_loop(
     sample = 0
     for k in range(count):
         for j in range(n):
-            read[j] = q[j] + (encoder[k, j] if encoder.shape[0] else 0.0)
-            if quantum[j] > 0.0:
-                read[j] = quantum[j] * np.floor(read[j] / quantum[j] + 0.5)
+            read[j] = _reading(q[j], encoder, quantum, k, j)
             if k == 0:
                 speed[j] = v[j]
             else:
@@ -558,25 +563,18 @@ def closed_loop(
             wish[j] = at[j]
         while sample < out.shape[1] and sample * every < k + 1 - 1e-9:
             part = sample * every - k
-            if part < 1e-9:
-                for j in range(n):
-                    out[0, sample, j], out[1, sample, j], out[2, sample, j] = q[j], v[j], slopes[0, j]
-                    out[3, sample, j], out[4, sample, j] = read[j], tau[j]
-            else:
-                here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
+            here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
+            if part >= 1e-9:
                 args = (tree, body, linear, kinds, acts, past, loads)
                 status = _advance(*args, here, fast, wish, part * period, first, work, matrix, at, rate)
                 if status != FINE:
                     return status, k
                 if not accelerate(*args, here, fast, wish, work, matrix, first[0]):
                     return SINGULAR, k
-                for j in range(n):
-                    out[0, sample, j], out[1, sample, j], out[2, sample, j] = here[j], fast[j], first[0, j]
-                    seen_now = here[j] + (encoder[k, j] if encoder.shape[0] else 0.0)
-                    if quantum[j] > 0.0:
-                        seen_now = quantum[j] * np.floor(seen_now / quantum[j] + 0.5)
-                    out[3, sample, j], out[4, sample, j] = seen_now, tau[j]
                 accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, wish, work, matrix, slopes[0])
+            for j in range(n):
+                out[0, sample, j], out[1, sample, j], out[2, sample, j] = here[j], fast[j], first[0, j]
+                out[3, sample, j], out[4, sample, j] = _reading(here[j], encoder, quantum, k, j), tau[j]
             sample += 1
         if k + 1 < count:
             args = (tree, body, linear, kinds, acts, memory, loads)
