@@ -72,7 +72,7 @@ class DynamicsModel(Judged):
         They are those of recorded torques, with what of them no model in the band explains.
 
         Raises:
-            UsageError: for a model of too short a recording to learn errors from.
+            UsageError: for a model of too short a recording to estimate errors from.
         """
         expected = self.outcome.errors
         if expected is None:
@@ -156,7 +156,7 @@ def identify_dynamics(
 
     Raises:
         MeasurementError: for logs that cannot be right, naming row and column.
-        Unidentifiable: where the motion tells no parameter.
+        Unidentifiable: where the motion identifies no parameter.
     """
     require(settings is None or options is None, "settings and options say the same: give one of them", UsageError)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))

@@ -35,7 +35,7 @@ def export(
         result: a fit, an identification, or the folder of one.
         into: folder for the files.
         urdf: description of the nominal robot to edit, everything else in it kept; by default the fit's own source.
-        prior: draws masses that the torques do not tell to the robot's own, ``entropic`` or ``euclidean``.
+        prior: what masses that the torques do not identify are regularised towards, ``entropic`` or ``euclidean``.
 
     Returns:
         What was written and what to know of it, in words.

@@ -81,8 +81,9 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best.
 
-    Beside OUT.csv, OUT_prediction.json holds what the poses will tell (calib fit --selection), OUT_predicted.png shows
-    how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more poses would tell.
+    Beside OUT.csv, OUT_prediction.json holds what the poses are predicted to identify (calib fit --selection),
+    OUT_predicted.png shows how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more
+    poses would identify.
 
     Args:
         out: CSV file of the chosen joint values, rad
@@ -117,7 +118,7 @@ def select(
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
     if told := selection.beside_poses(out, plots, chosen.chosen):
-        say(f"what they will tell: {', '.join(str(path) for path in told.values())}")
+        say(f"predictions: {', '.join(str(path) for path in told.values())}")
     say(f"{m} poses written to {out}")
 
 

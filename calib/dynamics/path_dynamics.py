@@ -113,7 +113,7 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
     max_mixed = 1e-6  # of a column, beyond which friction counts as regrouped with something else
     if mixed.max(initial=0.0) > max_mixed:
         name = model.names[int(mixed.max(axis=1).argmax())]
-        raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
+        raise CalibError(f"base parameter {name} mixes friction with other effects: torques are not distinguished")
     standard = model.base.to_standard(values)
     bodies = standard[: model.model.inertial]
     terms, amounts = _valued(model.model, standard)

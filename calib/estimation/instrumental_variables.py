@@ -272,7 +272,7 @@ def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     require_rank(
         factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0), names,
-        "the instruments do not tell them apart: they are dependent in W, or the simulated motion is another one",
+        "the instruments do not distinguish them: they are dependent in W, or the simulated motion is another one",
     )  # fmt: skip
     return retriangulate(factor[:p, p:])
 

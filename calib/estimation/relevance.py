@@ -195,7 +195,7 @@ def _posterior(
             break
     else:
         raise Unidentifiable(
-            "the measurements cannot tell the model's terms apart; are rows repeated? Measure more poses"
+            "the measurements cannot distinguish the model's terms; are rows repeated? Measure more poses"
         )
     solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
     inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more

@@ -20,7 +20,7 @@ from calib.arrays import frozen, shaped
 from calib.errors import CalibError, Unidentifiable, require
 from calib.words import listing
 
-ADVICE = "choose base columns first (columns.split_columns), or add motion that tells them apart"
+ADVICE = "choose base columns first (columns.split_columns), or add motion that distinguishes them"
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,8 +66,8 @@ def fit(
     free = candidates[split.kept]
     if split is not None and not len(free):
         raise Unidentifiable(
-            "these rows tell nothing of the robot: a socket, a bar, a plane or a pair says something by several rows, "
-            "at different joint values"
+            "these rows determine nothing of the robot: a socket, a bar, a plane or a pair says something by several "
+            "rows, at different joint values"
         )
     _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior

@@ -173,9 +173,9 @@ def identify_gains(
     if reference is None:
         raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
     raise NotConverged(
-        f"without gains or a payload of known mass, currents tell gains only by how joints act on each other, relative "
-        f"to joint {reference + 1}; this motion does not tell them. State the gains (options file: gains), or record "
-        "runs without and with a payload ([gain_identification])",
+        f"without gains or a payload of known mass, currents identify gains only through the coupling of joints, "
+        f"relative to joint {reference + 1}; this motion does not identify them. State the gains (options: gains), "
+        "or record runs without and with a payload ([gain_identification])",
         gain,
     )
 

@@ -96,7 +96,7 @@ def identify(
     Args:
         robot: as a geometric fit returns it, or a chain that no fit has moved. Base columns are chosen on its nominal
             geometry; joint corrections take no part.
-        cases: recordings to learn from.
+        cases: training recordings.
         settings: the choices; None: those that suit a serial arm with motor torques.
         progress: called with a few words at each stage.
     """
@@ -131,7 +131,7 @@ def identify_model(
 
     Args:
         model: of a serial chain, or of anything else that meets the protocol.
-        cases: recordings to learn from, their targets those of the model's torque rows.
+        cases: training recordings, their targets those of the model's torque rows.
         settings: the choices; what makes a chain's model of them (drives, payloads, gravity) is in `model` already.
         nominal: the same model on the geometry that base columns are chosen on; None: `model`.
         states: to choose base columns over; None: the model's own.
@@ -391,7 +391,7 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
 def _require_motion(cases: Sequence[Case]) -> None:
     """Refuse cases to learn from in which the robot stands (our choice: less than a milliradian or millimetre)."""
     if all((np.ptp(case.motion.q, axis=0) < 1e-3).all() for case in cases):
-        refuse_data(cases[0].motion.file, "no joint moves: that tells of gravity in one pose, and nothing else")
+        refuse_data(cases[0].motion.file, "no joint moves: that shows gravity in one pose, and nothing else")
 
 
 def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:

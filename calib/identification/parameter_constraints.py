@@ -419,7 +419,7 @@ def _without_effect(weights: Mapping[str, float], base: Base) -> str:
         if any(name in line.replace("=", " ").split() for name in weights)
     ]  # fmt: skip
     return (
-        f"[constraints]: {', '.join(weights)}: the torques tell it in sums with others only: {'; '.join(parts[:4])}. "
+        f"[constraints]: {', '.join(weights)}: torques identify it only in sums with others: {'; '.join(parts[:4])}. "
         "State the bound for such a sum"
     )
 

@@ -74,7 +74,7 @@ def test_faster_motion_than_learnt_is_named_and_its_errors_are_expected_to_be_la
     slow, fast = (model.sigma(found.dynamics, q, k * v, k * k * a) for k in (1.0, 3.0))
     assert (np.median(fast, axis=0) > 1.2 * np.median(slow, axis=0)).all()
     said = judged(found, model, recorded(0, 1.0, harmonics=12)).ways("abc")
-    assert any(line.startswith("accelerating more than learnt at joint a, b, c") for line in said)
+    assert any(line.startswith("accelerating more than in training at joint a, b, c") for line in said)
 
 
 def test_several_recordings_and_exact_torques_give_intervals_too():

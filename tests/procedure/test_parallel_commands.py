@@ -212,7 +212,7 @@ def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, said):
 def test_a_payload_on_board_of_every_run_is_told(folder, tmp_path, capsys):
     words = ("--options", folder / "options.toml", "--out", tmp_path / "id", "--no-plots")
     assert calib("identify", "dualv", folder / "load.csv", *words) == 0
-    assert "a run without it tells them apart" in capsys.readouterr().out
+    assert "a run without it separates them" in capsys.readouterr().out
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():

@@ -48,7 +48,7 @@ class Board:
 
     def __post_init__(self) -> None:
         if max(self.columns, self.rows) > 100:
-            raise ValueError(f"{self.columns} x {self.rows} squares: more than 100 in a row cannot be told apart")
+            raise ValueError(f"{self.columns} x {self.rows} squares: more than 100 in a row cannot be distinguished")
         if self.kind == "charuco" and not 0.3 * self.square <= self.marker <= 0.9 * self.square:
             raise ValueError(
                 f"marker = {self.marker:g}: of a charuco board the markers lie in the white squares, so that marker "

@@ -24,7 +24,7 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
     common: dict[str, Any] = {
         "group": group, "group_names": names, "tool": tool, "tool_names": tool_names, "file": table.file,
         "rows": table.rows,
-        "notes": (f"one row alone tells nothing: {layout.kind} {', '.join(single[:5])}",) if single else (),
+        "notes": (f"one row alone determines nothing: {layout.kind} {', '.join(single[:5])}",) if single else (),
     }  # fmt: skip
     stated = None if options.sigma.position is None else np.tile(options.sigma.position, (len(q), 1))
     if layout.kind == Sockets.kind:

@@ -40,7 +40,7 @@ def check_joints(
     stated = [sheet.unit(column, "joints") for column in columns]
     _check_joint_units(sheet, columns, kinds, stated)
     if len(q) > 1 and np.ptp(q, axis=0).max() < BOUNDS.min_travel:
-        message = f"all {len(q)} rows have the same joint values: one pose tells nothing of the robot"
+        message = f"all {len(q)} rows have the same joint values: one pose determines nothing of the robot"
         refuse_data(table.file, message, columns[0], int(table.rows[-1]))
     lower, upper = np.asarray(limits if limits is not None else [np.full(len(joints), np.nan)] * 2, dtype=float)
     bounded = np.isfinite(lower) & np.isfinite(upper)

@@ -76,7 +76,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
 
 def _check_count(recording: Recording) -> None:
     message = (
-        f"{len(recording)} samples are too few to filter and to learn from; at least {LIMITS.min_samples} are needed"
+        f"{len(recording)} samples are too few to filter and to identify from; at least {LIMITS.min_samples} are needed"
     )
     require(len(recording) >= LIMITS.min_samples, message, MeasurementError, recording.file)
 
@@ -241,7 +241,7 @@ def _columns(recording: Recording, name: str) -> list[str]:
 def _still(recording: Recording) -> list[str]:
     still = np.ptp(recording.q, axis=0) < LIMITS.min_travel
     if still.all():
-        return ["no joint moves in this recording: it tells of gravity in one pose, and nothing else"]
+        return ["no joint moves in this recording: it shows gravity in one pose, and nothing else"]
     notes = []
     for j, dead in enumerate(np.ptp(recording.effort, axis=0) == 0):
         if dead and not still[j]:

@@ -109,7 +109,7 @@ class FrictionCandidates:
     """What forward selection of friction starts from.
 
     Attributes:
-        cases: recordings to learn from.
+        cases: training recordings.
         rows: their rows in the base columns and standard drive terms, blocks numbered.
         loads: transmitted torques of each case (N, n), by a first fit.
         decimator: of the rows.

@@ -227,7 +227,7 @@ def _controller(
     shown = ", ".join(f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, found.explained))
     if len(bad):
         raise NotConverged(
-            f"{case.name}: the log tells no controller at joint {bad[0] + 1} (kp/kd by joint: {shown}); state the "
+            f"{case.name}: the log identifies no controller at joint {bad[0] + 1} (kp/kd by joint: {shown}); state the "
             "gains, or lower [loop] band",
             found,
         )

@@ -231,7 +231,7 @@ IRLS = _LeastSquares(
 TLS = _LeastSquares(
     "tls",
     f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
-    "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact",
+    "residuals, all up to one estimated factor, independently from row to row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
 )
 _CONSISTENT = "; parameters satisfy [constraints]"

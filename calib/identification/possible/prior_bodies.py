@@ -64,11 +64,13 @@ def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> Prior
             bodies[i] = pseudo_inertia.ball(*PAYLOAD)
         elif not own[i, 9] > 0.0:
             bodies[i], drawn[i] = pseudo_inertia.ball(LIGHT * heaviest, RADIUS / 2), False
-            notes.append(f"body {label} has no mass in the CAD: drawn weakly to {LIGHT * heaviest:.2g} kg")
+            notes.append(f"body {label} has no mass in the CAD: weakly regularised towards {LIGHT * heaviest:.2g} kg")
         elif pseudo_inertia.margin(own[i]) < THIN:
             bodies[i] = _thickened(own[i])
             if pseudo_inertia.margin(own[i]) < 0.0:
-                notes.append(f"the CAD's inertia of body {label} belongs to no possible body: drawn to the nearest one")
+                notes.append(
+                    f"CAD inertia of body {label} is physically inconsistent: the nearest consistent one is taken"
+                )
     return PriorBodies(bodies, drawn, True, "the inertias of the robot's description", tuple(notes))
 
 

@@ -282,7 +282,7 @@ def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
             root = scipy.linalg.cho_factor(whole + ridge * np.eye(len(unit)))
             break
     else:
-        raise NotConverged("the consistent parameters cannot be told apart to within rounding")
+        raise NotConverged("the consistent parameters cannot be distinguished to within rounding")
     scale = unit if target.ndim == 1 else unit[:, None]
     return scipy.linalg.cho_solve(root, target / scale) / scale
 

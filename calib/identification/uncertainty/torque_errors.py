@@ -52,7 +52,7 @@ DOUBLING, PRIOR = 2.0, 0.02
 """The log(1 + d²) at which errors have twice their variance before any data; as share of all rows (our choice)."""
 ERRORS_USED = 4000  # errors of a joint that its weights are found from, about
 MAX_ERROR, MIN_ERROR = 5.0, 1e-9  # sigmas that an error counts as; of a joint's error, below which it has none
-WAYS = ("outside the range of joint", "faster than learnt at joint", "accelerating more than learnt at joint")
+WAYS = ("outside the range of joint", "faster than in training at joint", "accelerating more than in training at joint")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What an identification works on: the robot, the recordings to learn from, and those it must not see."""
+"""What an identification works on: the robot, the training recordings, and those it must not see."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class IdentificationInputs:
         robot: `CalibratedChain` as a geometric fit has left it, or as it was described, joint corrections left out;
             or a `calib.procedure.robot_kinds.Mechanism`.
         source: the file it came from.
-        cases: recordings to learn from.
+        cases: training recordings.
         unseen: recordings to be predicted.
         options: the options file's content, the command's choices put in.
         notes: what a user should know about how the files were understood.
@@ -160,7 +160,7 @@ def gather(
 
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
-    """Refuse a recording that carries what neither the recordings to learn from nor the options say the weight of."""
+    """Refuse a recording that carries what neither the training recordings nor the options say the weight of."""
     known = {*settings.payload_values, *(label for label, load in settings.payloads.items() if load.parameters)}
     known.update(label for case in cases for label in case.carried)
     for case in unseen:

@@ -119,7 +119,7 @@ class ModelMetrics:
 
 
 def on_bounds(found: Identification) -> tuple[str, ...]:
-    """Return parameters that a constraint holds where they are: the data do not tell them, and have no σ of them.
+    """Return parameters that a constraint holds where they are: the data do not identify them, and have no σ of them.
 
     The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
     """

@@ -121,7 +121,7 @@ def assess(
     """Predict every recording and judge: in the command, and of a model read from its folder.
 
     Args:
-        inputs: recordings to learn from (for the model's own error) and unseen ones.
+        inputs: training recordings (for the model's own error) and unseen ones.
         dynamics: the model.
         findings: what is known of it.
         errors: what errors its torques are expected to have.

@@ -203,7 +203,7 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
     if 2 * len(rests.names) <= rests.of:
         return verdict
     source = "the CAD's" if rests.source == "cad" else "a guess of their sizes"
-    told = f"{len(rests.names)} of {rests.of} parameters are {source}: this motion does not tell them"
+    told = f"{len(rests.names)} of {rests.of} parameters are {source}: this motion does not identify them"
     return replace(verdict, reason=f"{verdict.reason}; {told}")
 
 

@@ -52,7 +52,7 @@ class Designed:
         front: trade-offs, where asked for.
         playback: what a controller is to run.
         notes: what a user should know.
-        outlook: what the motion will tell; None where no torque limits say how large errors are.
+        outlook: what the motion is predicted to identify; None where no torque limits say how large errors are.
         predicted: sigmas of the parameters; empty there.
     """
 
@@ -157,13 +157,13 @@ def _outlook(
     found: SearchResult,
     say: Progress,
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return what a motion will tell, and what others of other periods would."""
+    """Return what a motion is predicted to identify, and what others of other periods would."""
 
     def problem_of(period: float) -> ExcitationProblem:
         return _excitation_problem(given, replace(settings, period=period, shortest=None))[0]
 
     look = settings.outlook and not found.interrupted
-    say("what other periods would tell")
+    say("what other periods would identify")
     evaluations = min(OUTLOOK_EVALUATIONS, settings.evaluations // 4) if look else 0
     return foretell(
         given, problem, found, settings.repeat, settings.noise, problem_of, evaluations, settings.seed

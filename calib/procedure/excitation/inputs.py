@@ -159,7 +159,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     table = read_table(folder)
     try:
         found = from_table(chain, table)
-        require(found.model.torque_rows.has_bodies, "rows 'drive' tell nothing of the bodies", ValueError)
+        require(found.model.torque_rows.has_bodies, "rows 'drive' hold no information on the bodies", ValueError)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         theirs = description.read(folder / ROBOT)
         if theirs.n != chain.n:

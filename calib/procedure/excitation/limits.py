@@ -15,7 +15,7 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
     [torque]                         # default the robot's effort limits
     margin = 0.1                     # a share of the limits that stays free
     deviations = 2.0                 # standard deviations of the predicted torque, where the model has a covariance
-    [friction]                       # where no identified model tells: Fv [N m s/rad], Fc [N m], per joint
+    [friction]                       # where there is no identified model: Fv [N m s/rad], Fc [N m], per joint
     Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
     Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
     [[point]]                        # a named point, which keeps [target]'s height and axis_distance

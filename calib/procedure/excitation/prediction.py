@@ -59,7 +59,7 @@ class MotionPrediction:
 
 
 class PredictedSigma(NamedTuple):
-    """A row of ``prediction.csv``: a parameter, its value where it is known, and what the motion as run will tell."""
+    """A row of ``prediction.csv``: a parameter, its value where known, and its predicted sigma by the motion as run."""
 
     name: str
     unit: str
@@ -94,7 +94,7 @@ def foretell(
     evaluations: int,
     seed: int,
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return what a motion will tell, of torques and of parameters; None where a joint has no torque limit.
+    """Return what a motion is to identify, of torques and of parameters; None where a joint has no torque limit.
 
     Args:
         given, problem, found: the robot, what was solved, and the motion.
@@ -151,7 +151,7 @@ def _prediction(
     given: ExcitationInputs, noise: np.ndarray, task: np.ndarray, family: Family, x: np.ndarray, factor: float,
     repeat: float,
 ) -> tuple[MotionPrediction, np.ndarray]:  # fmt: skip
-    """Return what `repeat` periods of a motion tell, and the sigmas (c,) of the parameters."""
+    """Return the information of `repeat` periods of a motion, and the sigmas (c,) of the parameters."""
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     counted = np.ones(given.chain.n) if given.columns.sigmas is None else given.columns.sigmas

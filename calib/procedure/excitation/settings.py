@@ -78,7 +78,7 @@ class ExcitationSettings:
         existing: a recording (log.npz@0:9.4 cuts), or folder of an earlier design, that counts already; repeatable
         lock: joints that stay: joint4, or joint4=0.5 [rad or m]; repeatable
         noise: torques that no parameter explains, as a share of their limits; for predicted sigmas alone
-        outlook: look at what other periods would tell
+        outlook: look at what other periods would identify
     """
 
     goals: tuple[Goal, ...] = ()

@@ -64,7 +64,8 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: st
         identified: the folder of an identification.
         source: a URDF of the nominal robot; None: a URDF is written anew from the chain.
         out: folder for the files.
-        prior: that draws what the torques do not tell, see `calib.identification.possible.solve.PRIORS`.
+        prior: what the torques do not identify is regularised towards, see
+        `calib.identification.possible.solve.PRIORS`.
 
     Returns:
         What was written, and what to know of it, in words.

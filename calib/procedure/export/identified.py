@@ -131,7 +131,7 @@ def mass_notes(given: IdentifiedRobot) -> list[str]:
         if unlike:
             notes.append(
                 f"masses unlike the robot's description by more than {MAX_MASS_RATIO:g} times (that in brackets): "
-                f"{', '.join(unlike)}; torques tell sums of masses, not each"
+                f"{', '.join(unlike)}; torques identify sums of masses, not each"
             )
     if wrong := impossible_bodies(given.chain):
         notes.append(f"the robot's own description is not physically consistent: {'; '.join(wrong)}")

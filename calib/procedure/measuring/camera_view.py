@@ -1,4 +1,4 @@
-"""Whether a camera sees its board, where from, and what an image would tell: pose selection with a camera.
+"""Whether a camera sees its board, where from, and what an image would reveal: pose selection with a camera.
 
 ``[camera]`` of the constraints file states the camera (`calib formats constraints`).
 """
@@ -161,7 +161,7 @@ class CameraView:
 class ImageObservation:
     """Whitened observation Jacobian of images, in base columns: q (m, n) -> (m, rows, p).
 
-    An image's corners are reduced to what they tell of the board's pose and the lens; noise of corners and of the arm's
+    An image's corners are reduced to what they say of the board's pose and the lens; noise of corners and of the arm's
     repeatability are our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
 
     Attributes:
@@ -209,7 +209,7 @@ def _part(view: CameraView, q: np.ndarray, free: np.ndarray) -> PixelPart:
 
 
 def image_observation(view: CameraView, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
-    """Return the observation Jacobian of images in the columns that postures which see the board can tell."""
+    """Return the observation Jacobian of images in the columns that postures which see the board can identify."""
     table = layout(view.cell)
     columns = np.concatenate([table.arm_index, table.frame_index])
     q = view.draw(100, lambda each: np.all(view(each) <= 1e-8, axis=1), lower, upper, seed)

@@ -1,4 +1,4 @@
-"""What `calib new` is told of the cell, as tables of the limits file (`calib formats limits`) that the session keeps.
+"""What `calib new` is given of the cell, as tables of the limits file (`calib formats limits`) that the session keeps.
 
 "unknown" is an answer to every question: what it is about is then not checked, and the certificate says so. "none" says
 that there is no such thing, and nothing is missing.

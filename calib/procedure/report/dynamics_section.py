@@ -137,7 +137,7 @@ def outcome_section(outcome: IdentificationOutcome) -> Section:
 def certificate_section(
     found: DynamicReport, drawn: Mapping[str, Pictures], exported: Sequence[str] = (), tolerance: float = 0.0
 ) -> Section:
-    """Return the section of a certificate: errors on unseen motion, torques, excitation, parameters, what is not told.
+    """Return the section of a certificate: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
         drawn: figures by name, see `calib.procedure.report.figures.draw_dynamics`; those not there are left out.
@@ -151,7 +151,8 @@ def certificate_section(
     blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
-    blocks += [Text("The model", _model_sentences(metrics)), Text("What the motion can tell", _identifiability(found))]
+    blocks.append(Text("The model", _model_sentences(metrics)))
+    blocks.append(Text("What the motion identifies", _identifiability(found)))
     blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
     blocks += [*pictures("parameters"), _parameter_table(found)]
     if metrics.loop:
@@ -268,7 +269,7 @@ def _friction_table(metrics: ModelMetrics) -> Table:
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return how many parameters there are, by which method they were found, and which the data do not tell."""
+    """Return how many parameters there are, by which method they were found, and which the data do not identify."""
     lines = []
     for one in metrics.ripple:
         others = ("" if wave.gear == one.joint else f" of joint {wave.gear}" for wave in one.waves)
@@ -399,11 +400,11 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Bl
 
 
 def _identifiability(found: DynamicReport) -> list[str]:
-    """Return what the motion can and cannot tell, in sentences."""
+    """Return what the motion identifies and what not, in sentences."""
     lines = []
     weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:
-        lines.append(f"Not told from zero (σ above half the value): {', '.join(weak)}.")
+        lines.append(f"Not distinguishable from zero (σ above half the value): {', '.join(weak)}.")
     _, proof, where = proof_of(found.unseen)
     coloured = [row for row, white in zip(found.unseen.rows, proof.whiteness) if white and white.outside > WHITE]
     if coloured:
@@ -412,7 +413,7 @@ def _identifiability(found: DynamicReport) -> list[str]:
             "it, and σ, which takes it for noise, is too small there."
         )
     elif any(proof.whiteness):
-        lines.append(f"What is left on {where} cannot be told from white noise.")
+        lines.append(f"What is left on {where} cannot be distinguished from white noise.")
     return lines
 
 

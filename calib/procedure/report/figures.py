@@ -139,7 +139,7 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
 
 
 def _excitation(excitation: Path) -> list[Picture]:
-    """Return the designed motion, and how well it tells the parameters; nothing where none was designed."""
+    """Return the designed motion, and how well it identifies the parameters; nothing where none was designed."""
     from calib.procedure.excitation import coefficients
     from calib.procedure.excitation.metrics import DesignMetrics
     from calib.procedure.report import motion_figures

@@ -1,6 +1,6 @@
 """The figures of a geometric calibration: plain arrays in, a `Chart` out. Lengths come in m, angles in rad.
 
-Before is light and after is dark everywhere, so that a greyscale print still tells them apart.
+Before is light and after is dark everywhere, so that a greyscale print still distinguishes them.
 """
 
 from __future__ import annotations

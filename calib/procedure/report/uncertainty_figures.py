@@ -1,4 +1,4 @@
-"""Figures of what is known how well: what more measurements would tell, the estimate on two geometries, what matters.
+"""Figures of what is known how well: what more measurements would bring, the estimate on two geometries, what matters.
 
 The latter two are drawn from an identification's folder (``geometries.csv``, ``geometry_effects.csv``), so that a
 certificate made later shows the same.

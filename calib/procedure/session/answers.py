@@ -1,4 +1,4 @@
-"""What `calib new` is told, by options or at a terminal; loads nothing, so that the command line starts at once."""
+"""What `calib new` is given, by options or at a terminal; loads nothing, so that the command line starts at once."""
 
 from __future__ import annotations
 

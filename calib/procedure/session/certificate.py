@@ -84,7 +84,7 @@ def _whole_report(session: Session) -> fit_report.Report:
 
 
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
-    """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
+    """Return what was said of files as they came: those for training, and those that the step `unseen` looked at."""
     lines = read_lines(session.path(f"{place}/{CHECKED}"))
     files_there = session.brought("validation" if place == "3-measured" else "unseen")
     said = read_state(session).notes(unseen)

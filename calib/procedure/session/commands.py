@@ -32,7 +32,7 @@ from calib.robot.tables import dumps
 Say = Callable[[str], None]
 LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
-HEAD = "# What the cell is like, as calib new was told; calib formats limits says what may stand here.\n"
+HEAD = "# What the cell is like, as stated to calib new; calib formats limits says what may stand here.\n"
 COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
 
 

@@ -57,7 +57,7 @@ def options_of(session: Session) -> IdentifyOptions:
 
 
 def excite(session: Session, say: Say) -> list[str]:
-    """Design the motion to learn from, and another one to validate on."""
+    """Design the training motion, and another one to validate on."""
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
     from calib.procedure.excitation.settings import ExcitationSettings
@@ -97,7 +97,7 @@ def excite(session: Session, say: Say) -> list[str]:
 
 
 def record(session: Session, say: Say) -> list[str]:
-    """Check the recordings to learn from."""
+    """Check the training recordings."""
     cuts, notes = {}, []
     for path in session.brought("training"):
         say(f"reading {path.name}")
@@ -153,7 +153,7 @@ def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
-    """Return the recordings to learn from, and what is held out of them, as paths with cuts."""
+    """Return the training recordings, and what is held out of them, as paths with cuts."""
     cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")

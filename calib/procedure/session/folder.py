@@ -3,7 +3,8 @@
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
 2-poses/         poses.csv to measure and fit, in the order of least time, poses_run.csv the ways between them, and
-                 validation.csv to measure and never fit; poses_prediction.json and predicted.png what they will tell
+                 validation.csv to measure and never fit; poses_prediction.json and predicted.png what they are
+                 predicted to identify
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
                  some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
 4-fit/  5-validation/

@@ -95,10 +95,10 @@ def _play(session: Session, step: str) -> str:
     wanted = session.settings.dynamics
     names = _motions(session, step)
     if not wanted.plan:
-        return "Record the robot moving in all its joints, in one motion to learn from and in another, unseen one."
+        return "Record the robot moving in all its joints, in one motion for training and in another, unseen one."
     file = RUN if wanted.repeats > 1 else SAMPLES
     motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
-    unseen = " (never learnt from)" if "validation" in names else ""
+    unseen = " (never used for training)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted.payloads.items())
     again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
     return (

@@ -28,7 +28,7 @@ HOW = "state [camera] in the limits file: calib formats constraints"
 
 
 def choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[str]:
-    """Choose and write the poses that ``session.toml`` asks for, the run through them, and what they will tell."""
+    """Choose and write the poses that ``session.toml`` asks for, the run through them, and predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     wanted, instrument = settings.poses, settings.instrument
     base, tip = session.links(chain)
@@ -75,7 +75,7 @@ def choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[s
 
 
 def _seen_as(measures: str) -> str:
-    """Return the kind of measurement that poses are chosen for: an image tells a pose."""
+    """Return the kind of measurement that poses are chosen for: an image determines a pose."""
     return "pose" if measures == Pixels.kind else measures
 
 

@@ -30,7 +30,7 @@ LOST = 0.2  # median misfit over the distance to the board beyond which nothing 
 
 @dataclass(frozen=True, eq=False)
 class CameraPlacement:
-    """What a block of images tells of camera and board by itself.
+    """What a block of images says of camera and board by itself.
 
     Attributes:
         rows: (k,) the rows that were looked at.
@@ -203,7 +203,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
         one, other = sorted(each.error for each in tried.values())
         if other < min_contrast * one:
             raise MeasurementError(
-                f"whether the arm carries the camera or the board cannot be told ({1e3 * one:.1f} against "
+                f"whether the arm carries the camera or the board cannot be determined ({1e3 * one:.1f} against "
                 f"{1e3 * other:.1f} mm): say so in the options, [camera] mounting = 'in hand' or 'to hand'",
                 block.file,
             )
@@ -240,7 +240,7 @@ def _check_pairing(
 
 
 def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_scale_error: float = 0.04) -> None:
-    """Refuse a board of another size than stated: the arm's motion tells the size of a square to a few per cent.
+    """Refuse a board of another size than stated: the arm's motion gives the size of a square to a few per cent.
 
     Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
 

@@ -1,4 +1,4 @@
-"""A lens from images of a board alone, and whether they tell it.
+"""A lens from images of a board alone, and whether they identify it.
 
 Zhang's (2000) problem, min over lens and one pose per image of the reprojection error, by variable projection (Golub &
 Pereyra 1973; Kaufman 1975): for a lens every image has its own best pose, and what a QR of its rows leaves beyond those
@@ -47,7 +47,7 @@ class LensGuess:
 def estimate_lens(
     board: Board, pixel: np.ndarray, size: tuple[int, int], model: str = "pinhole", file: str = ""
 ) -> LensGuess:
-    """Return the lens that images (m, K, 2) [px] of a flat board tell.
+    """Return the lens that images (m, K, 2) [px] of a flat board determine.
 
     Args:
         board: what was seen.
@@ -57,7 +57,7 @@ def estimate_lens(
         file: for messages.
 
     Raises:
-        MeasurementError: too few images, or all from one direction, so that the focal length cannot be told.
+        MeasurementError: too few images, or all from one direction, so that the focal length cannot be determined.
     """
     good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
     if len(good) < MIN_IMAGES:
@@ -86,7 +86,7 @@ def estimate_lens(
         told = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
         refuse_data(
             file,
-            f"the focal length is told {told}: the images see the board from too few "
+            f"the focal length is identified {told}: the images see the board from too few "
             "directions; tilt it (or the camera) by 20 to 45° both ways in a dozen images, or give the lens "
             "(camera.yaml)",
         )

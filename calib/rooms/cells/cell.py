@@ -56,7 +56,7 @@ class Cell:
     """A cell with one station and one tool.
 
     Attributes:
-        nominal: what the engineer is told the arm is.
+        nominal: what the engineer takes the arm to be.
         truth: what it is, where it stands, what the tool is, and how its joints deflect; hidden from a calibration.
         instrument: what measures.
         note: what the truth is made of, in a sentence.

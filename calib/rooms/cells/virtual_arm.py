@@ -4,7 +4,7 @@
 
 the first seen by sensors behind the gears, the second by the motors, each plus what no model holds (`unmodelled`).
 True inertias are the library's, made wrong body by body in a way that keeps every one possible, so that the nominal
-masses, which a calibration is told, are off.
+masses, which a calibration is given, are off.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class ParallelDesign:
 
     Attributes:
         robot: regressor and torques along platform coordinates.
-        base: base parameters it is to tell.
+        base: base parameters it is to identify.
         family, found: the Fourier series of the platform's coordinates; proof: margins, checked independently.
         condition: of the observation matrix over `INSTANTS` samples: raw, and with columns of unit norm.
         peak: (n,) largest torque of each actuator [N m or N]; fastest: (r,) largest acceleration of each coordinate.
@@ -118,7 +118,7 @@ def design_parallel(
     map: Callable = map,
     report: Callable[[int, int, str], None] | None = None,
 ) -> ParallelDesign:
-    """Design a motion of the platform that tells the base parameters of a robot.
+    """Design a motion of the platform that excites the base parameters of a robot.
 
     Args:
         model: of the robot, with what it carries.

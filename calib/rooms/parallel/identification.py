@@ -215,16 +215,16 @@ def _contradictions(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
 
 
 def _payload_notes(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> list[str]:
-    """Return what recordings with and without them tell of the payloads."""
+    """Return what recordings with and without them say of the payloads."""
     notes, estimate = [], found.fitted.estimate
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)
         if on == 0:
-            notes.append(f"payload '{label}' is on board of no recording to learn from: nothing is known of it")
+            notes.append(f"payload '{label}' is on board of no training recording: nothing is known of it")
         elif on == len(cases):
             notes.append(
                 f"payload '{label}' is on board of every recording: its parameters are regrouped with the platform's; "
-                "a run without it tells them apart"
+                "a run without it separates them"
             )
         elif f"M{label}" in found.base.names:
             k = found.base.names.index(f"M{label}")

@@ -7,7 +7,7 @@ options file ``fix`` counts: names of constants that stay, as ``estimate.csv`` h
 Verdict, by rows the fit has not seen (validation files, rows held out; else rows of four folds left out in turn): fail
 where a tolerance is exceeded or the calibrated robot is worse than the nominal one; marginal where there are no such
 rows, where errors are three times the fit's own, where the gain is below 10 %, or where only encoders were read, which
-tell neither scale nor place; else pass.
+give neither scale nor place; else pass.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class ParallelFit(ParallelResult):
         robot, found = self.nominal.known.robot, self.found
         told = len(found.parameters) - len(found.vague)
         lines = [
-            f"{robot.name}: {len(found.parameters)} constants of the loops, {told} told by the data; encoders off by "
+            f"{robot.name}: {len(found.parameters)} constants of the loops, {told} identified; encoders off by "
             f"{found.before:.3g}, calibrated by {found.after:.3g} (rms, rad or m)"
         ]
         for where, errors in self.judged.items():
@@ -364,7 +364,7 @@ def _judge(
     if not told:
         return Verdict("marginal", "there are no unseen rows, and too few to leave some out: measure more poses")
     if rows.coordinates is None:
-        return Verdict("marginal", f"{told[0]}; readings alone tell neither scale nor place: measure platform poses")
+        return Verdict("marginal", f"{told[0]}; readings alone give neither scale nor place: measure platform poses")
     if far or small:
         return Verdict("marginal", far[0] if far else f"the gain is small: {small[0]}; it may be calibrated already")
     kept = "" if tolerance is None else f", within the tolerance of {1e3 * tolerance:g} mm"

@@ -87,7 +87,7 @@ def compare(
     The one to take is judged as calib identify judges it; where its verdict is fail, none is to take: exit code 1.
 
     Args:
-        recordings: recordings to learn from; log.npz@0:9.4 cuts
+        recordings: training recordings; log.npz@0:9.4 cuts
         validate: recording of other motion; may be repeated
         methods: wls,iv,didim; default: all that the options allow
         friction: as of calib identify; loops are simulated with standard friction

@@ -1,13 +1,13 @@
-"""What rows say: figures of merit of each method on each condition, and which methods can be told apart.
+"""What rows say: figures of merit of each method on each condition, and which methods can be distinguished.
 
 Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
 on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
 data set go together and their distributions have long tails.
 
 The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
-motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set, are as good
-as the best; a method of fewer than `MIN_DATA_SETS` runs is listed and takes no part. Of these one is taken that is
-cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
+motion cannot be distinguished from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set,
+are as good as the best; a method of fewer than `MIN_DATA_SETS` runs is listed and takes no part. Of these one is
+taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class MethodSummary:
         examples: status → data set and message of the first of these.
         figures: name of a figure (`FIGURES`) → its spread.
         rank: by the median torque error, from 1.
-        as_good: not told from the best, or within `SLACK` of it, and reliable.
+        as_good: not distinguishable from the best, or within `SLACK` of it, and reliable.
         chosen: the one of those to take.
         p: of the sign test against the best; NaN for the best itself.
     """
@@ -66,7 +66,7 @@ class MethodSummary:
 
     @property
     def enough(self) -> bool:
-        """Whether there are runs enough to tell it from others."""
+        """Whether there are runs enough to distinguish it from others."""
         return self.trials >= MIN_DATA_SETS
 
     @property
@@ -102,7 +102,7 @@ class ConditionSummary:
         if self.chosen or not self.methods:
             return ""
         if not any(one.enough for one in self.methods):
-            return f"fewer than {MIN_DATA_SETS} runs of any method tell nothing apart: --runs {MIN_DATA_SETS} or more"
+            return f"fewer than {MIN_DATA_SETS} runs of any method distinguish nothing: --runs {MIN_DATA_SETS} or more"
         return f"no method of {MIN_DATA_SETS} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
 
 
@@ -185,7 +185,7 @@ def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
         one, other: seed → error; seeds in both count, ties do not.
 
     Returns:
-        1 where fewer than `MIN_DATA_SETS` data sets tell them apart.
+        1 where fewer than `MIN_DATA_SETS` data sets distinguish them.
     """
     both = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
     larger, smaller = sum(a > b for a, b in both), sum(a < b for a, b in both)

@@ -38,7 +38,7 @@ class TrialRow:
         robot, sigma_q, sigma_tau, decimation, cutoff, mismatch, duration, guess: of the condition.
         beta_error: 100 ‖β̂ - β‖ / ‖β‖ [%].
         beta_distance: the survey's d_β = 100 (2/p) Σ |β̂_j - β_j| / (|β̂_j| + |β_j|) [%].
-        beta_sigma: rms of (β̂_j - β_j) / σ_j: 1 where the stated σ tell the error.
+        beta_sigma: rms of (β̂_j - β_j) / σ_j: 1 where the stated σ match the error.
         coverage: share of the parameters within 1.96 σ [%].
         torque_error: 100 ‖τ̂ - τ‖ / ‖τ‖ along the validation motion, τ noise-free [%].
         torque_worst: the same of the worst joint.
@@ -79,7 +79,7 @@ class TrialRow:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """What tells it from all other trials."""
+        """What distinguishes it from all other trials."""
         return self.digest, self.method, self.seed
 
     @property

@@ -93,7 +93,7 @@ def test_motion_far_beyond_the_limits_is_a_warning():
 def test_most_parameters_from_the_cad_are_told_in_the_reason(drawn, told):
     rests = Resting(tuple(f"p{k}" for k in range(drawn)), 10, "cad")
     reason = with_prior(Verdict("marginal", "why"), rests).reason
-    assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not tell them") == told
+    assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not identify them") == told
     assert told or reason == "why"
 
 

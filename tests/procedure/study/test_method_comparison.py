@@ -70,7 +70,7 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
     given = gather(robot, [train], [other])
     (found,) = compare_methods(given, ["ols"])
     assert found.unseen > 100.0 and not found.chosen
-    assert "learn from more motion" in caveats(given, [found])[-1]
+    assert "add training motion" in caveats(given, [found])[-1]
 
 
 def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -42,7 +42,7 @@ class ClosedRobot:
     Attributes:
         robot: legs and platform.
         home: its posture there, (1, ...).
-        minors: per leg, the rows of its Jacobian whose determinant tells its branch.
+        minors: per leg, the rows of its Jacobian whose sign of the determinant is its branch.
         signs: (L + 1,) of these determinants at home; last that of the encoders' rows (0 where they are redundant).
         fixed: whether the loops leave the same twists everywhere: the named ones.
     """
@@ -342,7 +342,7 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
     """Return whether the loops leave the named twists everywhere, after checking how many they leave.
 
     Raises:
-        RobotError: for another number of freedoms than named, or names that do not tell them apart.
+        RobotError: for another number of freedoms than named, or names that do not distinguish them.
     """
     named, fixed = np.eye(6)[:, robot.selected], True
     rng, free = np.random.default_rng(0), ClosedRobot(robot, home, (), np.zeros(0), False)

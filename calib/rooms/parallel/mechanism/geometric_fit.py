@@ -1,15 +1,16 @@
 """Geometric calibration of a parallel robot from its closure: from platform poses, or from redundant encoders alone.
 
     poses       r = q - q(P; g)                 encoders against the legs' joints at the measured pose
-    encoders    r = Nᵀ (q - q(x̂; g))            what n encoders of r freedoms contradict each other by; x̂ fits them best
+    encoders    r = Nᵀ (q - q(x̂; g))            what n encoders of r freedoms contradict each other by; x̂ fits them
+    best
 
     ∂q/∂g = -J⁺ ∂gap/∂g                         of the closure J δq = G t - gap(g), so no forward kinematics is
                                                 differentiated (self-calibration: Wampler, Hollerbach & Arai 1995)
 
 g: the constants of every leg's rows, its place in the base, its attachment, and the zeros of the encoders (they are the
 thetas, or r of prismatic joints). A parameter that would open a loop for good (an axis tilted out of a planar robot's
-plane) is left out. Parameters that depend on each other, gauge included, are drawn to the nominal robot by a prior of
-`SPREAD`, and keep its covariance where the data do not tell them.
+plane) is left out. Parameters that depend on each other, gauge included, are regularised towards the nominal robot by a
+prior of `SPREAD`, and keep its covariance where the data do not identify them.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class LoopFit:
     Attributes:
         known: the calibrated robot, its loops closed.
         parameters: that may change; estimate: their changes from the nominal robot, with covariance.
-        vague: names of parameters of which the data tell less than half of what was known beforehand.
+        vague: names of parameters of which the data identify less than half of what was known beforehand.
         before, after: rms of the encoders' residuals [rad or m], nominal and calibrated.
         iterations: of Gauss and Newton.
     """
@@ -100,15 +101,15 @@ def fit_loops(
         loss: relative change of the residuals' sum of squares at which the fit is settled.
 
     Raises:
-        Unidentifiable: where the data tell no parameter; readings alone of a robot without redundancy.
+        Unidentifiable: where the data identify no parameter; readings alone of a robot without redundancy.
         NoPosture: for rows at which no posture exists.
         NotConverged: after 30 steps.
     """
     robot = nominal.robot
     if coordinates is None and not robot.redundant:
         raise Unidentifiable(
-            f"'{robot.name}' has as many encoders as freedoms: readings alone tell nothing of its geometry; measure "
-            "platform poses"
+            f"'{robot.name}' has as many encoders as freedoms: readings alone determine nothing of its geometry; "
+            "measure platform poses"
         )
     parameters = tuple(one for one in loop_parameters(nominal) if one.name not in held)
     count, known, square, before, std = len(parameters), nominal, np.inf, np.nan, np.nan

@@ -1,6 +1,6 @@
 """The file of a parallel robot, in TOML: legs as MDH tables, a platform, where each leg is attached.
 
-kind = "parallel"                # required: tells it from a serial arm
+kind = "parallel"                # required: distinguishes it from a serial arm
 name = "dualv"
 gravity = [0, 0, -9.81]          # in the base frame [m/s²]
 source = "where the numbers come from"

@@ -3,14 +3,15 @@
     state x = [q, v, χ],   q, v ← one step under the measured torques with parameters χ,   χ ← χ,   seen: q
 
 (Gautier & Poignet 2001; Leboutet et al. 2021, section 6.1). One pass over all recordings; the robot alone is simulated,
-so no controller is asked for. What the survey tunes by hand, the data tell, or it follows from the model (our choices):
+so no controller is asked for. What the survey tunes by hand, the data determine, or it follows from the model (our
+choices):
 
 * noise of q: the level of each log's spectrum, the filtered log thinned to `FASTER` times its cut-off;
 * process noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹;
 * parameters have none: they are constants, and a filter that knows its other noise needs none to converge;
 * they start where `calib.rooms.studies.methods.believed` says, as uncertain as `START_SIGMAS` standard deviations of
 least
-  squares, or as far from it as they are: that is next to nothing beside what a pass tells.
+  squares, or as far from it as they are: that is next to nothing compared with what a pass adds.
 
 Where innovations are larger than the filter says, the covariance is widened by their mean square.
 """

@@ -182,14 +182,14 @@ def _packed(
     """Return the fit with the covariance H⁻¹ S H⁻¹.
 
     Raises:
-        Unidentifiable: where the simulated motion does not tell parameters apart.
+        Unidentifiable: where the simulated motion does not distinguish parameters.
     """
     white, left = slopes / std[:, None], residual / std
     p, rows = len(values), int(np.sum(residual != 0.0))
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
     factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
-    require_rank(factor, plain.pooled.names, "the simulated motion does not tell them apart")
+    require_rank(factor, plain.pooled.names, "the simulated motion does not distinguish them")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T
     covariance = rows / max(rows - p, 1) * bread @ scatter(white, left) @ bread

@@ -97,7 +97,7 @@ def compare_methods(
     """Return every method on these recordings, best first; those that failed, or that lack a [loop], last.
 
     Args:
-        inputs: recordings to learn from, and unseen ones.
+        inputs: training recordings, and unseen ones.
         methods: their names; None: all.
         friction: as of `IdentificationSettings`; methods that simulate know ``standard`` alone.
         say: called with words on progress.
@@ -156,7 +156,7 @@ def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> li
     if found and found[0].unseen >= USELESS:
         told.append(
             f"none to take: the best is off by {found[0].unseen:.3g} % on unseen motion, no model by {USELESS:g} %: "
-            "learn from more motion"
+            "add training motion"
         )
     elif judged_one is not None:
         told.append(f"none to take: calib identify fails the model of {judged_one.name}, for the reason below")

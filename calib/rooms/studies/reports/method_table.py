@@ -41,7 +41,7 @@ def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
         for one in good
     ]  # fmt: skip
     note = (
-        "100 ‖τ - τ̂‖ / ‖τ‖ on motion that was not learnt from, in the identification band, ± its standard error over "
+        "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over "
         f"blocks of time; as good: within {APART:g} standard errors of the difference, or {SLACK:.0%}, of the best"
     )
     strong = frozenset(k for k, one in enumerate(good) if one.chosen)

@@ -27,8 +27,8 @@ from calib.rooms.studies.trial import TrialRow
 
 RULE = (
     f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
-    "whose torque error on unseen motion, noise-free, is not told from the best one's on the same data sets (sign "
-    f"test, {LEVEL:.0%}), or, in the median data set, larger by at most {SLACK:.0%}.",
+    "whose torque error on unseen motion, noise-free, cannot be distinguished from the best one's on the same data "
+    f"sets (sign test, {LEVEL:.0%}), or, in the median data set, larger by at most {SLACK:.0%}.",
     f"Of these one is taken that is cheap, at most {ALIKE:g} times the processor time of the cheapest: the best such.",
     "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
     f"A method with fewer than {MIN_DATA_SETS} runs is listed, and neither the best nor as good: too few to compare.",
