@@ -13,7 +13,7 @@ from rich.table import Table
 
 from calib.config import parse
 from calib.errors import UsageError, command_line, require
-from calib.folders import CERTIFICATE
+from calib.folders import CERTIFICATE, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
@@ -78,7 +78,7 @@ def begin(
         "poses": {"fit": poses, "validation": validation, "constraints": named},
         "dynamics": {"wanted": dynamics, "limits": named, **(motion or {})},
     }  # fmt: skip
-    return create(folder, source, parse(SessionSettings, table, "session.toml"), copied | meshes_beside(source))
+    return create(folder, source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))
 
 
 def _limits(
