@@ -180,25 +180,22 @@ class Real(_Read):
         found = _number(value, self.quantity) if self.quantity and isinstance(value, str) else _float(value)
         if self.zero and found == 0.0:
             return found
-        if not (math.isfinite(found) or (self.infinite and found == found)):
-            raise _Refused(self.words or self._expected, value)
-        if self.above is not None and found <= self.above:
-            raise _Refused(self.words or self._expected, value)
-        if self.above is None and self.least is not None and found < self.least:
-            raise _Refused(self.words or f"{self.least:g} or more", value)
-        if (self.least is not None and found < self.least) or (self.most is not None and found > self.most):
-            raise _Refused(self.words or self._span, value)
+        if expected := self._expected(found):
+            raise _Refused(self.words or expected, value)
         return found
 
-    @property
-    def _expected(self) -> str:
-        return "a number" if self.above is None else f"a number above {self.above:g}"
-
-    @property
-    def _span(self) -> str:
+    def _expected(self, found: float) -> str:
+        """Return what was expected where a number is beyond the bounds; empty where it keeps them."""
+        finite = math.isfinite(found) or (self.infinite and not math.isnan(found))
+        if not finite or (self.above is not None and found <= self.above):
+            return "a number" if self.above is None else f"a number above {self.above:g}"
+        if self.above is None and self.least is not None and found < self.least:
+            return f"{self.least:g} or more"
+        if (self.least is None or found >= self.least) and (self.most is None or found <= self.most):
+            return ""
         hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
         low = "" if self.least is None else f"at least {self.least:g} and "
-        return f"{self.unit or 'a number'}, {low}at most {self.most or math.inf:g}{hint}"
+        return f"{self.unit or 'a number'}, {low}at most {math.inf if self.most is None else self.most:g}{hint}"
 
     @property
     def json(self) -> Mapping[str, Any]:
