@@ -36,14 +36,7 @@ import numpy as np
 
 from calib import files
 from calib.folders import DRIVES, JOINT_ORIGINS, MJCF, PARAMETERS, write_staged
-from calib.procedure.export.identified import (
-    IdentifiedRobot,
-    consistency_lines,
-    drive_notes,
-    exported_prediction,
-    mass_notes,
-    read,
-)
+from calib.procedure.export.identified import IdentifiedRobot, exported_prediction, notes_of, read
 from calib.procedure.export.masses import as_mjcf, as_urdf
 from calib.procedure.export.parameters import parameters
 from calib.procedure.kinematic_stage.folder import URDF
@@ -94,8 +87,7 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: st
         "robot.xml: MJCF with armature, damping and frictionloss; Pinocchio reads the same poses and torques to 1e-9",
         "drives.csv, parameters.json" + ("" if source is None else ", joint_origins.yaml (tesseract's SRDF)"),
     ]
-    notes += mass_notes(given)
-    return [*lines, *consistency_lines(given.found, given.information.b), *notes, *drive_notes(given)]
+    return [*lines, *notes_of(given), *notes]
 
 
 def _export_drives(given: IdentifiedRobot, out: Path) -> Path:

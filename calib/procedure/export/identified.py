@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.bodies import Bodies, bodies_of
+from calib.errors import finding
 from calib.identification.friction.drive_table import Drives, drive_table, without_left
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
@@ -15,10 +16,10 @@ from calib.identification.possible.information import read as read_information
 from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_torques
 from calib.procedure.export import geometry
+from calib.procedure.findings import lines_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.description_checks import impossible_bodies
-from calib.words import listing
 
 MAX_MASS_RATIO = 3.0  # times a body's mass in the description from which on it is named (our choice)
 
@@ -99,56 +100,28 @@ def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPredict
     return max(found, key=lambda one: one.exported, default=None)
 
 
-def consistency_lines(found: PossibleBodies, b: int) -> list[str]:
-    """Return what consistency cost, in words."""
-    lines = [
-        f"physically consistent inertias, {found.distance:.3g} σ from the estimate of {b} parameters (limit "
-        f"{found.allowed:.3g}); regularised towards {found.source}, weight {found.weight:.3g}, {found.prior} prior; "
-        f"thinnest body {1e3 * float(found.margins.min()):.3g} mm (as a standard deviation)"
-    ]
-    if not found.possible:
-        blamed = ", ".join(f"{name} (without it {left:.3g})" for name, left in found.blamed)
-        lines.append(
-            "no physically consistent inertias within the estimate's uncertainty: the nearest are "
-            f"{found.nearest:.3g} σ away (limit {found.allowed:.3g}), mostly by {blamed}: unmodelled friction, gains "
-            "or a payload, or σ too small"
+def notes_of(given: IdentifiedRobot) -> list[str]:
+    """Return what consistency cost, what the bodies written weigh, and what is in none of the robot files."""
+    solved, chain, bodies = given.found, given.chain, given.found.dynamics.model.bodies
+    masses, theirs = given.bodies[:, 9], [] if chain.inertias is None else chain.inertias[:, 9]
+    found = [
+        finding(
+            "inertias", distance=solved.distance, count=given.information.b, allowed=solved.allowed,
+            source=solved.source, weight=solved.weight, prior=solved.prior, thinnest=solved.margins.min(),
         )
-    return [*lines, *found.notes]
-
-
-def mass_notes(given: IdentifiedRobot) -> list[str]:
-    """Return what the bodies written weigh, how that compares with the description's, and what of these cannot be."""
-    names, masses = given.chain.joint_names, given.bodies[:, 9]
-    notes = [f"masses written, behind each joint: {', '.join(f'{mass:.3g}' for mass in masses)} kg"]
-    if given.chain.inertias is not None:
-        theirs = given.chain.inertias[:, 9]
-        pairs = zip(names, masses, theirs)
-        unlike = [
-            f"{name} {mass:.3g} kg ({own:.3g})"
-            for name, mass, own in pairs
-            if max(mass, own) > MAX_MASS_RATIO * min(mass, own)
-        ]
-        if unlike:
-            notes.append(
-                f"masses unlike the robot's description by more than {MAX_MASS_RATIO:g} times (that in brackets): "
-                f"{', '.join(unlike)}; torques identify sums of masses, not each"
-            )
-    if wrong := impossible_bodies(given.chain):
-        notes.append(f"the robot's own description is not physically consistent: {'; '.join(wrong)}")
-    return notes
-
-
-def drive_notes(given: IdentifiedRobot) -> list[str]:
-    """Return what of the drives and payloads is in none of the robot files."""
-    notes = []
-    if np.any(given.drives.values[:, 0]):
-        notes.append(
-            "URDF has no place for motor inertias: robot.urdf is without them, drives.csv and robot.xml are not"
-        )
-    if np.any(given.drives.values[:, 3]) or given.drives.left:
-        names = [*(["offsets"] if np.any(given.drives.values[:, 3]) else []), *given.drives.left]
-        notes.append(f"in parameters.json alone: {listing(names, 8)}")
-    carried = given.found.dynamics.model.bodies
-    if payloads := [label for label, c in zip(carried.labels, carried.coordinates) if c < 0]:
-        notes.append(f"payload {', '.join(payloads)} is not part of the robot: in parameters.json alone")
-    return notes
+    ]  # fmt: skip
+    if not solved.possible:
+        blamed = [f"{name} (without it {left:.3g})" for name, left in solved.blamed]
+        found.append(finding("inertias-inconsistent", nearest=solved.nearest, allowed=solved.allowed, blamed=blamed))
+    found.append(finding("masses-written", masses=[f"{mass:.3g}" for mass in masses]))
+    rows = [row for row in zip(chain.joint_names, masses, theirs) if max(row[1:]) > MAX_MASS_RATIO * min(row[1:])]
+    offsets = ["offsets"] if np.any(given.drives.values[:, 3]) else []
+    optional = {
+        "masses-unlike": [f"{name} {mass:.3g} kg ({stated:.3g})" for name, mass, stated in rows],
+        "description-inconsistent": impossible_bodies(chain),
+        "urdf-without-motor-inertias": given.drives.values[:, 0].nonzero()[0],
+        "only-in-parameters": [*offsets, *given.drives.left],
+        "payload-not-exported": [label for label, c in zip(bodies.labels, bodies.coordinates) if c < 0],
+    }
+    found += [finding(code, names=names, times=MAX_MASS_RATIO) for code, names in optional.items() if len(names)]
+    return [*lines_of(found), *solved.notes]

@@ -32,7 +32,7 @@ import socket
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -41,13 +41,14 @@ from calib import files
 from calib.config import parse
 from calib.config_types import Text
 from calib.data.poses.pixels import CORNERS, is_image_folder
-from calib.errors import CalibError, SessionError, command_line
+from calib.errors import CalibError, SessionError, command_line, refused_as
 from calib.folders import CERTIFICATE, METRICS, PARAMETERS
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
+from calib.records import plain
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain
 
@@ -173,9 +174,7 @@ class Session:
 
     def write_state(self, state: StateFile) -> None:
         """Record `state`, whole or not at all."""
-        running = {"running": state.running} if state.running else {}
-        steps = {name: asdict(record) for name, record in state.steps.items()}
-        files.write_json(self.path("state.json"), {"schema": SCHEMA, "steps": steps, **running})
+        files.write_json(self.path("state.json"), {"schema": SCHEMA, **plain(state)})
 
     def verdicts(self) -> Verdicts:
         """Return the verdict of each stage; dynamics that were not exported are good for prediction only."""
@@ -280,16 +279,12 @@ def read_state(session: Session) -> StateFile:
     path = session.path("state.json")
     if not path.exists():
         return StateFile()
-    advice = "delete it, and calib next makes the steps again"
-    try:
+    damaged = f"{path} is damaged ({{}}); delete it, and calib next makes the steps again"
+    with refused_as(SessionError, (OSError, ValueError, RecursionError), damaged):
         state = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise SessionError(f"{path} is damaged ({error}); {advice}") from error
     check_schema(path, state.get("schema") if isinstance(state, dict) else None)
-    try:
+    with refused_as(SessionError, (SessionError,), damaged):
         return parse(StateFile, state, "what it records", SessionError)
-    except SessionError as error:
-        raise SessionError(f"{path} is damaged ({error}); {advice}") from None
 
 
 @contextmanager
