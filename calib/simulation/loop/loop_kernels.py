@@ -563,8 +563,9 @@ def closed_loop(
             wish[j] = at[j]
         while sample < out.shape[1] and sample * every < k + 1 - 1e-9:
             part = sample * every - k
-            here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
+            here, fast, first = q, v, slopes
             if part >= 1e-9:
+                here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
                 args = (tree, body, linear, kinds, acts, past, loads)
                 status = _advance(*args, here, fast, wish, part * period, first, work, matrix, at, rate)
                 if status != FINE:
