@@ -91,7 +91,7 @@ class Question:
     @property
     def words(self) -> str:
         """What is asked, as the option's help says it."""
-        return described(Answers)[self.name]
+        return f"{self.name.replace('_', ' ')} ({described(Answers)[self.name]})"
 
     def open(self, given: Answers) -> bool:
         """Say whether it is to be put."""
