@@ -19,12 +19,10 @@ from calib.arrays import frozen
 from calib.dynamics import rigid_body
 from calib.dynamics.drives import added_inertia
 from calib.errors import CannotSimulate, UsageError
-from calib.rooms.parallel.mechanism.distribution import preload_directions
 from calib.rooms.parallel.mechanism.leg_links import compiled
-from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
-from calib.rooms.parallel.mechanism.platform_body import wrench_regressor
+from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, wrench_regressor
 from calib.rooms.parallel.mechanism.platform_motion import along
-from calib.rooms.parallel.mechanism.velocities import LoopMotion
+from calib.rooms.parallel.mechanism.velocities import LoopMotion, preload_directions
 
 FAR = 0.3  # [rad or m] between encoders and reference at which a run is given up
 

@@ -14,9 +14,9 @@ from calib.identification.identify import identify_model
 from calib.identification.settings import IdentificationSettings
 from calib.rooms.parallel.mechanism import library, parallel_files
 from calib.rooms.parallel.mechanism.closure import closed
-from calib.rooms.parallel.mechanism.distribution import distributed, overconstraint
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
+from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
 
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}
 RATE = 1000.0

@@ -129,7 +129,8 @@ def gather(
         raise UsageError("no recording given")
     given = [*recordings, *validate]
     paths = [_path(each) for each in given]
-    _check_files(options, paths)
+    if not isinstance(robot, Mechanism):  # whose outcome may be judged on more files later, named in the same options
+        _check_files(options, paths)
     known = load_calibrated(robot, base, tip) if isinstance(robot, (str, Path)) else robot
     source = resolve(robot) if isinstance(robot, (str, Path)) else Path(known.source or known.chain.name)
     chain, arm = known.chain, isinstance(known, CalibratedChain)

@@ -9,13 +9,37 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.installation import Installation
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection, Term
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import Cell, SimulatedInstrument
-from calib.rooms.cells.deflections import deflection
 from calib.rooms.cells.unmodelled import PositionErrors
 from calib.transforms import pose
+
+ORDERS = (2, 3)
+
+
+def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed: int) -> Deflection:
+    """Return compliance and harmonics of every joint of a chain.
+
+    Args:
+        chain: the true arm.
+        compliance: (n,) [rad/(N m)].
+        amplitude: (n,) of each harmonic [rad, or m for a prismatic joint].
+        seed: of the phases φ.
+    """
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (chain.n, len(ORDERS)))
+    terms, values = [], []
+    for j, k in enumerate(chain.moving):
+        name = chain.elements[k].name
+        terms.append(Term(name, "torque", j))
+        values.append(compliance[j])
+        for order, phase in zip(ORDERS, phases[j]):
+            terms += [Term(name, "sin", j, order), Term(name, "cos", j, order)]
+            values += [amplitude[j] * np.cos(phase), amplitude[j] * np.sin(phase)]
+    return Deflection(tuple(terms), np.array(values), chain)
+
 
 LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3  # how far a made-up arm is from its nominal (1 sigma) [m], [rad], [rad]
 COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2  # hidden part of the LWR4+ [rad/(N m)], [rad]

@@ -22,12 +22,11 @@ from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.robot_kinds import refuse_unread
-from calib.rooms.parallel.design import actuator_bounds
-from calib.rooms.parallel.excite import read_model
+from calib.rooms.parallel.excite import actuator_bounds, read_model
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, coordinates_of
-from calib.rooms.parallel.mechanism.distribution import distributed
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model
+from calib.rooms.parallel.mechanism.velocities import distributed
 from calib.rooms.parallel.results import ParallelResult, ResultFolder, write_motion
 from calib.rooms.parallel.robots import ParallelMechanism
 from trajectories.setpoints import Setpoints, joined

@@ -98,7 +98,7 @@ def compare(
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs
     from calib.procedure.report import console
-    from calib.rooms.studies.reports import method_table
+    from calib.rooms.studies.reports import method_comparison
     from calib.rooms.studies.reports.method_comparison import caveats, compare_methods, write_table
 
     table = [] if out is None else [(out, (".csv",))]
@@ -110,9 +110,9 @@ def compare(
             friction=friction, progress=progress,
         )  # fmt: skip
         found = compare_methods(
-            given, chosen, friction, progress, lambda one: say_now(method_table.line(one))
+            given, chosen, friction, progress, lambda one: say_now(method_comparison.line(one))
         )  # fmt: skip
-    say(*console.section(method_table.section(found, caveats(given, found))))
+    say(*console.section(method_comparison.section(found, caveats(given, found))))
     if out is not None:
         with files.results(table, overwrite=overwrite):
             say(f"written to {write_table(found, out)}")

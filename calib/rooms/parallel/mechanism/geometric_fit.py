@@ -24,10 +24,9 @@ from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed, coordinates_of
-from calib.rooms.parallel.mechanism.distribution import preload_directions
 from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links, times
 from calib.rooms.parallel.mechanism.parallel_robot import Leg, ParallelRobot
-from calib.rooms.parallel.mechanism.velocities import loop_jacobians
+from calib.rooms.parallel.mechanism.velocities import loop_jacobians, preload_directions
 from calib.transforms import displace
 
 STEP = 1e-6  # of differences by a parameter [m or rad]

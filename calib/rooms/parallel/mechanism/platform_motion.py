@@ -9,10 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
-from calib.rooms.parallel.mechanism.distribution import distributed
 from calib.rooms.parallel.mechanism.leg_links import Posture
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
-from calib.rooms.parallel.mechanism.velocities import LoopMotion, loop_jacobians, of_platform
+from calib.rooms.parallel.mechanism.velocities import LoopMotion, distributed, loop_jacobians, of_platform
 
 STEP = 1e-6  # of the differences by x
 SPARE = 0.01  # of the box's width, beyond it (our choice)

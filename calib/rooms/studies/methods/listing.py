@@ -5,7 +5,7 @@ from __future__ import annotations
 from calib.identification.methods.method import MethodEntry
 from calib.rooms.studies.methods.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF, UKF
 from calib.rooms.studies.methods.maximum_likelihood import ML
-from calib.rooms.studies.methods.neural_networks import ADALINE, HOPFIELD
+from calib.rooms.studies.methods.networks import ADALINE, HOPFIELD
 from calib.rooms.studies.methods.output_error import CLIE, CLOE
 
 _TUNED = ("first covariance of the parameters", "rate of the filter")

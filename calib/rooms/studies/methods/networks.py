@@ -6,7 +6,8 @@ that parameters stay within stated bounds. Their noise of training is in the cov
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from calib.errors import NotConverged
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.samples import Samples
 from calib.estimation.triangles import Triangles, combine, solve_triangle
+from calib.identification.methods.least_squares import samples_of, weighed
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 
 EPOCHS = 60  # at most
 RESTING = 0.1  # standard deviations from the minimum, rms over parameters, at which training may end
@@ -111,3 +114,37 @@ def hopfield(
     saturated = [name for name, x, most in zip(triangles.names, outer, reach) if abs(x) > SATURATED * most]
     cause = f"neurons saturate: {', '.join(saturated[:5])}; widen their bounds" if saturated else "it is not at rest"
     raise NotConverged(f"the network after {count} steps: {cause}", outer / norms)
+
+
+Train = Callable[[IdentificationProblem, np.ndarray, np.ndarray], tuple[LinearFit, int]]
+
+
+@dataclass(frozen=True)
+class _Network(Method):
+    """A method that comes to rest at weighted least squares.
+
+    Attributes:
+        train: the problem, (rows,) standard deviations and inflation to the fit, and the number of rounds.
+    """
+
+    train: Train
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the weights of the network at rest, with the covariance of least squares and that of the training."""
+        return attempted(self.name, problem, lambda: self._estimate(problem))
+
+    def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        std, tau = weighed(problem)
+        fit, rounds = self.train(problem, std, tau)
+        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, iterations=rounds)
+
+
+_LIKE_WLS = "each joint's torque is as noisy as its own residuals say, q, v and a exact"
+ADALINE = _Network(
+    "adaline", f"{_LIKE_WLS}; samples in random order",
+    lambda problem, std, tau: adaline(samples_of(problem), problem.pooled, std, tau),
+)  # fmt: skip
+HOPFIELD = _Network(
+    "hopfield", f"{_LIKE_WLS}; no parameter is near the bound of its neuron",
+    lambda problem, std, tau: hopfield(problem.pooled, std, tau),
+)  # fmt: skip

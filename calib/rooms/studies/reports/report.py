@@ -9,9 +9,12 @@ from dataclasses import replace
 from datetime import datetime
 from importlib import metadata, resources
 
-from calib.procedure.report.page import Pictures, Section, Table, Text
+import numpy as np
+
+from calib.procedure.report.charts import Chart, Panel, box, line, picture, text
+from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
+from calib.procedure.report.style import AFTER, BEFORE, MARK
 from calib.rooms.studies.conditions import Condition, Study
-from calib.rooms.studies.reports import figures
 from calib.rooms.studies.summary import (
     ALIKE,
     FIGURES,
@@ -24,6 +27,36 @@ from calib.rooms.studies.summary import (
     Quartiles,
 )
 from calib.rooms.studies.trial import TrialRow
+
+LINE = 0.21  # height of one method [in]
+
+
+def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
+    """Return the box plot of a condition."""
+    layers: list = []
+    every: list[float] = []
+    for place, method in enumerate(one.methods):
+        own = [row.torque_error for row in rows if row.method == method.method and np.isfinite(row.torque_error)]
+        every += own
+        colour = AFTER if method.as_good else BEFORE
+        if len(own) < MIN_DATA_SETS:
+            layers.append(line(own, [place] * len(own), "o", colour, size=4.0))
+        else:
+            layers.append(box(own, place, colour))
+    low, high = 0.8 * max(min(every, default=0.1), 1e-6), 1.25 * max(max(every, default=1.0), 1.1e-6)
+    for place, method in enumerate(one.methods):
+        if failed := sum(method.failures.values()):
+            layers.append(text(f"{failed} failed", high, place, (3, 0), MARK, along="center"))
+    names = [method.method for method in one.methods]
+    panel = Panel(layers, x="torque error [%]", xlim=(low, high), log="x", ynames=names, grid="x")
+    words = (
+        "Torque error on unseen motion, noise-free: boxes from quartile to quartile with the median, lines to the 5th "
+        f"and 95th percentile, points beyond; fewer than {MIN_DATA_SETS} as points. Dark: as good as the best. Trials "
+        "without "
+        "an estimate stand at the right."
+    )
+    return picture(Chart([panel], 0.75 + LINE * len(names)), words)
+
 
 RULE = (
     f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
@@ -209,7 +242,7 @@ def make_page(
             continue
         own = [row for row in rows if row.digest == one.condition.digest]
         blocks = [_condition_table(one)]
-        drawn = [Pictures("", [figures.boxes(one, own)])] if plots else []
+        drawn = [Pictures("", [boxes(one, own)])] if plots else []
         blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))
     here, style = resources.files("calib.rooms.studies.reports"), resources.files("calib.procedure.report")
