@@ -286,7 +286,7 @@ def _cells(*values: float) -> list[object]:
     return ["" if np.isnan(value) else value for value in values]
 
 
-HEADER = (
+SHOWN_COLUMNS = (
     "", "method", "unseen [%]", "behind the best", "raw [%]", "training [%]", "worst joint", "parameters", "rounds",
     "simulations", "seconds", "",
 )  # fmt: skip
@@ -325,7 +325,7 @@ def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     )
     strong = frozenset(k for k, one in enumerate(good) if one.chosen)
     if rows:
-        yield Table("Methods", HEADER, rows, note, strong, (0, *range(2, len(HEADER) - 1)))
+        yield Table("Methods", SHOWN_COLUMNS, rows, note, strong, (0, *range(2, len(SHOWN_COLUMNS) - 1)))
     lines = [line(one) for one in found if one.failure]
     if lines:
         yield Text("Without an estimate", lines, "no estimate")
