@@ -84,8 +84,7 @@ class PoseSelection:
         There are none where a parameter is not identifiable.
         """
         from calib.procedure.report.charts import figure
-        from calib.procedure.report.geometry_figures import predicted_map
-        from calib.procedure.report.uncertainty_figures import outlook_figure
+        from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
         look = self.chosen.outlook
         curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]

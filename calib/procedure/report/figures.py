@@ -94,13 +94,13 @@ def draw_dynamics(found: DynamicReport, folder: Path, excitation: Path | None) -
         excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``; None where other motions
             were played.
     """
-    from calib.procedure.report import uncertainty_figures
+    from calib.procedure.report import dynamics_figures
 
     return {
         "errors": Pictures("", _judged(found.unseen)),
         "torques": Pictures("Torques", _torques(found.unseen)),
         "excitation": Pictures("Excitation", [] if excitation is None else _excitation(excitation)),
-        "geometry": Pictures("", list(uncertainty_figures.from_folder(folder).values())),
+        "geometry": Pictures("", list(dynamics_figures.from_folder(folder).values())),
         "parameters": Pictures("Dynamic parameters", [_significance(found)]),
     }
 

@@ -13,6 +13,7 @@ from calib.procedure.report.charts import Chart, Panel, bars, dots, heat, histog
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
 from calib.units import ERRORS
 
+Curve = Sequence[tuple[float, float]]
 PALE = "#c3ccd6"  # of changes below two sigmas
 
 
@@ -258,3 +259,24 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
     side = max(HALF_WIDTH, 0.13 * len(labels) + 0.05 * longest + 1.0)  # long names widen the figure, and never overlap
     panel = Panel([matrix], title, xnames=labels, ynames=labels)
     return Chart([panel], side - 0.3, width=side)
+
+
+def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: str) -> Chart:
+    """Return a predicted σ over the effort of measuring, both logarithmic; the plan in hand is marked.
+
+    Args:
+        others: pairs of effort and sigma; own: the same of the plan.
+        along, across: what they are, with units.
+    """
+    points = np.array(sorted(others)).reshape(-1, 2)
+    low, high = np.vstack([points, [own]]).min(axis=0), np.vstack([points, [own]]).max(axis=0)
+    layers = [
+        line(points[:, 0], points[:, 1], "o-", BEFORE),
+        line([own[0]], [own[1]], "o", MARK, size=5.5),
+        text("this plan", *own),
+    ]
+    panel = Panel(
+        layers, "predicted, before anything is moved", along, across, (0.8 * low[0], 1.25 * high[0]),
+        (0.7 * low[1], 1.4 * high[1]), log="xy", grid="both",
+    )  # fmt: skip
+    return Chart([panel], 2.4, width=HALF_WIDTH)

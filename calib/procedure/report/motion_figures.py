@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib.procedure.report.charts import Chart, Panel, level, line, save_all, text
+from calib.procedure.report.geometry_figures import outlook_figure
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
-from calib.procedure.report.uncertainty_figures import outlook_figure
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
 from trajectories.constraints import BoxLimit
