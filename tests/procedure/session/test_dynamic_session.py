@@ -92,7 +92,7 @@ def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
     first, second = instructions.asks(waiting, state)
     assert "6-excitation/training/run.csv" in first and "validation/run.csv" in first
-    assert "2 times" in first and "250 Hz" in first and "never learnt from" in first
+    assert "2 times" in first and "250 Hz" in first and "never used for training" in first
     assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
