@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -197,6 +199,14 @@ def test_cvxpy_finds_the_same_optimum():
     ours, other = (solve.cost(problem, gamma, one) for one in (values, theirs))
     assert ours <= other + 1e-6 * abs(other)
     assert np.linalg.norm((theirs - values) / scale) < 1e-2
+
+
+def test_a_term_that_was_switched_off_leaves_the_others_free():
+    """Its information is without bound: 1e12 against 1e4 of any other."""
+    data = planted(0)[3]
+    pinned = 1e12 * np.eye(data.factor.shape[1])[-2]
+    data = replace(data, factor=np.vstack([data.factor, pinned]))
+    assert make_problem(data, next(iter(find_prior_bodies(data.chain, data.dynamics.model)))).free.all()
 
 
 @pytest.mark.slow

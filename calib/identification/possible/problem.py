@@ -54,8 +54,10 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
     model = information.dynamics.model
     bodies = model.bodies.count
     columns = information.factor[:, :-1] @ information.transform
-    norms, target = np.linalg.norm(columns, axis=0)[10 * bodies :], np.linalg.norm(information.factor[:, -1])
-    seen = norms > 1e-9 * np.linalg.norm(columns, axis=0).max()
+    norms, target = np.linalg.norm(columns, axis=0), np.linalg.norm(information.factor[:, -1])
+    usual = np.median(norms[norms > 0.0])  # not the largest: a term that was switched off is pinned to zero
+    norms = norms[10 * bodies :]
+    seen = norms > 1e-8 * usual
     whole = target / np.where(seen, norms, 1.0)  # would explain all of the torque
     positive = np.array([one.nonnegative for one in model.columns], dtype=bool)
     sizes = np.where(positive, 0.1 * whole, DRIVES * whole)
