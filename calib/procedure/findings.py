@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -69,42 +69,12 @@ class Verdict:
         """Return the verdict of a model that cannot be exported, and `why`: a pass is one for prediction only."""
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}") if self.level == "pass" else self
 
-    def held_by(self, found: Sequence[SpelledFinding]) -> Verdict:
+    def held_by(self, found: Iterable[Finding]) -> Verdict:
         """Return the verdict, no better than the findings allow; the one that holds it comes first in its reason."""
-        worst = max(found, key=lambda one: LEVELS.index(one.allows), default=None)
-        if worst is None or worst.allows == "pass" or LEVELS.index(worst.allows) < LEVELS.index(self.level):
+        worst = max(found, key=lambda one: RANKS.index(level_of(one)), default=None)
+        if worst is None or level_of(worst) in ("", "note") or LEVELS.index(level_of(worst)) < LEVELS.index(self.level):
             return self
-        return Verdict(worst.allows, f"{worst.words}; {self.reason}")
-
-
-@dataclass(frozen=True)
-class SpelledFinding:
-    """What is odd with measurements, with a sentence of its own: on its way into the catalogue.
-
-    Attributes:
-        name: in the options' ``accept``.
-        level: the best one it allows, where it is not accepted.
-        words: a sentence, without its end.
-        accepted: whether the options say that it is meant.
-    """
-
-    name: str
-    level: str
-    words: str
-    accepted: bool = False
-
-    @property
-    def allows(self) -> str:
-        """The best level that a verdict beside it may have."""
-        return "pass" if self.accepted else self.level
-
-    @property
-    def told(self) -> str:
-        """The sentence for a user, with what to do where it is meant."""
-        if self.accepted:
-            return f"{self.words} (accepted by the options)"
-        advice = f'; if that is meant, accept = ["{self.name}"] in the options'
-        return self.words if self.level == "pass" else f"{self.words}{advice}"
+        return Verdict(level_of(worst), f"{sentence(worst)}; {self.reason}", worst.code)
 
 
 UNJUDGED = Verdict("", "the session judges, by unseen rows: see verdict.json at its root")
@@ -148,12 +118,6 @@ class Verdicts:
     def remark(self) -> str:
         """What is to be said in a file that does not pass; else empty."""
         return str(self) if self.level in ("marginal", "fail") else ""
-
-
-def settled(found: Iterable[SpelledFinding], accepted: Collection[str]) -> tuple[SpelledFinding, ...]:
-    """Return findings, those among `accepted` marked as such, worst first."""
-    marked = [replace(one, accepted=one.name in accepted) for one in found]
-    return tuple(sorted(marked, key=lambda one: -LEVELS.index(one.level)))
 
 
 @dataclass(frozen=True)

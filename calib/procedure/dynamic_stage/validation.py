@@ -39,7 +39,7 @@ from calib.procedure.dynamic_stage.verdict import (
     with_intervals,
     with_prior,
 )
-from calib.procedure.findings import Verdict, settled
+from calib.procedure.findings import Verdict, lines_of, settle
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE, without_gains
 
@@ -157,7 +157,7 @@ def assess(
     odd += plausibility.another_loop(findings.unlike) + plausibility.described(inputs.chain)
     signs = {case.name: signs_of(case, inputs.chain, settings.gravity) for case in (*inputs.cases, *inputs.unseen)}
     odd += plausibility.wrong_signs(signs, inputs.chain.joint_names)
-    odd = settled(odd, inputs.options.accept)
+    odd = settle(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
     verdict = with_duration(with_prior(verdict, findings.rests).held_by(odd), excitation)
@@ -170,7 +170,7 @@ def assess(
     verdict = _with_replays(verdict, tracking)
     verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}") if amperes else verdict
     said = (
-        *amperes, *(one.told for one in odd), *overlaps(inputs.cases, inputs.unseen),
+        *amperes, *lines_of(odd), *overlaps(inputs.cases, inputs.unseen),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
         *(line for name in validation if name in expected for line in extrapolates(name, expected[name])),
         *findings.notes,

@@ -12,6 +12,7 @@ from calib.identification.methods.bias import LoopTest, compare_with_loop
 from calib.identification.methods.loop_agreement import LoopDisagreement, disagreement
 from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage.plausibility import another_loop
+from calib.procedure.findings import level_of
 from calib.records import read_record
 
 
@@ -34,7 +35,7 @@ def test_gains_that_are_off_are_named_with_their_factor():
     assert found is not None and found.beside == "iv" and found.sigmas > 100.0
     np.testing.assert_allclose(found.factor, 2.0, rtol=0.02)
     (finding,) = another_loop(found)
-    assert finding.level == "fail" and "all torques are 2 times those of iv, are kp and kd off" in finding.words
+    assert level_of(finding) == "fail" and finding.values["times"] == pytest.approx(2.0, rel=0.02)
     told = test.lines(taken=False)
     assert any("2 times at joint 1, 2 times at joint 2" in line for line in told)
     assert not any("biased" in line for line in told)
@@ -46,7 +47,7 @@ def test_a_velocity_formed_otherwise_is_named():
     found, test = judged("cloe", 1e-5, 0.02, reference_velocity="difference")
     assert found is not None and test.found is not None and not len(test.found.off)
     (finding,) = another_loop(found)
-    assert finding.level == "marginal" and "reference_velocity" in finding.words
+    assert level_of(finding) == "marginal" and finding.values["velocity"] == "reference_velocity"
     np.testing.assert_allclose(found.factor, 1.0, atol=0.1)
 
 
