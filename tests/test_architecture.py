@@ -125,7 +125,7 @@ def test_the_walker_sees_every_form_of_import():
     } <= names
 
 
-CORE = 39_000
+CORE = 38_000
 """Code lines of all packages but the rooms: a newcomer reads the core alone. It may fall; growth needs a reason."""
 
 
