@@ -13,14 +13,14 @@ is largest (MacKay 1992, automatic relevance of groups),
 
     log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
 
-with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what
-a kind would be if it alone explained `EXPLAINED_SHARE` of all torque (offsets: `OFFSET`), within a factor exp(`WIDTH`)
-(our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that
-cancel. Rows are weighed by their joint's residual, worth as many independent values as its autocorrelation lets it, but
-not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave whatever the model is. What the
-model lacks is no noise, and differs on other motion: where sizes are found residuals count `TEMPERING` times less, and
-the prior as many times more for the values than for their covariance; more where regimes left out ask for it
-(`calib.identification.left_out.tempering`).
+with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what a
+kind would be if it alone explained `EXPLAINED_SHARE` of all torque (offsets: `offset_share`), within a factor
+exp(`kind_width`) (our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large
+parameters that cancel. Rows are weighed by their joint's residual, worth as many independent values as its
+autocorrelation lets it, but not fewer than one in `max_inflation`: residuals of a short record look like one wave
+whatever the model is. What the model lacks is no noise, and differs on other motion: where sizes are found residuals
+count `TEMPERING` times less, and the prior as many times more for the values than for their covariance; more where
+regimes left out ask for it (`calib.identification.left_out.tempering`).
 
 Directions that the motion identifies well do not feel the prior; those that it does not identify follow the whole
 robot. It does not make the parameters those of possible bodies: that is the semidefinite fit of another module; but
@@ -47,12 +47,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
 
 EXPLAINED_SHARE = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
-OFFSET = 0.01  # the same of constant torques: motors have friction rather than offsets (our choice)
-WIDTH = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
-MAX_DEVIATION = 3.0  # of the whole robot's parameters of a kind, rms, or of what explains all torque (our choice)
 MIN_CAD_DEVIATION = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
-WHOLE = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
-MAX_INFLATION = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
 TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
 MIN_NOISE = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
@@ -201,7 +196,8 @@ def weighing(
     """
     columns = data.factors[:, :, :-1]
     taken = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * tau)  # of the parameters, by row
-    tau = np.minimum(residual_inflation(rows, values), MAX_INFLATION)
+    max_inflation = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
+    tau = np.minimum(residual_inflation(rows, values), max_inflation)
     squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
     std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
     size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
@@ -271,10 +267,14 @@ def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: 
     body = alone[single] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
     known = mean_square > 0.0
     near = np.where(known, body + np.log(MIN_CAD_DEVIATION), -np.inf)
-    far = np.where(known, body, alone) + np.log(MAX_DEVIATION)
-    shares = {"one": OFFSET, "whole": 1.0}
+    max_deviation = 3.0  # of the whole robot's parameters of a kind, rms, or of what explains all torque (our choice)
+    far = np.where(known, body, alone) + np.log(max_deviation)
+    offset_share = 0.01  # the same of constant torques: motors have friction rather than offsets (our choice)
+    shares = {"one": offset_share, "whole": 1.0}
     share = np.array([shares.get(name.split(" ")[0], EXPLAINED_SHARE) for name in names])
-    width = np.where([name == "whole" for name in names], WHOLE, WIDTH)
+    whole_width = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
+    kind_width = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
+    width = np.where([name == "whole" for name in names], whole_width, kind_width)
     return _Sizes(names, member, np.clip(alone + np.log(share), near, far), width, near, far)
 
 

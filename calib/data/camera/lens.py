@@ -22,7 +22,6 @@ NAMES = {
     "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 PLAIN = 9  # values of a pinhole without the rational model's denominator
-ITERATIONS = 20  # of the inverse; Newton's, so that a handful does
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +164,8 @@ def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     else:
         plane = wanted.copy()
     bend = _fisheye if lens.model == "fisheye" else _brown_conrady
-    for _ in range(ITERATIONS):
+    iterations = 20  # of the inverse; Newton's, so that a handful does
+    for _ in range(iterations):
         bent, across, _ = bend(plane, lens.values[4:], True)
         error = bent - wanted
         determinant = across[:, 0, 0] * across[:, 1, 1] - across[:, 0, 1] * across[:, 1, 0]

@@ -13,9 +13,6 @@ from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit
 
 MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
-MIN_RATIO = 1.6  # a set-up's errors over the rest's from which on it is worth a word (our choice)
-UNLIKE = 5.0  # times a stated uncertainty, or a fraction, that residuals are remarked on from (our choice)
-CHANCE = 1e-3  # probability that the same rows in another order show such a change (our choice)
 
 
 def diagnose(found: GeometricFit) -> list[Finding]:
@@ -33,8 +30,13 @@ def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 
-def _setup_change(block: Block, part: Part) -> list[Finding]:
-    """Compare the rows before and after every cut, by size and by ranks (Mann–Whitney): a worse run is a set-up."""
+def _setup_change(block: Block, part: Part, max_chance: float = 1e-3, min_ratio: float = 1.6) -> list[Finding]:
+    """Compare the rows before and after every cut, by size and by ranks (Mann–Whitney): a worse run is a set-up.
+
+    `max_chance`: probability that the same rows in another order show such a change (our choice).
+
+    `min_ratio`: a set-up's errors over the rest's from which on it is worth a word (our choice).
+    """
     size = np.linalg.norm(part.value, axis=0)
     size = np.minimum(size, 4.0 * np.median(size))  # a few gross rows are not a set-up
     m = len(size)
@@ -46,11 +48,11 @@ def _setup_change(block: Block, part: Part) -> list[Finding]:
     weight = np.minimum(cuts, m - cuts)
     best = int(np.argmax((ratio - 1.0) * np.sqrt(weight)))
     cut, first_worse = int(cuts[best]), before[best] > after[best]
-    if ratio[best] < MIN_RATIO:
+    if ratio[best] < min_ratio:
         return []
     from scipy.stats import mannwhitneyu  # slow to load, and seldom needed
 
-    if float(mannwhitneyu(size[:cut], size[cut:]).pvalue) * len(cuts) > CHANCE:  # Bonferroni: the best of many cuts
+    if float(mannwhitneyu(size[:cut], size[cut:]).pvalue) * len(cuts) > max_chance:  # Bonferroni: the best of many cuts
         return []
     rows = block.measured.rows[part.index]
     bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
@@ -58,14 +60,17 @@ def _setup_change(block: Block, part: Part) -> list[Finding]:
     return [finding("set-up-changed", file=_name(block), first=bad[0], last=bad[1], worse=worse, rest=rest)]
 
 
-def _systematic(block: Block, part: Part) -> list[Finding]:
-    """Compare residuals of neighbouring poses: noise differs between neighbours, a missing effect does not."""
+def _systematic(block: Block, part: Part, max_times: float = 5.0) -> list[Finding]:
+    """Compare residuals of neighbouring poses: noise differs between neighbours, a missing effect does not.
+
+    `max_times`: times a stated uncertainty, or a fraction, that residuals are remarked on from (our choice).
+    """
     floor, rms = neighbour_floor(block.measured.q, part), float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
     stated = None if part.sigma is None else float(np.sqrt(np.mean(np.sum(part.sigma**2, axis=0))))
     result = []
     if floor is not None and floor < 0.6 * rms:
         result.append(finding("systematic-residual", file=_name(block), rms=rms, neighbours=floor))
-    if stated is not None and not stated / UNLIKE <= rms <= UNLIKE * stated:
+    if stated is not None and not stated / max_times <= rms <= max_times * stated:
         code = "sigma-too-small" if rms > stated else "sigma-too-large"
         times = max(rms, stated) / max(min(rms, stated), 1e-300)
         result.append(finding(code, file=_name(block), rms=rms, stated=stated, times=times))

@@ -22,7 +22,6 @@ from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.robot.chain import element_length
 
-SHORT = 0.01  # [m]: lengths below say nothing of a factor
 FLIP = np.array([1.0, -1.0, 1.0])
 Torques = Sequence[np.ndarray | None] | None
 
@@ -94,7 +93,8 @@ def length_factor(fit: GeometricFit) -> Scale | None:
     total = own[split.kept] + split.coefficients @ own[split.dropped]  # with those that are merged into them
     place = {int(k): number for number, k in enumerate(fit.free)}
     used = [(place[int(k)], int(k), size) for k, size in zip(candidates[split.kept], total) if int(k) in place]
-    used = [one for one in used if one[1] < arm and chain.elements[one[1]].axis[0] == "t" and abs(one[2]) > SHORT]
+    min_length = 0.01  # [m]: lengths below say nothing of a factor
+    used = [one for one in used if one[1] < arm and chain.elements[one[1]].axis[0] == "t" and abs(one[2]) > min_length]
     if len(used) < 2:
         return None
     index, elements, lengths = (np.array(each) for each in zip(*used))

@@ -16,9 +16,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings
 from calib.robot.kinematics import forward
 
-LOOKED_AT = 200  # rows of a block (our choice)
 SHORT = Settings(limit=20, passes=1)  # where base and tool settle at all they do so sooner
-FALLS = 0.8  # the error falls below this share with every further joint that is reversed (our choice)
 
 
 @dataclass(frozen=True)
@@ -42,20 +40,22 @@ def reversed_joints(
         blocks: the rows.
         torques: gravity torques (m, n) per block [N m], for deflections known from an earlier fit.
     """
-    chosen = [np.unique(np.linspace(0, len(block) - 1, LOOKED_AT).astype(int)) for block in blocks]
+    max_rows = 200  # rows of a block (our choice)
+    chosen = [np.unique(np.linspace(0, len(block) - 1, max_rows).astype(int)) for block in blocks]
     few = [take(block, rows) for block, rows in zip(blocks, chosen)]
     pulled = [None if torque is None else torque[rows] for torque, rows in zip(torques, chosen)]
     signs = np.ones(nominal.chain.n)
     before = rms = _rms(nominal, few, pulled, signs)
+    max_left = 0.8  # the error falls below this share with every further joint that is reversed (our choice)
     while (signs > 0.0).any():
         tried = {}
         for joint in np.flatnonzero(signs > 0.0).tolist():
             other = signs.copy()
             other[joint] = -1.0
-            if _least(nominal, few, other) < FALLS * rms:
+            if _least(nominal, few, other) < max_left * rms:
                 tried[joint] = _rms(nominal, few, pulled, other)
         best = min(tried, key=lambda joint: tried[joint], default=-1)
-        if best < 0 or not tried[best] < FALLS * rms:
+        if best < 0 or not tried[best] < max_left * rms:
             break
         signs[best], rms = -1.0, tried[best]
     found = tuple(np.flatnonzero(signs < 0.0).tolist())

@@ -25,7 +25,6 @@ from calib.geometry.result import GeometricFit
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 
-CHUNK = 1000  # poses observed at once
 MAX_BLIND_ERROR = 3.0  # error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
 FRAME_SIGMA = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
@@ -241,9 +240,10 @@ def _statistics(
     p = len(free)
     metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
     count = 0.0
+    chunk = 1000  # poses observed at once
     for number, (block, rows) in enumerate(zip(measured, chosen)):
         frames: list[tuple[np.ndarray, np.ndarray]] = []
-        pieces = np.array_split(rows, max(1, len(rows) // CHUNK)) if block.has_instrument else [rows]
+        pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
         for piece in pieces:
             if len(piece) == 0:
                 continue

@@ -10,9 +10,6 @@ from calib.data.poses.choices import MODELS as CHOICES
 from calib.robot.chain import Chain
 from calib.robot.deflection import Term
 
-MAX_ORDER = 60
-WOBBLE_ORDER = 2
-
 
 def _stiffness(chain: Chain, known: bool) -> list[Term]:
     """Return the deflection of each joint about its axis under gravity: by known torques, else by fitted moments."""
@@ -41,25 +38,25 @@ def _coupling(chain: Chain, known: bool) -> list[Term]:
     return [Term(names[chain.moving[j]], "joint", i) for j, i in near]
 
 
-def _harmonics(chain: Chain, known: bool) -> list[Term]:
-    """Return sin and cos of k q_j on each revolute joint, k = 1 … `MAX_ORDER`: encoder and gear errors."""
+def _harmonics(chain: Chain, known: bool, max_order: int = 60) -> list[Term]:
+    """Return sin and cos of k q_j on each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
     return [
         Term(chain.names[k], basis, j, order)
         for j, k in enumerate(chain.moving)
         if chain.joints[j].kind == "revolute"
-        for order in range(1, MAX_ORDER + 1)
+        for order in range(1, max_order + 1)
         for basis in ("cos", "sin")
     ]
 
 
-def _wobble(chain: Chain, known: bool) -> list[Term]:
+def _wobble(chain: Chain, known: bool, max_order: int = 2) -> list[Term]:
     """Return low harmonics of q_j on every other element of joint j: its axis wobbles as it turns."""
     moving = set(chain.moving.tolist())
     return [
         Term(element.name, basis, element.owner, order)
         for k, element in enumerate(chain.elements)
         if k not in moving and element.owner < chain.n and chain.joints[element.owner].kind == "revolute"
-        for order in range(1, WOBBLE_ORDER + 1)
+        for order in range(1, max_order + 1)
         for basis in ("cos", "sin")
     ]
 

@@ -23,7 +23,6 @@ from calib.geometry.uncertainty.unevenness import Profile, Unevenness, unevennes
 COVERED = 0.95
 FOLD_ROUNDS = 100  # rounds of the search for variances without a fold's poses
 LASTING, CHANGE = 0.5, 0.33
-MIN_ENDS = 3  # that tell what is common to them (our choice)
 MIN_ROWS = 5  # rows of a kind that the poses outside a fold must have to tell an interval (our choice)
 
 
@@ -129,7 +128,8 @@ class LeftOut:
         side = (q > np.median(q, axis=0))[self.pose, self.joint].astype(int)
         rows = {(j, k): sizes[(self.joint == j) & (side == k)] for j in range(q.shape[1]) for k in (0, 1)}
         rows = {end: each for end, each in rows.items() if len(each) > MIN_ROWS}
-        if len(rows) < MIN_ENDS:
+        min_ends = 3  # that tell what is common to them (our choice)
+        if len(rows) < min_ends:
             return ()
         size = np.array([np.sqrt(np.mean(each**2)) for each in rows.values()])
         mean = np.mean(np.log(size))

@@ -9,8 +9,6 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, target_jacobian
 from calib.robot.deflection import evaluate, extra_displacements
 
-CHUNK = 500  # poses at once: the Jacobian has a column per parameter
-
 
 def pose_sigmas(
     cell: Installation,
@@ -35,8 +33,9 @@ def pose_sigmas(
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     parts = [np.zeros((0, 2))]
-    for first in range(0, len(q), CHUNK):
-        rows = slice(first, first + CHUNK)
+    chunk = 500  # poses at once: the Jacobian has a column per parameter
+    for first in range(0, len(q), chunk):
+        rows = slice(first, first + chunk)
         some = None if torque is None else torque[rows]
         parts.append(_sigmas(cell, q[rows], free, root, some, station, np.broadcast_to(tool, len(q))[rows]))
     return np.concatenate(parts)

@@ -13,9 +13,6 @@ from calib.identification.cases import Case
 from calib.identification.checks.recorded_motion import CREEP
 from calib.identification.rows import segments
 
-EDGE = 0.3  # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
-SMOOTH = 0.02  # window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help
-
 
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
@@ -64,12 +61,16 @@ class MotionSamples:
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
     """Return some `count` samples of a recording of the motors' torques; None where too few are left."""
     motion, n = case.motion, case.motion.n
-    edge = int(EDGE * motion.rate)
+    # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
+    edge_time = 0.3
+    edge = int(edge_time * motion.rate)
     inner = np.concatenate([np.arange(a + edge, b - edge) for a, b in segments(motion.segment)])
     if len(inner) < 20 * n or case.target.shape[1] != n:
         return None
     index = inner[:: max(1, len(inner) // count)]
-    effort = _smoothed(np.asarray(case.target), max(1, round(SMOOTH * motion.rate)))
+    # window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help
+    window = 0.02
+    effort = _smoothed(np.asarray(case.target), max(1, round(window * motion.rate)))
     q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
     return MotionSamples(index, q, v, a, effort, motion.v, bodies)
 

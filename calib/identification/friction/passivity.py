@@ -14,7 +14,6 @@ from calib.identification.cases import Case
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import term_columns
 
-SPEEDS = 8  # of each direction at which friction is to brake (our choice)
 MIN_ENERGY_SHARE = -0.01  # of the energy that a joint moves: noise and other columns' shares stay above (our choice)
 
 
@@ -58,10 +57,11 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
     for k, one in enumerate(terms):
         if one is not None and one.joint is not None and one.form.dissipative and not one.form.remembers:
             groups.setdefault((one.joint, one.side, one.form.loaded), []).append(k)
+    speeds_per_direction = 8  # of each direction at which friction is to brake (our choice)
     for (joint, _, _), members in groups.items():
         if all(one is not None and one.nonnegative for one in (terms[k] for k in members)):
             continue  # single bounds say it already
-        speeds = fastest[joint] * np.append(np.geomspace(0.02, 1.0, SPEEDS), 10.0)
+        speeds = fastest[joint] * np.append(np.geomspace(0.02, 1.0, speeds_per_direction), 10.0)
         v = np.concatenate([-speeds, speeds])
         seen = Joined(np.zeros_like(v), v, np.zeros_like(v), np.ones_like(v), None)
         block = np.zeros((len(v), p))

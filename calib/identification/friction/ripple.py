@@ -38,11 +38,9 @@ COARSE, FINE = (10.0, 40.0), (10.0, 20.0, 30.0, 45.0, 65.0)  # nodes of the gain
 MIN_ORDER, MAX_ORDER = 16, 800  # orders per turn
 TURNS = range(16, 321)  # motor turns per turn that a family may have
 MIN_COHERENCE = 0.6  # of a gear's own best coherence: a number of turns of other gears takes its place (our choice)
-CELLS = 8192  # of a turn, for the search
 SPEED_BINS = 4  # of the speed, per direction
 RIDGES = (0.03, 0.1, 0.3, 1.0)  # of the mean information of a column
 MIN_TRAVEL = 0.1  # [rad] that a joint must travel
-BLOCKS = 8
 MIN_GAIN = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
 MIN_TOTAL_GAIN = 0.03  # in all: 1.5 % of its rms
 MIN_FREE_GAIN = 0.04  # and where no family pays: 2 % of its rms (our choices)
@@ -249,18 +247,19 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
 
 
 def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:
-    """Return S(k) of all whole orders k of a gear from 0 on, (CELLS / 2 + 1,); see the module."""
+    """Return S(k) of all whole orders k of a gear from 0 on, (cells / 2 + 1,); see the module."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
     edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
     bins = np.searchsorted(edges, speed, side="right") * np.where(v > 0.0, 1, -1)
-    cell = np.floor(q / (2.0 * np.pi) * CELLS).astype(int) % CELLS
+    cells = 8192  # of a turn, for the search
+    cell = np.floor(q / (2.0 * np.pi) * cells).astype(int) % cells
     numbers, place = np.unique(track.block, return_inverse=True)
-    result = np.zeros(CELLS // 2 + 1)
+    result = np.zeros(cells // 2 + 1)
     for b in np.unique(bins[bins != 0]):
         own = bins == b
-        index = place[own] * CELLS + cell[own]
-        waves = np.bincount(index, residual[own], len(numbers) * CELLS).reshape(len(numbers), CELLS)
+        index = place[own] * cells + cell[own]
+        waves = np.bincount(index, residual[own], len(numbers) * cells).reshape(len(numbers), cells)
         spectrum = np.fft.rfft(waves, axis=1)
         result += (np.abs(spectrum.sum(axis=0)) ** 2 - (np.abs(spectrum) ** 2).sum(axis=0)) / own.sum()
     return result
@@ -307,10 +306,10 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
     return residual - np.concatenate(slow)
 
 
-def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
-    """Number contiguous blocks of all cases, about `BLOCKS` in all; -1 at the start of a recording."""
+def _blocks(cases: Sequence[Case], blocks: int = 8) -> list[np.ndarray]:
+    """Number contiguous blocks of all cases, about `blocks` in all; -1 at the start of a recording."""
     sizes = [len(case.motion) for case in cases]
-    own = [max(1 if len(cases) > 1 else 2, round(BLOCKS * size / sum(sizes))) for size in sizes]
+    own = [max(1 if len(cases) > 1 else 2, round(blocks * size / sum(sizes))) for size in sizes]
     numbers, first = [], 0
     for case, size, count in zip(cases, sizes, own):
         number = first + np.arange(size) * count // size

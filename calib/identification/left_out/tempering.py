@@ -12,7 +12,6 @@ from calib.identification.prior import TEMPERING, Prior
 from calib.identification.rows import ObservationRows, triangulate
 
 STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
-MIN_GAIN = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
 
 
 def tempered_prior(
@@ -22,7 +21,7 @@ def tempered_prior(
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
     one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by
-    `MIN_GAIN`.
+    `min_gain`.
 
     Args:
         find: tempering and a prior to start from to the prior whose sizes the evidence chose with it.
@@ -32,6 +31,7 @@ def tempered_prior(
     data, columns, best = triangulate(rows), np.arange(len(rows[0].names)), None
     found = find(STEPS[0], None)
     std = found.first.std
+    min_gain = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
     for tempering in STEPS:
         own = found if tempering == STEPS[0] else find(tempering, found)
         inflation = tempering * own.first.inflation
@@ -40,7 +40,7 @@ def tempered_prior(
         )
         squares = (validation.extrapolated(columns) / std**2).sum(axis=1)
         error = float(np.log(np.maximum(squares, 1e-300)).mean())
-        if best is None or error < best[0] - MIN_GAIN:
+        if best is None or error < best[0] - min_gain:
             best = error, own
     assert best is not None
     return best[1]

@@ -13,7 +13,6 @@ from calib.estimation.triangles import Triangles
 from calib.identification.left_out.regimes import Regimes
 from calib.identification.rows import pool
 
-ITERATIONS = 12
 MAX_DEVIATION_RATIO = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
 
 
@@ -167,5 +166,6 @@ def _drawn(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) 
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero
     data = Gram(scaled, square[:-1, -1] / scale, float(square[-1, -1]), rows)
-    found = relevance(data, group, np.ones(len(group)), ITERATIONS)
+    iterations = 12
+    found = relevance(data, group, np.ones(len(group)), iterations)
     return found.values / scale, np.where(np.isfinite(found.ridge), found.ridge / scale, np.inf)

@@ -22,8 +22,6 @@ from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, bounded, residual_inflation, weighing
 
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
-MAX_COST = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
-ROUNDS = 2  # of weighing rows by the residuals that richer friction leaves
 
 
 class _Solve(Protocol):
@@ -122,7 +120,8 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     pooled, noise = problem.pooled, problem.noise
     std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
     fit, covariance, known = _drawn(problem, prior, std, tau, tempering)
-    for _ in range(ROUNDS):
+    rounds = 2  # of weighing rows by the residuals that richer friction leaves
+    for _ in range(rounds):
         own = fit.estimate
         std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise)
         fit, covariance, known = _drawn(problem, prior, std, tau, tempering)
@@ -139,9 +138,10 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     factor = retriangulate(np.vstack([combine(pooled, std), np.pad(known, ((0, 0), (0, 1)))]))
     values = bounded(factor, braking(terms, fastest))
     wrong = _driving(problem, free)
+    max_cost = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
     if wrong.any():
         wrong &= (
-            pooled.residual_squares(values)[-len(wrong) :] > MAX_COST * pooled.residual_squares(free)[-len(wrong) :]
+            pooled.residual_squares(values)[-len(wrong) :] > max_cost * pooled.residual_squares(free)[-len(wrong) :]
         )
     if not wrong.any():
         return values

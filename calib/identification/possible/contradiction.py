@@ -25,16 +25,13 @@ from calib.robot.chain import Chain
 if TYPE_CHECKING:
     from calib.identification.identify import Identification
 
-WEIGHT = 1.0  # γ that hardly draws, yet keeps Newton's steps off the border: its distance is at most a tenth larger
-WITHIN = 3.0  # times the bound, up to which no semidefinite program is solved for the last tenth
-
 
 @dataclass(frozen=True)
 class Contradiction:
     """How far an estimate is from the nearest possible robot.
 
     Attributes:
-        distance: in standard deviations (Mahalanobis); up to `WITHIN` times `allowed` that of a robot near it.
+        distance: in standard deviations (Mahalanobis); up to `max_times` times `allowed` that of a robot near it.
         allowed: what it stays below in 95 % of all cases where the model is right.
         unexplained: of the torques, in weighted rows, that the nearest possible robot leaves beside the estimate [%].
     """
@@ -65,11 +62,13 @@ def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
             except NotConverged:
                 continue
 
+    weight = 1.0  # γ that hardly draws, yet keeps Newton's steps off the border: its distance is at most a tenth larger
     try:
-        away = information.distance(solve(problems[-1], WEIGHT))
+        away = information.distance(solve(problems[-1], weight))
     except (NotConverged, ValueError):  # the latter where curvatures overflow
         away = np.inf
-    if away > WITHIN * allowed:
+    max_times = 3.0  # times the bound, up to which no semidefinite program is solved for the last tenth
+    if away > max_times * allowed:
         away = min((away, *distances()))
     if not np.isfinite(away):
         return None

@@ -53,9 +53,7 @@ from calib.identification.prediction import Dynamics
 
 MIN_CAD_WEIGHT = 20.0  # of γ with a CAD
 WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
-SMALLEST = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
 PRIORS = ("entropic", "euclidean")
-STEPS = 200
 RIDGES = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)  # of a unit diagonal
 SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
 
@@ -145,7 +143,8 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     )
     euclidean = prior == "euclidean"
     values = border.nearest(problem, pull=gamma) if euclidean else values
-    while weight is None and away <= allowed < information.distance(values) and gamma > SMALLEST:
+    min_gamma = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
+    while weight is None and away <= allowed < information.distance(values) and gamma > min_gamma:
         gamma /= 2.0
         values = border.nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
     curved_at = _reference(problem) if euclidean else values
@@ -190,10 +189,10 @@ def _reference(problem: BodyCost) -> np.ndarray:
     return np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
 
 
-def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
+def _descend(problem: BodyCost, gamma: float, values: np.ndarray, max_steps: int = 200) -> np.ndarray:
     """Return the optimum by Newton's method with steps halved until the cost falls (Armijo)."""
     free, here = problem.free, cost(problem, gamma, values)
-    for _ in range(STEPS):
+    for _ in range(max_steps):
         slope, curvature = derivatives(problem, gamma, values)
         step = np.zeros_like(values)
         step[free] = -_solved(curvature[np.ix_(free, free)], slope[free])
@@ -206,7 +205,7 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
             if size < 1e-12:  # rounding: no step lowers the cost any more
                 return values
         values, here = values + size * step, there
-    raise NotConverged(f"the consistent parameters still move after {STEPS} Newton steps", values)
+    raise NotConverged(f"the consistent parameters still move after {max_steps} Newton steps", values)
 
 
 def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:

@@ -45,9 +45,7 @@ from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
 STEP = 1e-5  # of the central differences [m or rad]
-BLOCK = 512  # samples at a time: the regressor of so many stays in the processor's cache
 SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
-PIECE = 32  # thinned samples of such a piece at least
 NOTHING = 0.01  # a σ that grows by a smaller share has not changed (our choice)
 TILTS = ("gravity.rx", "gravity.ry")
 
@@ -198,13 +196,15 @@ def _tree(found: Identification, chain: Chain) -> Bodies:
     return make_model(chain, found.settings).bodies
 
 
-def _pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
+def _pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32) -> list[tuple[slice, slice]]:
     """Return (thinned rows, samples at the full rate that these see) of every `step`-th piece of a case.
 
     With step 1 each segment is one piece.
+
+    `min_piece`: thinned samples of such a piece at least.
     """
     result, first, h, r = [], 0, decimator.reach, decimator.factor
-    size = max(4096 // r, PIECE)
+    size = max(4096 // r, min_piece)
     for start, stop in segments(case.motion.segment):
         count = len(kept(np.zeros(stop - start, dtype=int), decimator))
         length = max(count, 1) if step == 1 else size
@@ -235,8 +235,9 @@ def _differences(
     felt = model.torque_rows.fold(spread(residual, decimator, len(q))[:, :, None], (BODIES,))[:, :, 0]
     change = np.empty((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
-    for start in range(0, len(q), BLOCK):
-        part = slice(start, min(start + BLOCK, len(q)))
+    block = 512  # samples at a time: the regressor of so many stays in the processor's cache
+    for start in range(0, len(q), block):
+        part = slice(start, min(start + block, len(q)))
         weights = np.ascontiguousarray(felt[part].T).ravel()
         for k, (above, below) in enumerate(moved):
             for sign, one in ((1.0, above), (-1.0, below)):

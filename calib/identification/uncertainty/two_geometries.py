@@ -14,8 +14,6 @@ from calib.identification.reweighted import cut, estimate, estimator, rows_on, s
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty
 from calib.robot.chain import Chain
 
-CHUNK = 2000  # thinned samples at a time, where each needs its own line of a matrix
-
 
 @dataclass(frozen=True, eq=False)
 class GeometryComparison:
@@ -55,9 +53,10 @@ def compare(
     (first, inverse), (second, own) = (estimate(how, rows) for rows in both)
     values = np.asarray(found.fitted.estimate.values)
     alone, apart = np.zeros(len(values)), np.array(carried.sigma_geometry**2)
+    chunk = 2000  # thinned samples at a time, where each needs its own line of a matrix
     for one, other in zip(*both):
-        for start in range(0, len(one.target), CHUNK):
-            part = slice(start, start + CHUNK)
+        for start in range(0, len(one.target), chunk):
+            part = slice(start, start + chunk)
             gain, ours = (
                 matrix @ (stacked(cut(rows, part)) * weights(how, cut(rows, part), how.deviation**2)[:, None]).T
                 for matrix, rows in ((inverse, one), (own, other))

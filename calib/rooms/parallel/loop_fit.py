@@ -41,7 +41,6 @@ from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, ParallelR
 from calib.rooms.parallel.results import ParallelResult, ResultFolder, finite
 from calib.rooms.parallel.robots import ParallelMechanism
 
-FOLDS = 4  # of the rows, where none are unseen
 READ = ("holdout", "tolerance", "seed")  # of the settings
 
 
@@ -318,7 +317,8 @@ def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: _Rows) -> np.nd
 
 def _cross_validated(known: ClosedRobot, rows: _Rows, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
     """Return errors of all rows, each by a fit that has not seen it; nothing where a fold cannot be fitted."""
-    folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), FOLDS)
+    folds_wanted = 4  # of the rows, where none are unseen
+    folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), folds_wanted)
     found = []
     for k, own in enumerate(folds):
         rest = rows.part(np.concatenate(folds[:k] + folds[k + 1 :]))

@@ -37,9 +37,6 @@ from trajectories.timing.profile import track
 from trajectories.timing.time_scaling import Timing, time_optimal
 
 READ = ("payloads", "lines", "rate")  # of the settings
-DENSE = 100  # places per span of the path at which the actuators are solved for
-LEVER = 0.1  # of the base's size that a radian counts as in the length of a path (our choice)
-SHARP = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,21 +216,26 @@ def _law(
         refuse_option(
             folder, f"no payload '{unknown[0]}' was identified; it knows {', '.join(model.payloads) or 'none'}"
         )
-    terms = tuple(replace(one, settings=(SHARP,)) if one.shape == "sign" else one for one in model.terms)
+    smoothing = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
+    terms = tuple(replace(one, settings=(smoothing,)) if one.shape == "sign" else one for one in model.terms)
     return _PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()
 
 
-def _paths(known: ClosedRobot, points: np.ndarray, lines: bool) -> list[JointPath]:
-    scale = np.where(known.robot.selected < 3, 1.0, 1.0 / LEVER)
+def _paths(known: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0.1) -> list[JointPath]:
+    # lever: of the base's size that a radian counts as in the length of a path (our choice)
+    scale = np.where(known.robot.selected < 3, 1.0, 1.0 / lever)
     if not lines:
         return [spline(points, scale=scale)]
     return [spline(points[k : k + 2], scale=scale) for k in range(len(points) - 1)] or [spline(points)]
 
 
-def _of_actuators(known: ClosedRobot, path: JointPath) -> JointPath:
-    """Return the path of the actuated joints along one of the platform's coordinates."""
+def _of_actuators(known: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:
+    """Return the path of the actuated joints along one of the platform's coordinates.
+
+    `places_per_span`: places per span of the path at which the actuators are solved for.
+    """
     spans = len(path.knots) - 1
-    s = np.interp(np.linspace(0.0, spans, DENSE * spans + 1), np.arange(spans + 1), path.knots)
+    s = np.interp(np.linspace(0.0, spans, places_per_span * spans + 1), np.arange(spans + 1), path.knots)
     try:
         posture = known.place(path(s))
     except NoPosture as error:

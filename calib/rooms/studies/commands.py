@@ -12,8 +12,6 @@ from calib.cli.shared import Seed, exit_failed, reporting, say
 from calib.errors import UsageError, require
 
 app = typer.Typer()
-SHOWN = 3  # conditions whose tables are printed in full
-LOGGED = 30.0  # [s] between two lines on progress where the output is no terminal
 
 
 @command(app)
@@ -54,13 +52,15 @@ def study(
     if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
         raise UsageError("several studies together need a folder: --out DIR")
     folder = out or Path(f"{Path(studies[0]).stem}-study")
-    with reporting(LOGGED) as (_, progress):
+    log_interval = 30.0  # [s] between two lines on progress where the output is no terminal
+    with reporting(log_interval) as (_, progress):
         found = outcome.run_study(
             studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
         )  # fmt: skip
     seen = [one for one in found.conditions if one.methods]
-    if len(seen) > SHOWN:
+    max_shown = 3  # conditions whose tables are printed in full
+    if len(seen) > max_shown:
         blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
     else:
         blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]

@@ -47,12 +47,9 @@ from calib.simulation.loop.tracking import feed_forward
 MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
 REACH, SPEED, ACCELERATION = 0.9, 0.8, 40.0  # shares of the limits; largest in any joint [rad/s²]
 THIN = 50  # of the control rate: instants at which a motion's condition and the validation torques are taken
-GEOMETRY = 3.0  # times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated
-POSES = 40  # measured for the geometric fit, by a tracker of frames (60 µm, 0.2 mrad)
 BELIEVED = 1.3, 0.7  # factors of kp, kd
 STRIBECK, SLIP = 0.5, 0.1  # peak of friction at rest beyond Fc, as its share; the speed it falls with [rad/s]
 PAYLOAD, AWAY = 1.0, 0.05  # [kg] a ball, [m] in front of the flange
-LATE = 2e-3  # [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +152,14 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, Ident
     """Return the robot that moves, the model and its base as believed, and the robot with the model's parameters."""
     plant, chain = setup.plant, setup.chain
     model, base = known_robots.model(plant), _nominal_base(condition.robot)
+    size_factor = 3.0  # times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated
+    pose_count = 40  # measured for the geometric fit, by a tracker of frames (60 µm, 0.2 mrad)
     if condition.mismatch in ("geometry", "calibrated"):
-        cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=GEOMETRY))
+        cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=size_factor))
         true = replace(plant, bodies=bodies_of(replace(cell.truth.chain, inertias=chain.inertias)))
         if condition.mismatch == "geometry":
             return true, model, base, plant
-        measured = [measure(cell, random_joints(chain, POSES, seed), seed=seed)]
+        measured = [measure(cell, random_joints(chain, pose_count, seed), seed=seed)]
         found = geometry.fit(install(chain, measured), measured).calibrated.chain
         fitted = replace(model, bodies=bodies_of(found))
         return true, fitted, bases.regroup(base, fitted), plant
@@ -189,8 +188,9 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
 
     log, period = run(setup.every), setup.reference.period
     rate, torque = 1.0 / (period * setup.every), log.tau
+    torque_lag = 2e-3  # [s]
     if condition.mismatch == "clock":
-        torque = run(1).tau[np.maximum(np.rint((log.t - log.t[0] - LATE) / period).astype(int), 0)]
+        torque = run(1).tau[np.maximum(np.rint((log.t - log.t[0] - torque_lag) / period).astype(int), 0)]
     asked = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
     recording = Recording(
         log.t, log.measured, torque, "torque", setup.chain.joint_names, q_ref=asked, file=condition.name

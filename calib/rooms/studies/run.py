@@ -13,8 +13,6 @@ from calib.rooms.studies.store import RowStore
 from calib.rooms.studies.trial import Trials, grouped, run_trials
 from calib.workers import Workers
 
-HURRY = 1.0  # [s] between two words on progress
-
 
 @dataclass
 class Progress:
@@ -90,6 +88,7 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
     progress = Progress(sum(len(task.methods) for task in tasks))
     progress.left.update(name for task in tasks for name in task.methods)
     said = 0.0
+    word_interval = 1.0  # [s] between two words on progress
     for number, rows in workers.completed(run_trials, tasks):
         methods = tasks[number].methods
         progress.left.subtract(methods)
@@ -101,7 +100,7 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
             progress.failed += sum(not row.found for row in rows)
             for row in rows:
                 progress.spent.setdefault(row.method, []).append(row.seconds if row.seconds == row.seconds else 0.0)
-        if time.monotonic() - said > HURRY:
+        if time.monotonic() - said > word_interval:
             said = time.monotonic()
             say(progress)
     say(progress)

@@ -27,12 +27,8 @@ from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_link
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 
 CLOSED = 1e-10  # gap and step [m or rad] below which a loop is closed
-STRIDE = 0.25  # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
-LIMIT = 60  # Newton steps
 BOUND = 0.5  # of one step [rad or m]
 SINGULAR = 1e-4  # reciprocal condition below which a posture is called singular (our choice)
-NEAR = 0.02  # the same, where Newton's steps fail: that explains it (our choice)
-STEP = 16  # samples of a record of which the first is reached from home, the others from it
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,12 +207,14 @@ def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim,
         return known.home[:0]
     if near is not None:
         return _newton(known, near, wanted, aim)
-    if len(wanted) > 2 * STEP and np.abs(np.diff(wanted, axis=0)).max() < STRIDE / STEP:
-        first = _reached(known, wanted[::STEP], own, aim, None)
-        nearest = np.minimum((np.arange(len(wanted)) + STEP // 2) // STEP, len(first) - 1)
+    every = 16  # samples of a record of which the first is reached from home, the others from it
+    max_stride = 0.25  # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
+    if len(wanted) > 2 * every and np.abs(np.diff(wanted, axis=0)).max() < max_stride / every:
+        first = _reached(known, wanted[::every], own, aim, None)
+        nearest = np.minimum((np.arange(len(wanted)) + every // 2) // every, len(first) - 1)
         found = _newton(known, first[nearest], wanted, aim)
     else:
-        count = max(1, int(np.ceil(np.abs(wanted - own).max() / STRIDE)))
+        count = max(1, int(np.ceil(np.abs(wanted - own).max() / max_stride)))
         found = known.home[np.zeros(len(wanted), dtype=int)]
         for share in np.arange(1, count) / count:
             found = _newton(known, found, own + share * (wanted - own), aim, rough=True)
@@ -229,7 +227,8 @@ def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, r
     """Return solutions near `start`; of a rough one two steps are enough."""
     q, pose = np.array(start.q), np.array(start.pose)
     left = np.arange(len(q))
-    for _ in range(2 if rough else LIMIT):
+    max_steps = 60  # Newton steps
+    for _ in range(2 if rough else max_steps):
         own = Posture(q[left], pose[left])
         links = leg_links(known.robot, own)
         D, t = twists(known, links, [one.gap for one in links])
@@ -248,12 +247,13 @@ def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, r
     return Posture(q, pose)
 
 
-def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray) -> None:
+def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rcond: float = 0.02) -> None:
+    # max_rcond: the same, where Newton's steps fail: that explains it (our choice)
     own, at_home = found[left[:1]], leg_links(known.robot, known.home)
     links = dict(zip((leg.name for leg in known.robot.legs), leg_links(known.robot, own)))
     worst = max(links, key=lambda name: float(np.abs(links[name].gap).max()))
     gap = 1e3 * float(np.abs(links[worst].gap).max())
-    weak = [n for (n, one), home in zip(links.items(), at_home) if float(_leg_rcond(one, home)[0]) < NEAR]
+    weak = [n for (n, one), home in zip(links.items(), at_home) if float(_leg_rcond(one, home)[0]) < max_rcond]
     why = f"{worst} stays {gap:.3g} mm from its attachment: out of reach" if gap > 1.0 else (
         f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach" if weak
         else "Newton's steps do not settle: at a singularity (type 2), or readings that contradict each other"

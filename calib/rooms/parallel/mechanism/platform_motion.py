@@ -14,7 +14,6 @@ from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, distributed, loop_jacobians, of_platform
 
 STEP = 1e-6  # of the differences by x
-SPARE = 0.01  # of the box's width, beyond it (our choice)
 
 
 def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
@@ -99,10 +98,13 @@ class PlatformRegressor:
     def _speeds(self, motion: LoopMotion) -> np.ndarray:
         return motion.v[:, self.model.known.robot.actuated]
 
-    def _reachable(self, x: np.ndarray) -> np.ndarray:
-        """Return coordinates brought back to the robot's box: a search may leave it."""
+    def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
+        """Return coordinates brought back to the robot's box: a search may leave it.
+
+        `spare_share`: of the box's width, beyond it (our choice).
+        """
         robot = self.model.known.robot
-        spare = SPARE * (robot.upper - robot.lower)
+        spare = spare_share * (robot.upper - robot.lower)
         return np.clip(x, robot.lower - spare, robot.upper + spare)
 
     def _columns(self, motion: LoopMotion) -> np.ndarray:

@@ -35,9 +35,6 @@ from calib.identification.methods.method import EstimateStatus, IdentificationPr
 from calib.identification.prior import residual_inflation
 from calib.rooms.studies.methods.believed import with_friction
 
-LIMIT = 40
-TOLERANCE = 0.01  # standard deviations of the estimate
-FLOOR = 1e-4  # of the residuals' standard deviation: torques are not free of noise
 BLOCK = 1000  # samples at a time
 
 
@@ -61,18 +58,22 @@ class _MaximumLikelihood(Method):
         task = _noisy_states(problem, model)
         values, noise = wls(problem.pooled, std).estimate.values, std**2
         steps: list[float] = []
-        for count in range(1, LIMIT + 1):
-            noise = _torque_noise(task, values, noise, (FLOOR * std) ** 2)
+        min_noise = 1e-4  # of the residuals' standard deviation: torques are not free of noise
+        max_steps = 40
+        tolerance = 0.01  # standard deviations of the estimate
+        for count in range(1, max_steps + 1):
+            noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
             found = _step(task, values, noise)
             steps.append(float(np.max(np.abs(found.values - values) / found.sigma)))
             values = found.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
                 raise Diverged("maximum likelihood: the noise of the positions is too large to be linear in", values)
-            if steps[-1] < TOLERANCE:
+            if steps[-1] < tolerance:
                 break
         else:
             raise NotConverged(
-                f"maximum likelihood still moves by {steps[-1]:.2g} standard deviations after {LIMIT} rounds", values
+                f"maximum likelihood still moves by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
+                values,
             )
         return MethodEstimate(
             self.name, EstimateStatus.FOUND, _packed(problem, found, noise), problem.pooled, np.sqrt(noise),

@@ -19,11 +19,6 @@ from calib.identification.methods.least_squares import samples_of, weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 
 EPOCHS = 60  # at most
-RESTING = 0.1  # standard deviations from the minimum, rms over parameters, at which training may end
-BOX = 30.0  # times the parameter that explains all torques by one column: no estimate is near it
-SATURATED = 0.9  # of the box
-STEPS = 200
-AT_REST = 1e-3  # standard deviations from the equilibrium
 
 
 def adaline(
@@ -51,6 +46,7 @@ def adaline(
     inputs, target = (rows[:, :, None] * data.matrix) @ inverse, rows * data.target
     power = np.maximum(np.sum(inputs**2, axis=(1, 2)), 1e-300)
     rng, weights = np.random.default_rng(seed), np.zeros(p)
+    max_away = 0.1  # standard deviations from the minimum, rms over parameters, at which training may end
     for epoch in range(1, EPOCHS + 1):
         mean, steps = np.zeros(p), np.minimum(1.0 / power, 1.0 / (epoch**2 * power.mean()))
         for k in rng.permutation(len(target)):
@@ -60,7 +56,7 @@ def adaline(
         values = inverse @ mean / len(target)
         away = float(np.sqrt(np.mean((factor[:p, :p] @ values - factor[:p, p]) ** 2)))
         trained = replace(fit.estimate, values=values)
-        if away < RESTING:
+        if away < max_away:
             excess = fit.estimate.covariance + (away / size) ** 2 * inverse @ inverse.T
             return replace(fit, estimate=replace(trained, covariance=excess)), epoch
     raise NotConverged(
@@ -84,22 +80,25 @@ def hopfield(
     Args:
         triangles: of the rows, one group per standard deviation.
         std, inflation: (g,), see `linear.wls`.
-        bound: α (p,), what no parameter exceeds; None: `BOX` times what one column needs to explain all torques.
+        bound: α (p,), what no parameter exceeds; None: `box` times what one column needs to explain all torques.
 
     Raises:
-        NotConverged: where a neuron saturates, so that x is a bound and no estimate, or after `STEPS`.
+        NotConverged: where a neuron saturates, so that x is a bound and no estimate, or after `max_steps`.
     """
     fit = wls(triangles, std, inflation)
     factor = combine(triangles, std)
     p = triangles.parameters
     norms = np.linalg.norm(factor[:p, :p], axis=0)
     upper, target = factor[:p, :p] / norms, factor[:p, p]
-    reach = np.full(p, BOX * np.linalg.norm(target)) if bound is None else np.asarray(bound, dtype=float) * norms
+    box = 30.0  # times the parameter that explains all torques by one column: no estimate is near it
+    reach = np.full(p, box * np.linalg.norm(target)) if bound is None else np.asarray(bound, dtype=float) * norms
     inner, step = np.zeros(p), 1.0
-    for count in range(1, STEPS + 1):
+    max_rest = 1e-3  # standard deviations from the equilibrium
+    max_steps = 200
+    for count in range(1, max_steps + 1):
         outer = reach * np.tanh(inner / reach)
         rest = upper @ outer - target
-        if np.linalg.norm(rest) < AT_REST:
+        if np.linalg.norm(rest) < max_rest:
             return replace(fit, estimate=replace(fit.estimate, values=outer / norms)), count
         while True:
             gain = 1.0 - (outer / reach) ** 2
@@ -111,7 +110,8 @@ def hopfield(
         if step < 1e-12:
             break
         inner, step = moved, 4.0 * step
-    saturated = [name for name, x, most in zip(triangles.names, outer, reach) if abs(x) > SATURATED * most]
+    saturation = 0.9  # of the box
+    saturated = [name for name, x, most in zip(triangles.names, outer, reach) if abs(x) > saturation * most]
     cause = f"neurons saturate: {', '.join(saturated[:5])}; widen their bounds" if saturated else "it is not at rest"
     raise NotConverged(f"the network after {count} steps: {cause}", outer / norms)
 

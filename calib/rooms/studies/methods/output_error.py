@@ -34,12 +34,6 @@ from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, 
 from calib.rooms.studies.methods.tangents import simulate_tangents
 from calib.simulation.loop.closed_loop import Sensing, simulate
 
-ROUNDS = 3  # of weighing joints by what the last estimate leaves
-LIMIT = 25  # simulations with tangents per round
-TOLERANCE = 0.05  # standard deviations of the estimate
-DAMPING = 1e-3  # at first
-IMPOSSIBLE = 1e60  # residual of parameters that cannot be simulated: any step that can is better
-
 
 @dataclass(frozen=True)
 class _OutputError(Method):
@@ -76,7 +70,8 @@ class _OutputError(Method):
         values = start_of(problem, self.name, plain.estimate.values, inertia, task.simulated)
         first, _ = task.linearised(values)
         std, count = task.spread(first, 0), 1
-        for _ in range(ROUNDS):
+        rounds = 3  # of weighing joints by what the last estimate leaves
+        for _ in range(rounds):
             found = task.solved(values, std)
             values, count = found.state, count + found.iterations
             residual, slopes = task.linearised(values)
@@ -144,17 +139,21 @@ class _Comparison:
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (M n,) and slopes (M n, p) over (n,) std; of what cannot be simulated huge ones."""
         p = len(values)
+        impossible = 1e60  # residual of parameters that cannot be simulated: any step that can is better
         try:
             residual, slopes = self.linearised(values)
         except CalibError:
-            return np.full(p + 1, IMPOSSIBLE), np.zeros((p + 1, p))
+            return np.full(p + 1, impossible), np.zeros((p + 1, p))
         return (residual / std).ravel(), np.asfortranarray((slopes / std[:, None]).reshape(-1, p))
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
         """Return the parameters that minimise the residuals over (n,) std."""
+        first_damping = 1e-3  # at first
+        max_simulations = 25  # simulations with tangents per round
+        step_tolerance = 0.05  # standard deviations of the estimate
         return nonlinear.solve(
-            lambda x: self.whitened(x, std), lambda x, step: x + step, values, damping=DAMPING, tolerance=TOLERANCE,
-            limit=LIMIT,
+            lambda x: self.whitened(x, std), lambda x, step: x + step, values, damping=first_damping,
+            tolerance=step_tolerance, limit=max_simulations,
         )  # fmt: skip
 
     def spread(self, residual: np.ndarray, p: int) -> np.ndarray:

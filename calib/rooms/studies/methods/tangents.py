@@ -12,8 +12,6 @@ from calib.simulation.loop.closed_loop import LOWER, Packed, Plant, body_rows, f
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
-GROWN = 1e20  # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
-
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
@@ -71,7 +69,11 @@ def simulate_tangents(
     )  # fmt: skip
     if status != loop_kernels.FINE:
         raise failure(status, reached * reference.period)
-    if not np.abs(slopes[:, -1]).max(initial=0.0) < GROWN:  # saturated torques keep the motion finite, not its slopes
+    # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
+    max_slope = 1e20
+    if (
+        not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope
+    ):  # saturated torques keep the motion finite, not its slopes
         raise Diverged(f"the loop is unstable, its slopes grow without bounds: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))

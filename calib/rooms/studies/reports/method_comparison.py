@@ -35,7 +35,6 @@ from calib.procedure.dynamic_stage.verdict import motion_warnings
 from calib.procedure.findings import Verdict
 from calib.procedure.report.page import Block, Section, Table, Text
 
-BLOCKS = 10  # of time in each recording
 APART, SLACK, ALIKE, QUICK = 2.0, 0.05, 2.0, 1.0  # our choices; the last in seconds
 LOOP = "needs the closed loop: state it in the options file, [loop] (calib formats identify-options)"
 USELESS = 100.0  # error [%] of predicting no torque at all
@@ -214,13 +213,14 @@ def _errors(
     ), unseen  # fmt: skip
 
 
-def _sums(found: Identification, cases: Sequence[Case]) -> _Sums:
+def _sums(found: Identification, cases: Sequence[Case], blocks: int = 10) -> _Sums:
+    # blocks: of time in each recording
     parts = []
     for case in cases:
         motion, known = case.motion, case.motion.weight > 0.5
         predicted = predict(found.dynamics, case)
         low, target = motion.in_band(predicted), motion.in_band(np.asarray(case.target))
-        starts = np.linspace(0, len(known), BLOCKS, endpoint=False).astype(int)
+        starts = np.linspace(0, len(known), blocks, endpoint=False).astype(int)
         parts.append(
             [
                 np.add.reduceat(np.where(known[:, None], x, 0.0) ** 2, starts, axis=0)
