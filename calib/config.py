@@ -22,7 +22,6 @@ from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
 
 T = TypeVar("T")
-MAX_BYTES = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
 MAX_LEVELS = 32
 _PLAIN = {  # pydantic's words
     "float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false", "tuple": "a list",
@@ -41,12 +40,13 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
     """
     from calib.files import check_regular
 
+    max_bytes = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
     try:
         check_regular(path, streams=True)
         with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise error(f"{path}: is larger than {MAX_BYTES / 1e6:g} MB: is it the right file?")
+            data = file.read(max_bytes + 1)
+        if len(data) > max_bytes:
+            raise error(f"{path}: is larger than {max_bytes / 1e6:g} MB: is it the right file?")
         found = tomllib.loads(data.decode("utf-8-sig"))
     except OSError as wrong:
         raise error(f"{path}: cannot be read: {wrong.strerror or wrong}") from wrong

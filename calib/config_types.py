@@ -20,7 +20,6 @@ from typing import Annotated, Any, get_args
 from calib.errors import CalibError, UsageError, suggestion
 from calib.units import QUANTITIES
 
-MAX_LETTERS = 200  # signs of an expression (our choice)
 UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 
@@ -90,8 +89,9 @@ def _number(value: Any, quantity: str) -> float:
     return result
 
 
-def _expression(text: str, quantity: str) -> float:
-    if len(text) > MAX_LETTERS or "_" in text:  # Python would read 0_5 as 5
+def _expression(text: str, quantity: str, max_letters: int = 200) -> float:
+    # max_letters: signs of an expression (our choice)
+    if len(text) > max_letters or "_" in text:  # Python would read 0_5 as 5
         raise ValueError(text)
     text, factor = text.strip(), 1.0
     for unit, size in sorted(QUANTITIES.get(quantity, {}).items(), key=lambda item: -len(item[0])):

@@ -21,8 +21,6 @@ from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.convex.cone_program import minimise
 
-UNIT_LENGTH = 0.1  # [m] of a body of one kilogram, in whose units the program is written
-
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
@@ -64,7 +62,8 @@ class BodyCone:
         unit = np.linalg.norm(factor[:p, :p], axis=0)
         size = max(1.0, float(np.linalg.norm(factor[:p, p])))
         R, z = factor[:p, :p] / unit, factor[:p, p] / size  # β = size · b / unit
-        root = np.diag([UNIT_LENGTH, UNIT_LENGTH, UNIT_LENGTH, 1.0])
+        unit_length = 0.1  # [m] of a body of one kilogram, in whose units the program is written
+        root = np.diag([unit_length, unit_length, unit_length, 1.0])
         block = pseudo_inertia.to_standard(root @ pseudo_inertia.UNITS @ root).T  # of the unknowns' pseudo-inertia
         made = unit[:base, None] / size * self.transform @ block_diag(*[block] * count, np.eye(len(self.positive)))
         made = np.asarray(

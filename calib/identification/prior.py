@@ -14,7 +14,7 @@ is largest (MacKay 1992, automatic relevance of groups),
     log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
 
 with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what a
-kind would be if it alone explained `EXPLAINED_SHARE` of all torque (offsets: `offset_share`), within a factor
+kind would be if it alone explained `explained_share` of all torque (offsets: `offset_share`), within a factor
 exp(`kind_width`) (our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large
 parameters that cancel. Rows are weighed by their joint's residual, worth as many independent values as its
 autocorrelation lets it, but not fewer than one in `max_inflation`: residuals of a short record look like one wave
@@ -46,14 +46,11 @@ from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
 
-EXPLAINED_SHARE = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
-MIN_CAD_DEVIATION = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
 TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
 MIN_NOISE = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
 ROUNDS = 12
 SETTLED = 0.03  # of every parameter's sigma, and of every residual
-RESTING_SHARE = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
 DRIVES = 3.0  # terms without CAD: standard deviation in units of what would explain all of the torque
 ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times its square, seen from the joint
 
@@ -95,12 +92,13 @@ class Prior:
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return (b,) which parameters rest on the prior: the data lower their variance by less than `RESTING_SHARE`.
+        """Return (b,) which parameters rest on the prior: the data lower their variance by less than `resting_share`.
 
         Counted about the whole robot's share: its factor s is one number, and soon identified.
         """
         b = len(self.own)
-        return np.diag(covariance)[:b] > (1.0 - RESTING_SHARE) * self.own**2
+        resting_share = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
+        return np.diag(covariance)[:b] > (1.0 - resting_share) * self.own**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,12 +264,15 @@ def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: 
     mean_square = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names)) / count
     body = alone[single] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
     known = mean_square > 0.0
-    near = np.where(known, body + np.log(MIN_CAD_DEVIATION), -np.inf)
+    # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
+    min_cad_deviation = 0.03
+    near = np.where(known, body + np.log(min_cad_deviation), -np.inf)
     max_deviation = 3.0  # of the whole robot's parameters of a kind, rms, or of what explains all torque (our choice)
     far = np.where(known, body, alone) + np.log(max_deviation)
     offset_share = 0.01  # the same of constant torques: motors have friction rather than offsets (our choice)
     shares = {"one": offset_share, "whole": 1.0}
-    share = np.array([shares.get(name.split(" ")[0], EXPLAINED_SHARE) for name in names])
+    explained_share = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
+    share = np.array([shares.get(name.split(" ")[0], explained_share) for name in names])
     whole_width = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
     kind_width = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
     width = np.where([name == "whole" for name in names], whole_width, kind_width)

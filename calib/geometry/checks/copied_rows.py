@@ -13,8 +13,6 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.checks.repeatability import SAME
 from calib.words import counted
 
-MAX_COPIED_SHARE = 0.5  # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
-
 
 class _Aside(Protocol):
     """Rows kept from the fit, `calib.procedure.kinematic_stage.inputs.Unseen`."""
@@ -47,6 +45,8 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
         if before:
             notes.append(f"{name}: {_rows(before)} with the numbers of a row fitted already: is the file given twice?")
         known.update(marks)
+    # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
+    max_copied_share = 0.5
     for name, aside in unseen.items():
         copied = [mark in known for mark in _marks(aside.block)]
         again = _measured_again(fit, aside.block) & ~np.array(copied, dtype=bool)
@@ -54,7 +54,7 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
             if told := _numbers(aside.block, chosen):
                 notes.append(f"{name}: {_rows(told)} {words}: not unseen")
         same = _numbers(aside.block, again | copied)
-        if len(same) > MAX_COPIED_SHARE * len(aside.block) and not aside.held_out:
+        if len(same) > max_copied_share * len(aside.block) and not aside.held_out:
             proofless.add(name)
     return proofless, notes
 

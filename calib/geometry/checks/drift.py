@@ -11,9 +11,6 @@ from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
-SAME = 1e-3  # joints of a pose that is visited again differ by less [rad or m] (this and the next: our choice)
-MIN_DRIFT_SIGMAS = 3.0  # standard errors that repeated poses have to be off to be called drift
-
 
 @dataclass(frozen=True)
 class Drift:
@@ -28,8 +25,9 @@ class Drift:
     rms: float
 
     def exceeds(self, sigma: float) -> bool:
-        """Say whether the differences are above `MIN_DRIFT_SIGMAS` standard errors of noise of `sigma` per axis [m]."""
-        return self.rms > (MIN_DRIFT_SIGMAS / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
+        """Say whether the differences are above `min_drift_sigmas` standard errors of noise of `sigma` per axis [m]."""
+        min_drift_sigmas = 3.0  # standard errors that repeated poses have to be off to be called drift
+        return self.rms > (min_drift_sigmas / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
 
 
 def noise_of_difference(sigma: float) -> float:
@@ -65,8 +63,9 @@ def _compared(
     if not first or not later:
         return None
     q, squares = np.array([block.q[k] for block, k in first]), []
+    max_apart = 1e-3  # joints of a pose that is visited again differ by less [rad or m]; our choice
     for place, (block, k) in enumerate(later):
-        near = [int(i) for i in np.flatnonzero(np.abs(q - block.q[k]).max(axis=1) < SAME)]
+        near = [int(i) for i in np.flatnonzero(np.abs(q - block.q[k]).max(axis=1) < max_apart)]
         near = [i for i in near if not own or i < place]
         near = [i for i in near if first[i][0].tool[first[i][1]] == block.tool[k]]
         if not near:

@@ -17,11 +17,6 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion
 
-ROWS = 200  # how many are looked at (this and the next three: our choice)
-WRONG = 20.0  # median misfit [deg] from which on the file's orientations are not what they are said to be
-RIGHT = 5.0  # and below which another reading of them is
-MAX_MISFIT = 0.1  # of the positions' spread: their median misfit then
-
 
 def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     """Refuse quaternions that stand as w x y z under a header x y z w, and inverse orientations.
@@ -36,9 +31,11 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     if not isinstance(block, Poses):
         return
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, ROWS).astype(int))]
+    max_rows = 200  # how many are looked at; our choice
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, max_rows).astype(int))]
     arm, position, stated = forward(chain, block.q[rows]), block.position[rows], block.quaternion[rows]
-    if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= WRONG:
+    min_angle = 20.0  # median misfit [deg] from which on the file's orientations are not what they are said to be
+    if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= min_angle:
         return
     readings = {
         "as w x y z they do: are these w first? Name the columns in the order they stand in: qw, qx, qy, qz": np.roll(
@@ -46,9 +43,11 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
         ),
         "inverted they do: they have to be those of the target seen from the instrument": stated * [-1, -1, -1, 1],
     }
+    max_misfit = 0.1  # of the positions' spread: their median misfit then
+    max_angle = 5.0  # and below which another reading of them is
     for words, quaternion in readings.items():
         angle, distance = _misfit(arm, position, quaternion)
-        if angle < RIGHT and distance < MAX_MISFIT:
+        if angle < max_angle and distance < max_misfit:
             refuse_data(
                 block.file,
                 f"the orientations do not turn with the arm (as x y z w they are off by {found:.0f}° in the median, "

@@ -27,7 +27,6 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare
 
 SAME = 1e-3  # joints of one commanded pose, as read back, differ by less [rad or m]; our choice, as the next two
-MIN_CYCLES = 3  # cycles that make a repeated pose
 APART = np.radians(30.0)  # directions of approach that differ by more are different ones
 
 
@@ -56,7 +55,7 @@ class Repeats:
 def repeats(
     cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None, same: float = SAME
 ) -> Repeats | None:
-    """Return accuracy and repeatability of all poses measured at least `MIN_CYCLES` times; None without any.
+    """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without any.
 
     Args:
         cell: the arm whose commands are meant.
@@ -86,7 +85,7 @@ def repeats(
 
 
 def repeated_rows(measured: PoseMeasurements, same: float = SAME) -> list[np.ndarray]:
-    """Return for each pose measured at least `MIN_CYCLES` times the indices of its rows, in the file's order.
+    """Return for each pose measured at least `min_cycles` times the indices of its rows, in the file's order.
 
     Rows with the very same numbers are copies of one measurement and count once. Empty for kinds without positions.
     """
@@ -98,9 +97,10 @@ def repeated_rows(measured: PoseMeasurements, same: float = SAME) -> list[np.nda
     key = np.hstack([measured.q[rows], 1e3 * measured.tool[rows, None]])  # another reflector is another pose
     near = KDTree(key).query_ball_point(key, same, p=np.inf)
     groups, taken = [], np.zeros(len(rows), dtype=bool)
+    min_cycles = 3  # cycles that make a repeated pose
     for k, each in enumerate(near):
         own = np.array([i for i in each if not taken[i]], dtype=int)
-        if not taken[k] and len(own) >= MIN_CYCLES:
+        if not taken[k] and len(own) >= min_cycles:
             taken[own] = True
             groups.append(np.sort(rows[own]))
     return groups

@@ -10,10 +10,7 @@ from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.robot.kinematics import forward
 
-MAX_PLACEMENT_SIGMA = 2e-3  # [m] a placement known no better than this is worth a word (our choice)
-NAMED = 4  # parameters by which families of merged ones are distinguished
 # [deg] orientation range below which "the wrist is held still" is the likely reason (our choice)
-MIN_ORIENTATION_RANGE = 45.0
 PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}
 
 
@@ -40,8 +37,11 @@ def _rank(found: GeometricFit) -> list[Finding]:
     ]
 
 
-def _merged(found: GeometricFit) -> list[Finding]:
-    """Return the arm parameters that are linear combinations of others, by what they merge with."""
+def _merged(found: GeometricFit, max_named: int = 4) -> list[Finding]:
+    """Return the arm parameters that are linear combinations of others, by what they merge with.
+
+    `max_named`: parameters by which families of merged ones are distinguished.
+    """
     split = found.split
     if split is None:
         return []
@@ -57,7 +57,7 @@ def _merged(found: GeometricFit) -> list[Finding]:
             partners = found.candidates[split.kept[weight > 0.1 * weight.max()]]
             groups = {table.group(int(k)) for k in partners}
             arm = tuple(table.names[k] for k in partners if table.group(int(k)) == "arm")
-            key = "station" in groups, "tool" in groups, arm[:NAMED], len(arm)
+            key = "station" in groups, "tool" in groups, arm[:max_named], len(arm)
             frames = [PLACES[group] for group in PLACES if group in groups]
             kin.setdefault(key, {"into": (*frames, *arm)})
         families.setdefault(key, []).append(table.names[found.candidates[dropped]])
@@ -82,17 +82,21 @@ def _at_nominal(found: GeometricFit) -> list[Finding]:
     return [finding("left-nominal", names=left)] if left else []
 
 
-def _loose(found: GeometricFit) -> list[Finding]:
-    """Return tools whose placement is hardly determined, and the station that each is confused with."""
+def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:
+    """Return tools whose placement is hardly determined, and the station that each is confused with.
+
+    `max_placement_sigma`: [m] a placement known no better than this is worth a word (our choice).
+    """
     estimate = found.estimate
     index = {name: k for k, name in enumerate(estimate.names)}
     result: list[Finding] = []
+    min_orientation_range = 45.0
     for tool in found.cell.tool_names:
         own = [index[f"{tool}.{axis}"] for axis in "xyz" if f"{tool}.{axis}" in index]
         sigma = float(np.linalg.norm(estimate.sigma[own]))
-        if own and sigma >= MAX_PLACEMENT_SIGMA:
+        if own and sigma >= max_placement_sigma:
             spread = _orientation_range(found)
-            still = spread if spread is not None and spread < MIN_ORIENTATION_RANGE else None
+            still = spread if spread is not None and spread < min_orientation_range else None
             station = _confused(found, own, index)
             result.append(finding("loose-tool", tool=tool, sigma=sigma, station=station, still=still))
     return result

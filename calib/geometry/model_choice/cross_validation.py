@@ -25,8 +25,6 @@ from calib.geometry.result import GeometricFit
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 
-MAX_BLIND_ERROR = 3.0  # error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
-FRAME_SIGMA = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
@@ -191,7 +189,7 @@ def blind_folds(
     """Return which folds cannot be judged (folds,): the other rows do not determine where the tool would be in them.
 
     There the error that geometry and frames would have by their covariance alone, with the nominal arm's residuals
-    taken for noise and `plausible_deviation` known beforehand, is above `MAX_BLIND_ERROR` times those residuals.
+    taken for noise and `plausible_deviation` known beforehand, is above `max_blind_error` times those residuals.
 
     Args:
         nominal: the nominal arm with its frames fitted to all rows.
@@ -204,7 +202,8 @@ def blind_folds(
     sigmas: list[dict[str, float]] = [{} for _ in measured]
     for piece in nominal.pieces:
         sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
-    known = np.where(free >= table.arm, FRAME_SIGMA, plausible_deviation(nominal.cell, free))
+    frame_sigma = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
+    known = np.where(free >= table.arm, frame_sigma, plausible_deviation(nominal.cell, free))
     weights = nominal.row_weights()
     each, squares, none, moved = [], [], [None] * len(measured), [True] * len(measured)
     for fold in range(folds.count):
@@ -215,10 +214,12 @@ def blind_folds(
     total = sum(each[1:], each[0])
     result = np.zeros(folds.count, dtype=bool)
     noise = sum(square for _, square in squares) / folds.count
+    # error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
+    max_blind_error = 3.0
     for fold, own in enumerate(each):
         spread = np.linalg.inv(((total - own).square + np.diag(known**-2)) * np.outer(known, known))
         predicted = float(np.sum(squares[fold][0] * (spread * np.outer(known, known))))
-        result[fold] = predicted > MAX_BLIND_ERROR**2 * noise
+        result[fold] = predicted > max_blind_error**2 * noise
     return result
 
 

@@ -16,7 +16,6 @@ from calib.errors import UsageError, require
 
 REGIONS = 20
 FOLDS = 5
-MAX_STATION_POSES = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +114,12 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
     """Return `transfer_folds`, `region_folds`, ten `random_folds`, or one fold for each of the ``poses``.
 
     Raises:
-        UsageError: for another name, or for leaving out each of more than `MAX_STATION_POSES` poses.
+        UsageError: for another name, or for leaving out each of more than `max_station_poses` poses.
     """
-    if name == "poses" and sum(len(block) for block in measured) > MAX_STATION_POSES:
+    max_station_poses = 150
+    if name == "poses" and sum(len(block) for block in measured) > max_station_poses:
         raise UsageError(
-            f"folds 'poses' leaves out every pose once, for {MAX_STATION_POSES} rows at most; take 'random'"
+            f"folds 'poses' leaves out every pose once, for {max_station_poses} rows at most; take 'random'"
         )
     ways = {
         "transfer": lambda: transfer_folds(measured, seed),

@@ -29,7 +29,6 @@ from calib.geometry.weighing import Settings
 from calib.robot.deflection import Deflection, Term
 
 MIN_GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
-POSES_PER_ORDER = 8  # harmonics of order k are offered to sets of at least 8 k poses (our choice)
 
 MAX_RESIDUAL = 8.0  # robust sigmas beyond which a row is not of this robot (our choice)
 
@@ -309,10 +308,13 @@ class _Climber:
         found = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
         return replace(found, start=self.best.start, split=self.best.split, candidates=self.best.candidates)
 
-    def _terms(self, effect: str) -> list[Term]:
-        """Return an effect's terms, harmonics only up to what so many poses can identify."""
+    def _terms(self, effect: str, poses_per_order: int = 8) -> list[Term]:
+        """Return an effect's terms, harmonics only up to what so many poses can identify.
+
+        `poses_per_order`: harmonics of order k are offered to sets of at least 8 k poses (our choice).
+        """
         known = self.torques is not None and all(torque is not None for torque in self.torques)
-        highest = sum(len(block) for block in self.measured) // POSES_PER_ORDER
+        highest = sum(len(block) for block in self.measured) // poses_per_order
         terms = EFFECTS[effect](self.nominal.cell.chain, known)
         return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
 

@@ -37,11 +37,7 @@ from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 
-NEAR_SHARE = 0.02  # share of the poses (our choice)
 END_SHARE = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
-MIN_POSES = 20  # poses from which errors on rows left out are worth a model (our choice)
-MAX_POSES = 1500  # poses that folds are judged by (our choice)
-PRIOR_SIGMA = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
 
 
 @dataclass(frozen=True)
@@ -178,12 +174,13 @@ def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
 
-    The latter is, joint by joint, the way to where `NEAR_SHARE` of the learnt poses are within reach: a few of them far
+    The latter is, joint by joint, the way to where `near_share` of the learnt poses are within reach: a few of them far
     off the others do not say how a joint is there.
     """
     nearest = np.asarray(KDTree(learnt * levers).query(q * levers)[0]) ** 2
     alone, count = np.zeros(len(q)), len(learnt)
-    some = int(np.clip(round(NEAR_SHARE * count), 1, count))
+    near_share = 0.02  # share of the poses (our choice)
+    some = int(np.clip(round(near_share * count), 1, count))
     for j, lever in enumerate(levers):
         values = np.sort(learnt[:, j])
         place = np.searchsorted(values, q[:, j])
@@ -223,7 +220,8 @@ def learn_errors(
         seed: of the random folds.
     """
     found = selected.fit
-    if sum(len(block) for block in measured) < MIN_POSES or not all(isinstance(block, Positions) for block in measured):
+    min_poses = 20  # poses from which errors on rows left out are worth a model (our choice)
+    if sum(len(block) for block in measured) < min_poses or not all(isinstance(block, Positions) for block in measured):
         return None
     levers = _joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
     rows = _Rows(selected, measured, torques)
@@ -268,7 +266,8 @@ class _Rows:
         torques: Sequence[np.ndarray | None] | None,
     ):
         found, terms = selected.fit, selected.offered
-        every = max(1, -(-sum(map(len, measured)) // MAX_POSES))
+        max_poses = 1500  # poses that folds are judged by (our choice)
+        every = max(1, -(-sum(map(len, measured)) // max_poses))
         self.chosen = [np.arange(0, len(block), every) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
         self.pose, poses = [], []
@@ -293,7 +292,8 @@ class _Rows:
         wide = plausible_deviation(cell, self.free[: len(own)])
         if found.prior is not None:
             wide = np.minimum(wide, found.prior[own])
-        self.prior = np.where(np.isfinite(wide), wide, PRIOR_SIGMA)
+        prior_sigma = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
+        self.prior = np.where(np.isfinite(wide), wide, prior_sigma)
         scales, weights = found.used_sigmas(), found.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
         self.metric: list[tuple[np.ndarray, np.ndarray]] = []

@@ -21,7 +21,6 @@ from calib.estimation.variances import ROUNDS, variance_weights
 from calib.geometry.uncertainty.unevenness import Profile, Unevenness, unevenness
 
 COVERED = 0.95
-FOLD_ROUNDS = 100  # rounds of the search for variances without a fold's poses
 LASTING, CHANGE = 0.5, 0.33
 MIN_ROWS = 5  # rows of a kind that the poses outside a fold must have to tell an interval (our choice)
 
@@ -85,7 +84,8 @@ class LeftOut:
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
         """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the radii: sigmas that hold near, far errors."""
-        near, rounds = self.near, FOLD_ROUNDS
+        fold_rounds = 100  # rounds of the search for variances without a fold's poses
+        near, rounds = self.near, fold_rounds
         if not start:
             middle, rounds = float(np.median(self.squares)), ROUNDS
             start = [1.0, middle, *0.3 * middle / np.maximum(self.shapes[:, 2:].mean(axis=0), 1e-12)]

@@ -21,15 +21,8 @@ from trajectories.errors import BadInput
 from trajectories.recall import Recalled, find_periods, sliding_products
 
 STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
-MAX_GAP = 60.0  # between samples that the grid bridges [s]; a log may go on after weeks
-LIKE = 0.9  # share of the motion's variance a recorded period has to explain
 SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
 UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
-EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
-SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse grid
-MIN_SIGN_CORRELATION = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
-HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
-UNLIMITED = 100.0  # torque limit of a joint that states none [N m or N]
 CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
 
 
@@ -91,9 +84,10 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
     played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
     tracking = np.sqrt(np.mean(played**2, axis=0))
+    edge_time = 0.25  # kept before and after the motion [s], for the filters' borders
     return LocatedMotion(
-        start=max(float(recording.t[0]), float(start) - EDGE), stop=min(float(recording.t[-1]), float(stop) + EDGE),
-        periods=found.periods, tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
+        start=max(float(recording.t[0]), float(start) - edge_time), stop=min(float(recording.t[-1]), float(stop) +
+        edge_time), periods=found.periods, tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
         loosest=int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9))),
     )  # fmt: skip
 
@@ -130,10 +124,13 @@ def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     return grid, _sampled(recording.t, recording.q, grid)
 
 
-def _coarse(t: np.ndarray) -> np.ndarray:
-    """Return times every `STEP` over those of samples (N,) [s]; of longer gaps than `MAX_GAP` the rest is left out."""
-    last = np.flatnonzero(np.diff(t) > MAX_GAP)
-    spans = zip(t[np.append(0, last + 1)], np.append(t[last] + MAX_GAP, t[-1]))
+def _coarse(t: np.ndarray, max_gap: float = 60.0) -> np.ndarray:
+    """Return times every `STEP` over those of samples (N,) [s]; of longer gaps than `max_gap` the rest is left out.
+
+    `max_gap`: between samples that the grid bridges [s]; a log may go on after weeks.
+    """
+    last = np.flatnonzero(np.diff(t) > max_gap)
+    spans = zip(t[np.append(0, last + 1)], np.append(t[last] + max_gap, t[-1]))
     return np.concatenate([np.arange(start, stop, STEP) for start, stop in spans])
 
 
@@ -147,9 +144,10 @@ def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
     return motion.orders(np.arange(count) * motion.period / count)[0]
 
 
-def _found(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
+def _found(q: np.ndarray, reference: np.ndarray, min_likeness: float = 0.9) -> Recalled | None:
+    # min_likeness: share of the motion's variance a recorded period has to explain
     try:
-        return find_periods(q, reference, likeness=LIKE)
+        return find_periods(q, reference, likeness=min_likeness)
     except BadInput:
         return None
 
@@ -174,8 +172,8 @@ def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
     """Compare recorded torques with those of the nominal masses, friction left free.
 
     Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
-    rigid-body torque is more than `HEAVY` of its limit and the partial correlation of both torques is above
-    `MIN_SIGN_CORRELATION`.
+    rigid-body torque is more than `min_torque` of its limit and the partial correlation of both torques is above
+    `min_sign_correlation`.
 
     Args:
         recording: with torques of n joints.
@@ -210,18 +208,25 @@ def share_of_nominal(
         still = inverse_dynamics(bodies, parameters, q, np.zeros_like(v), np.zeros_like(a))
         rigid, other = still, rigid - still
     limit = np.array([joint.effort for joint in chain.joints])
-    heavy = rigid.std(axis=0) > HEAVY * np.where(np.isfinite(limit), limit, UNLIMITED)
+    min_torque = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
+    default_limit = 100.0  # torque limit of a joint that states none [N m or N]
+    heavy = rigid.std(axis=0) > min_torque * np.where(np.isfinite(limit), limit, default_limit)
     share = np.full(chain.n, np.nan)
+    # partial correlation with the torque of the nominal masses from which on its sign counts
+    min_sign_correlation = 0.8
     for j in np.flatnonzero(heavy):
         friction = np.column_stack([v[:, j], np.tanh(v[:, j] / CREEP), np.ones(len(q))])
         free = friction if other is None else np.column_stack([friction, other[:, j]])
         own, seen = (x - free @ np.linalg.lstsq(free, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
         common, power = own @ seen, own @ own
-        if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > MIN_SIGN_CORRELATION:
+        if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > min_sign_correlation:
             share[j] = common / max(power, 1e-12)
     return share
 
 
-def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window."""
-    return moving_cubics(values, min(SMOOTH, (len(values) - 1) // 2), order) / STEP**order
+def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndarray:
+    """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window.
+
+    `half_width`: half width of the window for derivatives, in steps of the coarse grid.
+    """
+    return moving_cubics(values, min(half_width, (len(values) - 1) // 2), order) / STEP**order

@@ -29,11 +29,7 @@ from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
 MAX_LAG_SAMPLES, MAX_SAMPLES = 1500, 500  # samples on which a lag is looked for, and all else
-DATED = 0.01  # share of a joint's travel by which errors of dates move its positions
-DRAWS = 6  # independent errors in what velocities leave of the positions: those with a dead zone drift for long
 FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are the positions
-RARE = 0.01  # share of the samples that may be spikes
-TRAVEL = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
 
 
 @dataclass(frozen=True)
@@ -87,9 +83,10 @@ def compare_sizes(
     known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
     masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
     limits = nothing
+    spike_share = 0.01  # share of the samples that may be spikes
     if newtons and case.target.shape[1] == n:
         limit = np.array([joint.effort for joint in chain.joints])
-        usual = np.quantile(np.abs(case.target), 1.0 - RARE, axis=0)
+        usual = np.quantile(np.abs(case.target), 1.0 - spike_share, axis=0)
         limits = np.where(np.isfinite(limit) & (limit > 0.0), usual / np.where(limit > 0.0, limit, 1.0), np.nan)
     speed, v = (nothing, nothing, nothing), motion.v_measured
     if v is not None:
@@ -127,10 +124,14 @@ def _speed_ratio(
             x[a:b] -= trend @ np.linalg.lstsq(trend, x[a:b], rcond=None)[0]
     power = np.maximum((own**2).sum(axis=0), 1e-300)
     ratio = (own * seen).sum(axis=0) / power
-    dated = DATED * np.ptp(q, axis=0) / np.maximum(np.ptp(own, axis=0), 1e-300)
-    travels = np.ptp(q, axis=0) > TRAVEL
+    date_error = 0.01  # share of a joint's travel by which errors of dates move its positions
+    dated = date_error * np.ptp(q, axis=0) / np.maximum(np.ptp(own, axis=0), 1e-300)
+    min_travel = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
+    travels = np.ptp(q, axis=0) > min_travel
     follows = np.where(travels, ratio * np.sqrt(power / np.maximum((seen**2).sum(axis=0), 1e-300)), np.nan)
-    sigma = np.hypot(np.sqrt(((seen - ratio * own) ** 2).sum(axis=0) / power / DRAWS), dated)
+    # independent errors in what velocities leave of the positions: those with a dead zone drift for long
+    independent_errors = 6
+    sigma = np.hypot(np.sqrt(((seen - ratio * own) ** 2).sum(axis=0) / power / independent_errors), dated)
     return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows
 
 

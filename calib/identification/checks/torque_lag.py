@@ -3,10 +3,10 @@
 One model of all joints is fitted at every lag that is tried: bodies shared by the joints, drives of each, and least
 squares weighed by what is left of each joint. Bodies of each joint's own bend after a late torque: they find 148 ms
 where torques are 100 ms late. Friction turns over later than its speed does, as long as joints bend before they slide,
-and would pass for a lag of 20 ms (the Panda's wrist); so sign(v) may come `FREE` earlier and later, at each joint, and
-friction holds no information on the lag: masses and inertias do. The least of the residual is found by a parabola; its
-sigma takes each joint's vote for one draw, and both halves of the recording for two: short ones agree on none. All of
-this and its thresholds are our choice.
+and would pass for a lag of 20 ms (the Panda's wrist); so sign(v) may come `free_time` earlier and later, at each joint,
+and friction holds no information on the lag: masses and inertias do. The least of the residual is found by a parabola;
+its sigma takes each joint's vote for one draw, and both halves of the recording for two: short ones agree on none. All
+of this and its thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -21,16 +21,8 @@ from calib.identification.checks.recorded_motion import CREEP
 
 LAGS = 0.25  # largest lag that is tried [s], in steps of
 STEP = 0.005
-FREE = 0.03  # by which friction may turn over early or late by itself [s]
-SWEEPS = 30  # over the joints' own lags
 MIN_LAG, MIN_LAG_SIGMAS = 0.015, 3.5  # least lag that is told [s], and in sigmas
-HELPS = 1.05  # and what is left without it over what is left with it: of another robot any lag may be the best
-KNOWN = 0.4  # share of the joints' torques that may be left: a model that leaves more knows no lag
 ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
-MAX_LAG_DIFFERENCE = 0.5  # share of that lag by which those of both halves may differ from it
-ROUNDS = 4  # of weighing joints by what is left of them
-UNSURE = 0.005  # sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms
-LONG = 2.0  # time with samples below which a motion tells no lag: bodies then stand for it [s]
 
 
 @dataclass(frozen=True)
@@ -59,7 +51,10 @@ class Lag:
     def told(self) -> bool:
         """Whether all torques come late, surely, and by enough."""
         least = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
-        return least < abs(self.seconds) < LAGS - STEP and self.factor > HELPS and self.after < KNOWN
+        # and what is left without it over what is left with it: of another robot any lag may be the best
+        min_gain = 1.05
+        max_left = 0.4  # share of the joints' torques that may be left: a model that leaves more knows no lag
+        return least < abs(self.seconds) < LAGS - STEP and self.factor > min_gain and self.after < max_left
 
 
 def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
@@ -70,7 +65,8 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
         rate: of its motion [Hz].
     """
     m = len(samples.index)
-    if m * float(np.median(np.diff(samples.index))) < LONG * rate:
+    min_time = 2.0  # time with samples below which a motion tells no lag: bodies then stand for it [s]
+    if m * float(np.median(np.diff(samples.index))) < min_time * rate:
         return None
     whole = _lag_in(samples, rate)
     halves = [_lag_in(_part(samples, half), rate) for half in (slice(0, m // 2), slice(m // 2, m))]
@@ -78,8 +74,11 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     return replace(whole, sigma=float(np.hypot(whole.sigma, apart)), joint=_alone(whole, halves))
 
 
-def _alone(whole: Lag, halves: Sequence[Lag]) -> int | None:
-    """Return the joint with a lag of its own as no other has, in the whole and alike in its halves; None without."""
+def _alone(whole: Lag, halves: Sequence[Lag], max_lag_difference: float = 0.5) -> int | None:
+    """Return the joint with a lag of its own as no other has, in the whole and alike in its halves; None without.
+
+    `max_lag_difference`: share of that lag by which those of both halves may differ from it.
+    """
     j, more = int(whole.gains.argmax()), np.sort(whole.gains) - 1.0
     late = whole.own[j] - whole.seconds
     if abs(late) < MIN_LAG or abs(whole.own[j]) > LAGS - 1.5 * STEP or len(more) < 2:
@@ -87,7 +86,7 @@ def _alone(whole: Lag, halves: Sequence[Lag]) -> int | None:
     if more[-1] < max(ALONE, OTHERS * more[-2]):
         return None
     return (
-        j if all(abs(half.own[j] - half.seconds - late) < MAX_LAG_DIFFERENCE * abs(late) for half in halves) else None
+        j if all(abs(half.own[j] - half.seconds - late) < max_lag_difference * abs(late) for half in halves) else None
     )
 
 
@@ -96,8 +95,13 @@ def _part(samples: MotionSamples, part: slice) -> MotionSamples:
     return MotionSamples(**picked, effort=samples.effort, velocity=samples.velocity, bodies=samples.bodies)
 
 
-def _lag_in(samples: MotionSamples, rate: float) -> Lag:
-    """Return the lag of least squares, its sigma by the joints' votes."""
+def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:
+    """Return the lag of least squares, its sigma by the joints' votes.
+
+    `rounds`: of weighing joints by what is left of them.
+
+    `lag_sigma`: sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms.
+    """
     n = samples.q.shape[1]
     shifts = np.arange(-LAGS, LAGS + STEP / 2, STEP)
     recorded = np.full(n, len(shifts) // 2)
@@ -105,7 +109,7 @@ def _lag_in(samples: MotionSamples, rate: float) -> Lag:
     torque = np.stack([np.interp(places, times, own) for own in samples.effort.T])
     columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2).transpose(1, 0, 2)
     fit = _Fit(columns, torque, 1.0 / np.maximum(torque[:, recorded[0]].std(axis=1), 1e-12))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         left = fit.left(np.full(n, fit.common.argmin()))
         fit = _Fit(columns, torque, fit.weight / np.maximum(left.std(axis=1), 1e-12))
     at = int(fit.common.argmin())
@@ -117,7 +121,7 @@ def _lag_in(samples: MotionSamples, rate: float) -> Lag:
 
     return Lag(
         seconds=float(shifts[at] + STEP * _least(fit.common, at)),
-        sigma=float(np.hypot(fit.sigma(at), UNSURE)),
+        sigma=float(np.hypot(fit.sigma(at), lag_sigma)),
         before=share(recorded),
         after=share(common),
         factor=float(np.sqrt(fit.common[recorded[0]] / max(fit.common[at], 1e-300))),
@@ -155,7 +159,8 @@ class _Fit:
     def own(self, places: np.ndarray) -> np.ndarray:
         """Return (n,) the lags of least squares of the joints, each for itself, from the given ones on."""
         places = places.copy()
-        for _ in range(SWEEPS):
+        max_sweeps = 30  # over the joints' own lags
+        for _ in range(max_sweeps):
             before = places.copy()
             for joint in range(len(places)):
                 places[joint] = self.along(places, joint).argmin()
@@ -178,11 +183,14 @@ class _Fit:
         return float(np.sqrt(few * ((votes - votes.mean()) ** 2).sum()) / max(power, 1e-300))
 
 
-def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
-    """Return columns (m, n, n) of friction that turns over early, and late."""
+def _turning(samples: MotionSamples, rate: float, free_time: float = 0.03) -> list[np.ndarray]:
+    """Return columns (m, n, n) of friction that turns over early, and late.
+
+    `free_time`: by which friction may turn over early or late by itself [s].
+    """
     n, times = samples.q.shape[1], np.arange(len(samples.velocity))
     found = []
-    for early in (-FREE, FREE):
+    for early in (-free_time, free_time):
         v = np.stack([np.interp(samples.index + early * rate, times, own) for own in samples.velocity.T], axis=1)
         found.append(np.tanh(v / CREEP)[:, :, None] * np.eye(n))
     return found

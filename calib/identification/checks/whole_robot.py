@@ -25,14 +25,8 @@ from calib.identification.checks.motion_samples import MotionSamples, basis, dri
 from calib.identification.rods import rods
 from calib.robot.chain import Chain
 
-JOINTS = 3  # of the shortest arm that is looked at (our choice)
-ROUNDS = 3  # of weighing joints by what is left of them
-MIN_FACTOR_SIGMAS = 5.0  # sigmas from which on a factor is told
 # least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
-MIN_EXCHANGED_SPEED = 0.3
-KNOWN = 0.5  # largest share of their torques' variance that is left as recorded
 QUARTERS = (1, 2, 3)  # turns of a joint's zero that are tried [90 deg]
-MAX_LEFT = 0.8  # of what is left as recorded, with a sign reversed: sound recordings at hand are left 0.91 and more
 
 
 @dataclass(frozen=True)
@@ -85,23 +79,28 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
     gravity beside any torque of motion; drives free in both.
     """
-    if chain.n < JOINTS:
+    min_joints = 3  # of the shortest arm that is looked at (our choice)
+    if chain.n < min_joints:
         return None
     whole = np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()
     still, moving = samples.at_rest, samples.inertial - samples.at_rest
     inertia, own = _factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))
     mass, other = _factor(samples.torque, still @ whole, np.concatenate([moving, samples.drives], axis=2))
-    if inertia < MIN_FACTOR_SIGMAS * own or mass < MIN_FACTOR_SIGMAS * other:
+    min_factor_sigmas = 5.0  # sigmas from which on a factor is told
+    if inertia < min_factor_sigmas * own or mass < min_factor_sigmas * other:
         return None
     return ClockRatio(inertia / mass, float(np.hypot(own / inertia, other / mass)))
 
 
-def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
-    """Return α of τ = α common + free x and its sigma, joints weighed by what is left of them."""
+def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: int = 3) -> tuple[float, float]:
+    """Return α of τ = α common + free x and its sigma, joints weighed by what is left of them.
+
+    `rounds`: of weighing joints by what is left of them.
+    """
     m, n = torque.shape
     weight, left, own = np.ones(n), torque, common
     alpha = power = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         scale = np.repeat(weight, m)
         rows = free.transpose(1, 0, 2).reshape(m * n, -1) * scale[:, None]
         spanned = basis(rows)
@@ -121,7 +120,7 @@ def reversed_signs(samples: MotionSamples) -> ReversedSigns | None:
 
     One model of all joints is fitted to each choice of signs: bodies and offsets of any size, Ia, Fv and Fc of every
     drive not negative, since no drive brakes backwards. Signs are reversed one by one, the one that explains most
-    first, as long as the geometric mean of what is left of the joints falls to `MAX_LEFT` of it. The robot's own
+    first, as long as the geometric mean of what is left of the joints falls to `max_left` of it. The robot's own
     masses need not be known.
     """
     m, n = samples.q.shape
@@ -144,11 +143,12 @@ def reversed_signs(samples: MotionSamples) -> ReversedSigns | None:
 
     signs = np.ones(n)
     before = now = left(signs)
+    max_left = 0.8  # of what is left as recorded, with a sign reversed: sound recordings at hand are left 0.91 and more
     while True:
         tried = [left(np.where(np.arange(n) == j, -signs, signs)) for j in range(n)]
         factors = [np.exp(0.5 * np.mean(np.log(one / now))) for one in tried]
         best = int(np.argmin(factors))
-        if factors[best] > MAX_LEFT:
+        if factors[best] > max_left:
             break
         signs[best], now = -signs[best], tried[best]
     joints = np.flatnonzero(signs < 0.0)
@@ -167,7 +167,9 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Rearranged | None:
     order, straight = np.arange(chain.n), np.zeros(chain.n)
     before = np.maximum(list(_left(samples, masses, order, straight)), 1e-9)
     speed = samples.v.std(axis=0)
-    moves = (speed > MIN_EXCHANGED_SPEED * speed.max()) & (before < KNOWN)
+    max_left = 0.5  # largest share of their torques' variance that is left as recorded
+    min_exchanged_speed = 0.3
+    moves = (speed > min_exchanged_speed * speed.max()) & (before < max_left)
     tried = [((a, b), 0) for a, b in combinations(np.flatnonzero(moves).tolist(), 2)]
     turning = [j for j, joint in enumerate(chain.joints) if joint.kind != "prismatic"]
     tried += [((j,), quarters) for j in turning for quarters in QUARTERS]

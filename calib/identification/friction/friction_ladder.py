@@ -34,10 +34,6 @@ from calib.identification.rows import ObservationRows, observe_terms, triangulat
 from calib.records import Number, stored
 
 MIN_GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
-MIN_BLOCKS_WON = 0.6  # and on this share of the blocks
-COUPLING_ROWS = 3000  # of the rows that couplings are sought in, about
-MIN_SIGMA = 1e-9  # σ of a term below which its ridge holds it at zero
-MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
 
 
 NAMES = ("auto", "standard", "coupling", *STEPS, "ripple")
@@ -89,7 +85,8 @@ class FrictionSelection:
 
     def fitted(self, sigma: np.ndarray) -> FrictionSelection:
         """Return the selection after the final fit, by its terms' σ (k,): what that switched off is not kept."""
-        off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < MIN_SIGMA)
+        min_sigma = 1e-9  # σ of a term below which its ridge holds it at zero
+        off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < min_sigma)
         joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
         steps = []
         for step in self.steps:
@@ -252,13 +249,16 @@ def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
     return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
 
 
-def _pays(before: np.ndarray, after: np.ndarray) -> bool:
-    """Say whether a joint's squared errors per block fell enough, and on enough blocks."""
+def _pays(before: np.ndarray, after: np.ndarray, min_blocks_won: float = 0.6) -> bool:
+    """Say whether a joint's squared errors per block fell enough, and on enough blocks.
+
+    `min_blocks_won`: and on this share of the blocks.
+    """
     used = before > 0.0
     if not used.any():
         return False
     lower = float(np.mean(after[used] < before[used]))
-    return bool(after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum() and lower >= MIN_BLOCKS_WON)
+    return bool(after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum() and lower >= min_blocks_won)
 
 
 def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
@@ -275,10 +275,12 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
     return found
 
 
-def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
+def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> list[DriveTerm]:
     """Return the terms of couplings of neighbours that explain what the standard model leaves of both torques.
 
     A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
+
+    `min_explained`: of two joints' squared residuals, by a coupling that is offered (our choice).
     """
     n = candidates.n
     if not candidates.torque_rows.motors_alone:
@@ -300,7 +302,7 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
             seen -= basis @ (basis.T @ seen)
             rest = left - seen @ np.linalg.lstsq(seen, left, rcond=None)[0]
             explained = float((left @ left - rest @ rest) / max(size[[i, j]].sum(), 1e-300))
-            if explained > MIN_EXPLAINED:
+            if explained > min_explained:
                 found.append((explained, terms))
     taken: list[DriveTerm] = []
     for _, terms in sorted(found, key=lambda one: -one[0]):
@@ -310,14 +312,15 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return some `COUPLING_ROWS` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
+    """Return some `coupling_rows` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
     parts = []
     for part, case in zip(candidates.rows, candidates.cases):
         own = kept(case.motion.segment, candidates.decimator)
         used = part.present.all(axis=1)
         parts.append([x[used] for x in (part.matrix, part.target, *(getattr(case.motion, key)[own] for key in "qva"))])
     matrix, target, *motion = (np.concatenate(series) for series in zip(*parts))
-    every = slice(None, None, max(1, len(target) // COUPLING_ROWS))
+    coupling_rows = 3000  # of the rows that couplings are sought in, about
+    every = slice(None, None, max(1, len(target) // coupling_rows))
     return matrix[every], target[every], [series[every].T for series in motion]
 
 

@@ -37,16 +37,7 @@ from calib.identification.rows import segments
 COARSE, FINE = (10.0, 40.0), (10.0, 20.0, 30.0, 45.0, 65.0)  # nodes of the gains [Hz]
 MIN_ORDER, MAX_ORDER = 16, 800  # orders per turn
 TURNS = range(16, 321)  # motor turns per turn that a family may have
-MIN_COHERENCE = 0.6  # of a gear's own best coherence: a number of turns of other gears takes its place (our choice)
-SPEED_BINS = 4  # of the speed, per direction
 RIDGES = (0.03, 0.1, 0.3, 1.0)  # of the mean information of a column
-MIN_TRAVEL = 0.1  # [rad] that a joint must travel
-MIN_GAIN = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
-MIN_TOTAL_GAIN = 0.03  # in all: 1.5 % of its rms
-MIN_FREE_GAIN = 0.04  # and where no family pays: 2 % of its rms (our choices)
-MAX_FREE_SETS = 3  # of free orders, at most
-MAX_SAMPLES = 4_000  # of the search
-SKIPPED_START = 0.5  # [s] left out at the beginning, where robots start
 
 Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
 
@@ -107,14 +98,16 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
     Args:
         residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
     """
-    step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
+    max_samples = 4_000  # of the search
+    step = max(1, sum(len(case.motion) for case in cases) // max_samples)
     used = np.concatenate([case.motion.weight[::step] > 0.5 for case in cases])
     block = np.where(used, np.concatenate([own[::step] for own in _blocks(cases)]), -1)
     kept = block >= 0
     if len(np.unique(block[kept])) < 2:
         return []
     q, v = (np.concatenate([getattr(case.motion, name)[::step] for case in cases])[kept] for name in ("q", "v"))
-    moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= MIN_TRAVEL))
+    min_travel = 0.1  # [rad] that a joint must travel
+    moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= min_travel))
     if not moving:
         return []
     track = GearTravel(q, v, block[kept], moving)
@@ -137,8 +130,9 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     every = sum(score / max(float(score.max()), 1e-300) for score in scores.values())
     found = {j: int(np.argmax(score)) for j, score in scores.items()}
     offered = sorted({*found.values(), int(np.argmax(every))}, key=lambda k: -float(np.asarray(every)[k]))
+    min_coherence = 0.6  # of a gear's own best coherence: a number of turns of other gears takes its place (our choice)
     return {
-        j: TURNS[next((k for k in offered if scores[j][k] >= MIN_COHERENCE * scores[j][own]), own)]
+        j: TURNS[next((k for k in offered if scores[j][k] >= min_coherence * scores[j][own]), own)]
         for j, own in found.items()
     }
 
@@ -156,9 +150,12 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
     sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
     offers = [tuple((j, order) for order in one) for j in sources for one in _family(turns[j])]
-    taken, best, ridge = _climb(bench, lambda rest: offers, MIN_GAIN)
+    min_gain = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
+    taken, best, ridge = _climb(bench, lambda rest: offers, min_gain)
+    max_free_sets = 3  # of free orders, at most
+    min_free_gain = 0.04  # and where no family pays: 2 % of its rms (our choices)
     if not taken:
-        taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), MIN_FREE_GAIN, MAX_FREE_SETS)
+        taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), min_free_gain, max_free_sets)
     if not taken:
         return None
     nodes = COARSE
@@ -250,7 +247,8 @@ def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarra
     """Return S(k) of all whole orders k of a gear from 0 on, (cells / 2 + 1,); see the module."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
-    edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
+    speed_bins = 4  # of the speed, per direction
+    edges = np.quantile(speed, np.linspace(0.1, 1.0, speed_bins + 1))[:-1]
     bins = np.searchsorted(edges, speed, side="right") * np.where(v > 0.0, 1, -1)
     cells = 8192  # of a turn, for the search
     cell = np.floor(q / (2.0 * np.pi) * cells).astype(int) % cells
@@ -287,7 +285,8 @@ def _climb(
             break
         taken, best, ridge = waves, share, level
         rest = bench.fit(taken, COARSE, ridge)[0]
-    return (taken, best, ridge) if best >= MIN_TOTAL_GAIN else ((), 0.0, ridge)
+    min_total_gain = 0.03  # in all: 1.5 % of its rms
+    return (taken, best, ridge) if best >= min_total_gain else ((), 0.0, ridge)
 
 
 def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
@@ -306,13 +305,16 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
     return residual - np.concatenate(slow)
 
 
-def _blocks(cases: Sequence[Case], blocks: int = 8) -> list[np.ndarray]:
-    """Number contiguous blocks of all cases, about `blocks` in all; -1 at the start of a recording."""
+def _blocks(cases: Sequence[Case], blocks: int = 8, skipped_start: float = 0.5) -> list[np.ndarray]:
+    """Number contiguous blocks of all cases, about `blocks` in all; -1 at the start of a recording.
+
+    `skipped_start`: [s] left out at the beginning, where robots start.
+    """
     sizes = [len(case.motion) for case in cases]
     own = [max(1 if len(cases) > 1 else 2, round(blocks * size / sum(sizes))) for size in sizes]
     numbers, first = [], 0
     for case, size, count in zip(cases, sizes, own):
         number = first + np.arange(size) * count // size
-        numbers.append(np.where(case.motion.t < SKIPPED_START, -1, number))
+        numbers.append(np.where(case.motion.t < skipped_start, -1, number))
         first += count
     return numbers

@@ -13,8 +13,6 @@ from calib.estimation.triangles import Triangles
 from calib.identification.left_out.regimes import Regimes
 from calib.identification.rows import pool
 
-MAX_DEVIATION_RATIO = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
-
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
@@ -156,12 +154,13 @@ def _drawn(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) 
 
     A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters
     of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
-    down) has a prior deviation of `MAX_DEVIATION_RATIO` times that of the best shown at most, not one without end.
+    down) has a prior deviation of `max_deviation_ratio` times that of the best shown at most, not one without end.
     """
     size = np.sqrt(np.diag(square)[:-1])
     seen = np.zeros(kinds.max(initial=-1) + 2)  # the last for -1
     np.maximum.at(seen, kinds, size)
-    size = np.where(group < 0, size, np.maximum(size, seen[kinds] / MAX_DEVIATION_RATIO))
+    max_deviation_ratio = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
+    size = np.where(group < 0, size, np.maximum(size, seen[kinds] / max_deviation_ratio))
     scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero

@@ -45,10 +45,6 @@ from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward, replayed_error
 
 FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
-MAX_SECONDS = 20.0  # [s] of a recording that are replayed
-MIN_EIGENVALUE = 0.05  # least eigenvalue of a possible robot's inertia, scaled by its diagonal
-MIN_SMOOTHING = 0.25  # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MIN_EIGENVALUE` is 0.11
-MIN_INERTIA = 1e-3  # [kg m² or kg] least inertia of a joint
 FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
 
 
@@ -125,10 +121,13 @@ def replay(
     return Replay(case.name, seconds, control, controller is not None, left_out, added, rms)
 
 
-def _stretch(case: Case) -> slice:
-    """Return the longest part without gaps, cut to `MAX_SECONDS`."""
+def _stretch(case: Case, max_seconds: float = 20.0) -> slice:
+    """Return the longest part without gaps, cut to `max_seconds`.
+
+    `max_seconds`: [s] of a recording that are replayed.
+    """
     first, last = max(segments(case.motion.segment), key=lambda ends: ends[1] - ends[0])
-    return slice(first, min(last, first + int(MAX_SECONDS * case.motion.rate)))
+    return slice(first, min(last, first + int(max_seconds * case.motion.rate)))
 
 
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
@@ -153,17 +152,20 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
     return Reference(place / motion.rate, *series), every
 
 
-def _possible(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
+def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) -> tuple[Plant, np.ndarray]:
     """Return the robot with as much inertia (n,) of its motors added as makes it possible, and that.
 
-    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `MIN_EIGENVALUE`.
+    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `min_eigenvalue`.
+
+    `min_eigenvalue`: least eigenvalue of a possible robot's inertia, scaled by its diagonal.
     """
     bodies, first = robot.bodies, robot.inertial
     inertia = mass_matrix(bodies, robot.parameters[:first], np.ascontiguousarray(reference.q[::50]))
     inertia = inertia + added_inertia(robot.terms, robot.parameters[first:], bodies.n)
-    size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), MIN_INERTIA)
+    min_inertia = 1e-3  # [kg m² or kg] least inertia of a joint
+    size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), min_inertia)
     least = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
-    added = max(0.0, MIN_EIGENVALUE - least) * size
+    added = max(0.0, min_eigenvalue - least) * size
     softer = tuple(_softer(one, value, size, reference) for one, value in zip(robot.terms, robot.parameters[first:]))
     robot = replace(robot, terms=softer)
     if not added.any():
@@ -176,7 +178,9 @@ def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference
     """Return a term whose sign the simulator can integrate at this control period."""
     if "v0" not in one.form.settings:
         return one
-    least = MIN_SMOOTHING * abs(value) * reference.period / size[one.acts[0][0]]
+    # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `min_eigenvalue` is 0.11
+    min_smoothing = 0.25
+    least = min_smoothing * abs(value) * reference.period / size[one.acts[0][0]]
     return replace(one, settings=(*one.settings[:-1], max(one.settings[-1], least)))
 
 

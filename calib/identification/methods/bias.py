@@ -13,10 +13,7 @@ from calib.identification.methods.method import IdentificationProblem, MethodEst
 from calib.identification.methods.simulated import IV
 from calib.identification.settings import IdentificationSettings
 
-FOLLOWS = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
-BLUR = 3.0  # widths of the smoothed sign that the noise of the velocity may have (our choice)
 MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
-NEGLIGIBLE = 1.0  # standard deviations of a shift that is not worth a word (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +106,9 @@ def _weakness(found: Instrumental) -> list[str]:
     ]
 
 
-def _distance(found: Instrumental) -> list[str]:
-    far = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < FOLLOWS]
+def _distance(found: Instrumental, max_miss: float = 10.0) -> list[str]:
+    # max_miss: [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
+    far = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < max_miss]
     if not far:
         return []
     return [
@@ -130,12 +128,15 @@ def _gains(found: Instrumental) -> list[str]:
     ]
 
 
-def _words(found: Instrumental) -> list[str]:
-    """Say what the test means; nothing of a loop that explains less than the model does, or of a bias too small."""
+def _words(found: Instrumental, max_shift: float = 1.0) -> list[str]:
+    """Say what the test means; nothing of a loop that explains less than the model does, or of a bias too small.
+
+    `max_shift`: standard deviations of a shift that is not worth a word (our choice).
+    """
     if not found.verdict.biased() or not found.valid or not found.explains:
         return []
     shift = found.shift
-    if shift.max() < NEGLIGIBLE:
+    if shift.max() < max_shift:
         return []
     worst = np.argsort(-shift)[:5]
     named = ", ".join(f"{found.names[k]} by {shift[k]:.2g} sigma" for k in worst)
@@ -145,14 +146,17 @@ def _words(found: Instrumental) -> list[str]:
     return [f"least squares is biased (Durbin, Wu, Hausman: {p}), off {named}: method 'iv' is not"]
 
 
-def _blurred(test: LoopTest) -> list[str]:
-    """Say where W is no longer its true value plus noise, which instruments take for granted."""
+def _blurred(test: LoopTest, max_blur: float = 3.0) -> list[str]:
+    """Say where W is no longer its true value plus noise, which instruments take for granted.
+
+    `max_blur`: widths of the smoothed sign that the noise of the velocity may have (our choice).
+    """
     if test.found is None or test.loops is None:
         return []
     case = test.loops.pairs[0][0]
     noise = case.motion.velocity_noise()
     widths = {one.acts[0][0]: one.settings[-1] for one in test.found.plant.terms if one.shape == "sign"}
-    wide = [f"{noise[j] / width:.2g} at joint {j + 1}" for j, width in widths.items() if noise[j] > BLUR * width]
+    wide = [f"{noise[j] / width:.2g} at joint {j + 1}" for j, width in widths.items() if noise[j] > max_blur * width]
     if not wide or not test.found.estimator.measured:
         return []
     return [

@@ -40,10 +40,7 @@ from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
-MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
 MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
-MAX_LOOP_ERROR = 2.0  # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
-MAX_RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
 @dataclass(frozen=True)
@@ -155,7 +152,9 @@ class Instrumental:
     @property
     def explains(self) -> bool:
         """Whether the simulated loop explains the recording as well as the model does its measured motion."""
-        return not len(self.off) and bool(np.all(self.direct < MAX_LOOP_ERROR * self.own))
+        # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
+        max_loop_error = 2.0
+        return not len(self.off) and bool(np.all(self.direct < max_loop_error * self.own))
 
     @property
     def shift(self) -> np.ndarray:
@@ -321,7 +320,9 @@ def _with_signs(
     motion, band = case.motion, 0.5 * case.motion.band
     measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
-    followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
+    # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
+    max_following = 1.25
+    followed = away <= max_following * motion.velocity_noise(band)
     if not followed.all():
         speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
         seen = observe(task.model, columns[drowned], replace(case, motion=replace(motion, v=speed)), task.decimator)
@@ -397,7 +398,8 @@ def _simulate_new(
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
     retreats = 0
-    while retreats < MAX_RETREATS:
+    max_retreats = 6  # halvings of a step to parameters that cannot be simulated
+    while retreats < max_retreats:
         share, new = 0.5**retreats, task.plant(old, found)
         tried = new.with_parameters(share * new.parameters + (1.0 - share) * old.parameters)
         try:

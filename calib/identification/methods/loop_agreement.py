@@ -17,8 +17,6 @@ from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, MethodEstimate
 
 SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choice)
-MAX_BESIDE_INSTRUMENTS = 1.2  # times the torque that instruments leave unexplained (our choice)
-MAX_BESIDE_WLS = 2.0  # the same beside least squares, of which it is the least that there is (our choice)
 
 
 @dataclass(frozen=True)
@@ -52,14 +50,16 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
     if not (found.found and found.alone and found.loops is not None):
         return None
     own, instruments = found.estimate, test.found
+    max_beside_instruments = 1.2  # times the torque that instruments leave unexplained (our choice)
+    max_beside_wls = 2.0  # the same beside least squares, of which it is the least that there is (our choice)
     if instruments is not None and instruments.valid and len(instruments.names) == len(own.values):
-        name, other, limit = instruments.estimator.name, instruments.fit.estimate, MAX_BESIDE_INSTRUMENTS
+        name, other, limit = instruments.estimator.name, instruments.fit.estimate, max_beside_instruments
         left, beside = (instruments.simulated_error(x.values) for x in (own, other))
     else:
         plain = WLS.estimate(problem)
         if not plain.found:
             return None
-        name, other, limit = "wls", plain.estimate, MAX_BESIDE_WLS
+        name, other, limit = "wls", plain.estimate, max_beside_wls
         size = np.maximum(problem.pooled.residual_squares(np.zeros(len(own.values))), 1e-300)
         left, beside = (100.0 * np.sqrt(problem.pooled.residual_squares(x.values) / size) for x in (own, other))
     away = np.abs(own.values - other.values) / np.maximum(np.hypot(own.sigma, other.sigma), 1e-300)

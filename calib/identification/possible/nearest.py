@@ -20,8 +20,6 @@ from calib.estimation.triangles import retriangulate
 from calib.identification.possible.information import Information
 from calib.identification.possible.problem import DRIVE, BodyCost
 
-MAX_TRACE = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
-
 
 def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> np.ndarray:
     """Return the standard parameters (p,) of the possible robot nearest to the data.
@@ -44,9 +42,10 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     goal = goal / max(1.0, float(np.linalg.norm(goal[:, -1])))
     bodies = pseudo_inertia.unknown_bodies(count, len(problem.sizes))
     positive = [k for k in np.flatnonzero(problem.positive) if count + k != spared]
-    rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * MAX_TRACE), np.eye(len(matrix))[10 * count :][positive]])
+    max_trace = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
+    rows = np.vstack([-np.einsum("irrj->ij", bodies) / (4.0 * max_trace), np.eye(len(matrix))[10 * count :][positive]])
     offset = np.repeat([1.0, 0.0], [count, len(positive)])
-    least = np.where(np.arange(count) == spared, -4.0 * MAX_TRACE, 0.0)
+    least = np.where(np.arange(count) == spared, -4.0 * max_trace, 0.0)
     result = matrix @ minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, least).values
     result[10 * count :] += given
     return np.asarray(result)

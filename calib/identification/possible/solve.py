@@ -19,7 +19,7 @@ degrees of freedom (our observation), so γ has a marginal likelihood,
 
 Laplace's approximation, J the cost and H its curvature at the optimum: the weight is where that is largest (our choice;
 blocks of one poor motion repeat each other, so that cross-validation on them wants no prior at all). γ is not let below
-`MIN_CAD_WEIGHT`, where masses may be wrong by √(2/γ), a third (10 for rods, below which Laplace's approximation fails):
+`min_cad_weight`, where masses may be wrong by √(2/γ), a third (10 for rods, below which Laplace's approximation fails):
 what no model explains must not pass for a wrong CAD. Only where a possible robot is within the estimate's covariance
 and the result is not, γ is lowered until it is.
 
@@ -51,7 +51,6 @@ from calib.identification.possible.prior_bodies import PriorBodies, find_prior_b
 from calib.identification.possible.problem import DRIVE, BodyCost, make_problem
 from calib.identification.prediction import Dynamics
 
-MIN_CAD_WEIGHT = 20.0  # of γ with a CAD
 WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
 PRIORS = ("entropic", "euclidean")
 RIDGES = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)  # of a unit diagonal
@@ -161,7 +160,8 @@ def _candidates(
 ) -> Iterator[tuple[float, float, BodyCost, np.ndarray, PriorBodies]]:
     """Yield the optimum of each weight with its evidence, the data's sigmas widened by `doubt`."""
     doubted = replace(problem, factor=problem.factor / doubt)
-    usual = [g for g in WEIGHTS if g >= MIN_CAD_WEIGHT] if references.cad else WEIGHTS[4::3]
+    min_cad_weight = 20.0  # of γ with a CAD
+    usual = [g for g in WEIGHTS if g >= min_cad_weight] if references.cad else WEIGHTS[4::3]
     for gamma in usual if weight is None else [weight]:
         values = solve(doubted, gamma)
         yield _evidence(doubted, gamma, values), gamma, doubted, values, references

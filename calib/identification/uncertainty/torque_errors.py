@@ -45,12 +45,9 @@ every motion (97.8 %).
 """
 BORROWED = 4.0  # blocks' worth of what all joints say together of one's errors (our choice)
 CHANCES = (np.arange(41) + 0.5) / 41
-MAX_SAMPLES = 5000  # samples of a recording that intervals are evaluated at
 SAME_STATE, MIN_REPEATED, FINER_BY = 0.05, 0.5, 8  # of states' spread; share of states met; samples per thinned one
-MAX_OUTSIDE = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
 DOUBLING, PRIOR = 2.0, 0.02
 """The log(1 + d²) at which errors have twice their variance before any data; as share of all rows (our choice)."""
-ERRORS_USED = 4000  # errors of a joint that its weights are found from, about
 MAX_ERROR, MIN_ERROR = 5.0, 1e-9  # sigmas that an error counts as; of a joint's error, below which it has none
 WAYS = ("outside the range of joint", "faster than in training at joint", "accelerating more than in training at joint")
 
@@ -81,7 +78,8 @@ class TorqueDiscrepancy:
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return by which of q, v, a and at which joint (3, N, n) states leave the training range."""
-        return self._outside(q, v, a) > MAX_OUTSIDE * (np.array(self.upper) - np.array(self.lower))[:, None]
+        max_outside = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
+        return self._outside(q, v, a) > max_outside * (np.array(self.upper) - np.array(self.lower))[:, None]
 
     def _outside(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         states = np.stack([q, v, a])
@@ -185,7 +183,8 @@ class TorqueIntervals:
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
     """Return what a model expects of its errors on a recording, beside those of its prediction (N, rows)."""
     motion = case.motion
-    index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), MAX_SAMPLES)).astype(int))
+    max_samples = 5000  # samples of a recording that intervals are evaluated at
+    index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), max_samples)).astype(int))
     q, v, a = (np.asarray(x[index]) for x in (motion.q, motion.v, motion.a))
     states = segmented_states(dynamics.model.columns, case)[:, index]
     sigma = errors.sigma(dynamics, q, v, a, case.carried, states)
@@ -339,7 +338,7 @@ def _left_out(
     return error.clip(-size, size), np.stack([own, np.ones_like(own), far], axis=2)
 
 
-def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int) -> np.ndarray:
+def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors_used: int = 4000) -> np.ndarray:
     """Return weights (rows, 3) of what errors may grow by, each torque row's regularised towards those of all.
 
     In units of a row's own mean square every row's κ, and its u over v, are of one kind. Behind a row's errors stand
@@ -349,9 +348,11 @@ def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int) -> np.
     Args:
         folds: errors (m, rows) and shapes (m, rows, 3) of each.
         blocks: of time.
+
+    `errors_used`: errors of a joint that its weights are found from, about.
     """
     errors, shapes = (np.concatenate(each) for each in zip(*folds))
-    every = max(1, len(errors) // ERRORS_USED)
+    every = max(1, len(errors) // errors_used)
     squares, shapes = errors[::every].T ** 2, shapes[::every].transpose(1, 0, 2).copy()
     size = np.maximum(squares.mean(axis=1), 1e-300)
     squares = np.maximum(squares / size[:, None], MIN_ERROR**2)

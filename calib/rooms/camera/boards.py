@@ -19,7 +19,6 @@ from calib.rooms.camera.image_folders import find_corners, joint_table, problem_
 
 Show = Callable[[str], None]
 USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
-MIN_SQUARE = 1.0  # side of a square [mm]
 
 
 def make(
@@ -44,7 +43,8 @@ def make(
     require(kind in KINDS, f"--kind {kind}: expected one of {', '.join(KINDS)}", UsageError)
     if paper is not None and paper.lower() not in board_print.PAPERS:
         raise UsageError(f"--paper {paper}: expected one of {', '.join(board_print.PAPERS)}")
-    if square < MIN_SQUARE:
+    min_square = 1.0  # side of a square [mm]
+    if square < min_square:
         raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
     usual, share, across = USUAL[kind]
     with refused_as(UsageError, ValueError, "this board cannot be: {}"):

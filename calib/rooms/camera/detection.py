@@ -1,8 +1,8 @@
 """Corners of a board in an image, sub-pixel, each with a standard deviation; and why an image is of no use.
 
-Markers are found in an image of some `COARSE` pixels; corners are then refined in the full one by the orthogonality of
-gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standard deviation is the Cramér–Rao bound of its
-patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, and a floor.
+Markers are found in an image of some `max_pixels` pixels; corners are then refined in the full one by the orthogonality
+of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standard deviation is the Cramér–Rao bound of
+its patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, and a floor.
 """
 
 from __future__ import annotations
@@ -21,15 +21,11 @@ from calib.rooms.camera.board_print import charuco, dictionary
 from calib.rooms.camera.corner_file import Detection, Found
 from calib.rooms.camera.images import quiet, read_image
 
-LOOKED_INTO = 3  # useless images that are looked into for the reason, unless it is found
-
-COARSE = 1.5e6  # pixels of the image that markers are sought in (our choice, as the next ones)
 MIN_CORNERS = 8  # corners that make an image useful
 MIN_MARKERS = 4  # markers that tell a dictionary
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}  # of a corner's sigma [px]; tags' wander with blur
 BLURRED = 7.0  # width of an edge from which on an image is refused [px]
 MOVED = 1.8  # ratio of the widths of edges across and along from which on blur is motion
-HALF = 9  # half width of the patches that quality is measured in [px]
 
 
 def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
@@ -41,7 +37,8 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
         thorough: where nothing is found, look for other boards and mirrored ones, to say so.
     """
     table = corners(board)
-    factor = min(1.0, np.sqrt(COARSE / image.size))
+    max_pixels = 1.5e6  # pixels of the image that markers are sought in (our choice)
+    factor = min(1.0, np.sqrt(max_pixels / image.size))
     coarse = image if factor == 1.0 else cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     scale = np.array(image.shape[::-1]) / np.array(coarse.shape[::-1])
     ids, found = _coarse(coarse, board)
@@ -137,7 +134,8 @@ def _refined(
 
 def _quality(image: np.ndarray, found: np.ndarray, floor: float, spacing: float) -> tuple[np.ndarray, float, float]:
     """Return each corner's sigma (n,) [px], the median width of edges [px], and how much wider they are one way."""
-    half = int(np.clip(0.15 * spacing, 3, HALF))
+    max_half_width = 9  # half width of the patches that quality is measured in [px]
+    half = int(np.clip(0.15 * spacing, 3, max_half_width))
     offsets = np.arange(-half, half + 1)
     middle = np.round(found).astype(int)
     rows = np.clip(middle[:, 1, None] + offsets, 0, image.shape[0] - 1)
@@ -226,6 +224,7 @@ def detected(
     """
     result, sizes, useless = dict[str, Detection](), dict[str, tuple[int, int]](), 0
     blank = np.full((len(corners(board)), 2), np.nan)
+    max_examined = 3  # useless images that are looked into for the reason, unless it is found
     for number, (name, each) in enumerate(images):
         if progress:
             progress(number, count, name)
@@ -235,7 +234,7 @@ def detected(
             result[name] = Detection(blank, blank[:, 0], str(error).removeprefix(f"{each}: "))
             continue
         sizes[name] = image.shape[1], image.shape[0]
-        result[name] = detect(image, board, thorough=useless < LOOKED_INTO)
+        result[name] = detect(image, board, thorough=useless < max_examined)
         useless += result[name].problem.startswith("no board found")
     if not sizes:
         return Found(result)

@@ -1,10 +1,9 @@
 """Images of a board from ROS 1 and 2 bags and MCAP: sensor_msgs/Image and CompressedImage beside JointState.
 
 Every image takes the joint values at its own stamp, between the joint states before and after it. An image during which
-a joint moved faster than `MAX_JOINT_SPEED` is left out: its joint values are not those of its exposure. Of images
-taken at one
-stop of the arm the first `SAME` are kept. What is kept is written as a folder (``calib images BAG --board board.toml
---out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
+a joint moved faster than `max_joint_speed` is left out: its joint values are not those of its exposure. Of images taken
+at one stop of the arm the first `max_per_stop` are kept. What is kept is written as a folder (``calib images BAG
+--board board.toml --out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
 """
 
 from __future__ import annotations
@@ -27,11 +26,7 @@ from calib.rooms.camera.detection import detected
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 JOINT = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
-MAX_JOINT_SPEED = 2e-3  # of a joint about an image [rad/s or m/s]; this and the next two: our choice
 Say = Callable[[int, str], None]
-APART = 1e-3  # joints of one stop differ by less [rad or m]
-SAME = 3  # images of one stop that are kept
-LATE = 0.1  # an image further from the nearest joint state has none [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,22 +164,26 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
     gap = np.maximum(stamps[after] - stamps[before], 1)
     share = np.clip((images - stamps[before]) / gap, 0.0, 1.0)[:, None]
     own = q[before] * (1.0 - share) + q[after] * share
-    near = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < LATE * 1e9
+    max_delay = 0.1  # an image further from the nearest joint state has none [s]
+    near = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < max_delay * 1e9
     speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
-    still = speed < MAX_JOINT_SPEED
+    max_joint_speed = 2e-3  # of a joint about an image [rad/s or m/s]; our choice
+    still = speed < max_joint_speed
     if not near.all():
-        notes.append(f"{int((~near).sum())} images have no joint state within {LATE:g} s (do the clocks agree?)")
+        notes.append(f"{int((~near).sum())} images have no joint state within {max_delay:g} s (do the clocks agree?)")
     if moving := int((near & ~still).sum()):
         notes.append(
-            f"{moving} images were taken while the arm moved (faster than {1e3 * MAX_JOINT_SPEED:g} mrad/s): left out"
+            f"{moving} images were taken while the arm moved (faster than {1e3 * max_joint_speed:g} mrad/s): left out"
         )
     kept, stop = [], 0
+    max_apart = 1e-3  # joints of one stop differ by less [rad or m]
+    max_per_stop = 3  # images of one stop that are kept
     for k in np.flatnonzero(near & still):
-        stop = stop + 1 if kept and np.abs(own[k] - own[kept[-1]]).max() < APART else 1
-        if stop <= SAME:
+        stop = stop + 1 if kept and np.abs(own[k] - own[kept[-1]]).max() < max_apart else 1
+        if stop <= max_per_stop:
             kept.append(int(k))
     if more := int((near & still).sum()) - len(kept):
-        notes.append(f"{more} more images of the same stops were left out ({SAME} of each are kept)")
+        notes.append(f"{more} more images of the same stops were left out ({max_per_stop} of each are kept)")
     return np.array(kept, dtype=int), own[kept], notes
 
 

@@ -39,8 +39,6 @@ from calib.rooms.camera import corner_file
 from calib.rooms.camera.corner_file import Found
 from calib.words import counted, listing
 
-MIN_IMAGES = 3  # usable images below which a folder is refused
-
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]
 
@@ -137,8 +135,11 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     return found
 
 
-def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray, list[str]]:
-    """Return the rows (of the table) whose images are of use, and what is to be said of the others."""
+def _usable(names: Sequence[str], found: Found, path: Path, min_images: int = 3) -> tuple[np.ndarray, list[str]]:
+    """Return the rows (of the table) whose images are of use, and what is to be said of the others.
+
+    `min_images`: usable images below which a folder is refused.
+    """
     missing = [name for name in names if name not in found.images]
     problems = {name: found.images[name].problem for name in names if name in found.images}
     rows = np.array([k for k, name in enumerate(names) if problems.get(name) == ""], dtype=int)
@@ -148,11 +149,11 @@ def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray,
     if extra := sorted(set(found.images) - set(names)):
         notes.append(f"{len(extra)} images have no row in {JOINTS}: {listing(extra, 5)}")
     notes += problem_words(problems)
-    if len(rows) < MIN_IMAGES:
+    if len(rows) < min_images:
         why = "; ".join(notes) or "there are no more rows"
         raise MeasurementError(
             f"{counted(len(rows), 'usable image')}: a calibration takes some 20 to 40 from all "
-            f"around, {MIN_IMAGES} at the very least ({why})",
+            f"around, {min_images} at the very least ({why})",
             path,
         )
     return rows, notes

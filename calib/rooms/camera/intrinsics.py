@@ -18,15 +18,10 @@ from calib.errors import CalibError, refuse_data
 from calib.rooms.camera.board_pose import board_poses
 from calib.words import counted
 
-MAX_IMAGES = 30  # images that a first lens is found from (our choice)
-MIN_IMAGES = 4
 STARTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5, 2.2, 3.2)  # focal lengths tried first, in widths of the image (our choice)
-TRIED = 8  # images that they are tried on (our choice)
 FITTED = 8  # of a lens's values: focal lengths, principal point, four of distortion
-STEPS = 60
 BENT = 0.5  # reprojection error from which on the other model is tried [px], and share of it that makes it the better
 WRONG = 50.0  # reprojection error of no lens [px]
-MAX_FOCAL_SIGMA = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +55,15 @@ def estimate_lens(
         MeasurementError: too few images, or all from one direction, so that the focal length cannot be determined.
     """
     good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
-    if len(good) < MIN_IMAGES:
+    min_images = 4
+    if len(good) < min_images:
         refuse_data(
             file,
-            f"{counted(len(good), 'image')} with a board: a lens takes {MIN_IMAGES} at least, tilted "
+            f"{counted(len(good), 'image')} with a board: a lens takes {min_images} at least, tilted "
             "differently, and a good one 15; take more, or give the lens (camera.yaml)",
         )
-    good = good[np.unique(np.linspace(0, len(good) - 1, MAX_IMAGES).astype(int))]
+    max_images = 30  # images that a first lens is found from (our choice)
+    good = good[np.unique(np.linspace(0, len(good) - 1, max_images).astype(int))]
     own = pixel[good]
     found, rms, matrix = _fitted(board, own, size, model)
     if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:
@@ -82,7 +79,8 @@ def estimate_lens(
             "one camera, at one focus, of this board?",
         )
     loose = _focal_sigma(found, matrix, rms)
-    if not loose < MAX_FOCAL_SIGMA:
+    max_focal_sigma = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
+    if not loose < max_focal_sigma:
         told = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
         refuse_data(
             file,
@@ -97,12 +95,14 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
     """Return the best lens, its reprojection error per coordinate [px], and ∂residual/∂values beside free poses."""
     middle, zero = 0.5 * (np.array(size) - 1.0), np.zeros({"pinhole": 5, "fisheye": 4}[model])
     starts = [Lens(model, np.array([f * max(size), f * max(size), *middle, *zero]), size) for f in STARTS]
+    max_tried = 8  # images that they are tried on (our choice)
     lens = min(
-        starts, key=lambda each: float(np.nanmean(np.minimum(board_poses(each, board, pixel[:TRIED]).rms, WRONG)))
+        starts, key=lambda each: float(np.nanmean(np.minimum(board_poses(each, board, pixel[:max_tried]).rms, WRONG)))
     )
     rows, damping = _beside_poses(lens, board, pixel), 1e-3
     cost = _squares(rows)
-    for _ in range(STEPS):
+    max_steps = 60
+    for _ in range(max_steps):
         matrix, residual = rows[:, :FITTED], rows[:, FITTED]
         length = np.linalg.norm(matrix, axis=0) + 1e-300
         padded = np.concatenate([matrix / length, np.sqrt(damping) * np.eye(FITTED)])

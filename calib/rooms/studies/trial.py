@@ -21,7 +21,6 @@ from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 FOUND = EstimateStatus.FOUND.value
 NOT_RECORDED, FAILED = "not recorded", "failed"  # beside `EstimateStatus`: the true robot, or the method, raised
 STATUSES = (*(one.value for one in EstimateStatus), NOT_RECORDED, FAILED)
-NORMAL_95 = 1.959963984540054  # standard deviations that hold 95 %
 NAN = float("nan")
 _CHANGED = " method "
 
@@ -146,11 +145,12 @@ def _merit(data: Experiment, found: MethodEstimate, values: np.ndarray) -> dict[
     sigma = np.asarray(found.estimate.sigma)[: len(values)]
     stated = bool(np.isfinite(sigma).all() and (sigma > 0.0).any())
     away = np.abs(error[sigma > 0.0] / sigma[sigma > 0.0]) if stated else np.full(1, NAN)
+    normal_95 = 1.959963984540054  # standard deviations that hold 95 %
     return {
         "beta_error": _percent(error, truth),
         "beta_distance": float(200.0 * np.mean(np.abs(error) / np.maximum(np.abs(values) + np.abs(truth), 1e-300))),
         "beta_sigma": float(np.sqrt(np.mean(away**2))),
-        "coverage": float(100.0 * np.mean(away < NORMAL_95)) if stated else NAN,
+        "coverage": float(100.0 * np.mean(away < normal_95)) if stated else NAN,
         "torque_error": _percent(wrong, data.torque),
         "torque_worst": float(max(_percent(own, true) for own, true in zip(wrong.T, data.torque.T))),
         "survey_tau": _survey_tau(data, values),

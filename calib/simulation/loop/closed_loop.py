@@ -25,7 +25,6 @@ from calib.simulation.loop.references import Reference
 _TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
-RAMP = 0.1  # of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated
 LOWER = (
     "these gains do not hold this robot at this rate; lower kp and kd (are they in the unit of the torque?), or the "
     "delay"
@@ -263,8 +262,11 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     return result
 
 
-def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.ndarray, list]:
-    """Return linear (n, 2 n + 1) and the acts: row, code, amount, seven settings, weights (n,)."""
+def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
+    """Return linear (n, 2 n + 1) and the acts: row, code, amount, seven settings, weights (n,).
+
+    `ramp`: of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated.
+    """
     from calib.dynamics import shape_kernels
 
     linear, acts = np.zeros((n, 2 * n + 1)), []
@@ -277,7 +279,7 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
             for joint, weight in motion:
                 weights[joint] += weight
             if one.shape not in LINEAR:
-                settings = [*one.settings, RAMP * one.settings[0]] if one.shape == "dead" else [*one.settings]
+                settings = [*one.settings, ramp * one.settings[0]] if one.shape == "dead" else [*one.settings]
                 code = getattr(shape_kernels, one.shape.upper())
                 acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
             else:

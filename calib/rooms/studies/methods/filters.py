@@ -6,10 +6,10 @@
 so no controller is asked for. What the survey tunes by hand, the data determine, or it follows from the model (our
 choices):
 
-* noise of q: the level of each log's spectrum, the filtered log thinned to `FASTER` times its cut-off;
+* noise of q: the level of each log's spectrum, the filtered log thinned to `rate_factor` times its cut-off;
 * process noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹;
 * parameters have none: they are constants, and a filter that knows its other noise needs none to converge;
-* they start where `calib.rooms.studies.methods.believed` says, as uncertain as `START_SIGMAS` standard deviations of
+* they start where `calib.rooms.studies.methods.believed` says, as uncertain as `start_sigmas` standard deviations of
 least
   squares, or as far from it as they are: that is next to nothing compared with what a pass adds.
 
@@ -35,11 +35,7 @@ from calib.rooms.studies.methods.kalman import Belief, Filter, believe, correcte
 from calib.rooms.studies.methods.tangents import Stepper, stepper
 from calib.simulation.loop.closed_loop import forward_dynamics
 
-FASTER = 4.0  # times the positions' cut-off: rate of the filter, at least
-START_SIGMAS = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
 NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider ones are no robots
-MAX_STEP = 2.5e-3  # [s] of a step of the dynamics
-LOST = 30.0  # times the stated mean square: innovations of a filter that has lost the robot
 
 
 @dataclass(frozen=True)
@@ -69,14 +65,16 @@ class _KalmanFilter(Method):
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values, sigma = plain.estimate.values, plain.estimate.sigma
         start = start_of(problem, self.name, values, _inertia(problem), lambda x: _moves(robot, problem, x))
-        wide = np.maximum(START_SIGMAS * sigma, np.abs(start - values))
+        start_sigmas = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
+        wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques
         state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
                 state = _pass(state, case, slice(first, last), noise)
         innovation = float(np.mean(state.sizes)) if state.sizes else np.inf
-        if not np.isfinite(innovation) or innovation > LOST:
+        max_innovation = 30.0  # times the stated mean square: innovations of a filter that has lost the robot
+        if not np.isfinite(innovation) or innovation > max_innovation:
             raise Diverged(
                 f"{self.name} lost the robot: its innovations are {np.sqrt(innovation):.3g} times what it says",
                 state.mean,
@@ -122,13 +120,16 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
         forward_dynamics(robot.at(values, case), q, v, np.zeros_like(q))
 
 
-def _steps(case: Case, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield q (n,) as seen, and the mean torques (s, n) of s equal steps since the last one, of a segment."""
+def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield q (n,) as seen, and the mean torques (s, n) of s equal steps since the last one, of a segment.
+
+    `max_step`: [s] of a step of the dynamics.
+    """
     motion = case.motion
     thin = _thin(case)
     q, tau = motion.q[part], low_passed(case.target[part], motion)  # as the positions were: the same band on both sides
     whole = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
-    steps = max(1, int(np.ceil(thin / (motion.rate * MAX_STEP) - 1e-6)))
+    steps = max(1, int(np.ceil(thin / (motion.rate * max_step) - 1e-6)))
     place = np.arange(len(q), dtype=float)
     for k in range(thin, len(q), thin):
         ends = np.linspace(k - thin, k, steps + 1)
@@ -137,8 +138,9 @@ def _steps(case: Case, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield q[k], np.diff(sums, axis=0) * (steps / thin)
 
 
-def _thin(case: Case) -> int:
-    return max(1, int(case.motion.rate / (FASTER * float(case.motion.cutoff.max()))))
+def _thin(case: Case, rate_factor: float = 4.0) -> int:
+    # rate_factor: times the positions' cut-off: rate of the filter, at least
+    return max(1, int(case.motion.rate / (rate_factor * float(case.motion.cutoff.max()))))
 
 
 def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
