@@ -23,7 +23,8 @@ def test_effects_of_the_ladder_hold_no_more_than_a_third_of_the_gear_errors() ->
     q = random_joints(ARM, 2500, 3)
     torque = gravity_torques(ARM, q)
     moved = displacements(PositionErrors(gear=1e-3), ARM, q, torque, np.inf)[ARM.moving]
-    terms = [one for effect in EFFECTS for one in effect.terms(ARM, True) if one.basis != "lever" and one.order <= 6]
+    found = [one for terms_of in EFFECTS.values() for one in terms_of(ARM, True)]
+    terms = [one for one in found if one.basis != "lever" and one.order <= 6]
     known = np.vstack([np.ones(len(q)), evaluate(Deflection(tuple(dict.fromkeys(terms)), (), ARM), q, torque)])
     known = np.unique(np.round(known, 12), axis=0).T
     fitted = known @ np.linalg.lstsq(known, moved.T, rcond=None)[0]
