@@ -112,7 +112,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
 
 
 def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
-    """Refuse settings that a stage does not read, where they are not as usual.
+    """Refuse settings that a stage does not read, where they ask for something: neither as usual nor switched off.
 
     Args:
         settings, plain: dataclasses of one type: as given, and as usual.
@@ -124,6 +124,6 @@ def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: objec
     """
     for each in fields(settings):
         value = getattr(settings, each.name)
-        if each.name not in read and value != getattr(plain, each.name):
+        if each.name not in read and value is not False and value != getattr(plain, each.name):
             place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
             raise UsageError(f"{place}{each.name}{shown} is for serial arms yet, not for this kind of robot")

@@ -100,7 +100,21 @@ def test_fit_then_identify_on_the_calibrated_geometry(folder, tmp_path, capsys):
 @pytest.mark.slow
 def test_excite_writes_a_motion_within_the_limits(tmp_path):
     out = tmp_path / "motion"
-    words = ("--period", 1, "--harmonics", 3, "--starts", 1, "--evaluations", 8, "--drives", "Fv Fc", "--out", out)
+    words = (
+        "--period",
+        1,
+        "--harmonics",
+        3,
+        "--starts",
+        1,
+        "--evaluations",
+        8,
+        "--drives",
+        "Fv Fc",
+        "--no-outlook",
+        "--out",
+        out,
+    )
     assert calib("excite", "dualv", *words) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert max(metrics["peak_torque"]) < 127.0 and min(one["margin"] for one in metrics["margins"]) > -1e-9
