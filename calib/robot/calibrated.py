@@ -27,13 +27,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.arrays import frozen, shaped
 from calib.errors import RobotError, refuse_robot
 from calib.estimate_files import read_covariance, write_covariance
 from calib.robot import description
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection, Term
+from calib.robot.deflection import Deflection, Term, evaluate, extra_displacements
+from calib.robot.kinematics import forward, tip_jacobian
 from calib.robot.tables import check_keys, number, vector
 
 ROBOT, COVARIANCE = "robot.toml", "chain_covariance.csv"
@@ -111,6 +113,31 @@ class CalibratedChain:
     def moved(self) -> bool:
         """Whether calibration changed an element's value of a nominal arm that is known."""
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
+
+    def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> np.ndarray:
+        """Return the tip's poses (m, 4, 4) [m] in the base frame at joint values q (m, n) [rad or m].
+
+        With joint corrections the geometry is the one they belong to, and they act.
+
+        Args:
+            q: joint values, those of one pose (n,) as well.
+            torque: (m, n) gravity torques [N m]; only corrections by compliance need them.
+
+        Raises:
+            CalibError: for a shape that does not fit, and for compliances without `torque`.
+        """
+        values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
+        bases = evaluate(self.deflection, values, torque) if self.deflection.terms else None
+        return forward(self.complete, values, extra_displacements(self.complete, self.deflection, values, bases))
+
+    def jacobian(self, q: ArrayLike) -> np.ndarray:
+        """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n), without corrections.
+
+        Raises:
+            CalibError: for a shape that does not fit.
+        """
+        values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
+        return tip_jacobian(self.complete, values)
 
     def without_corrections(self) -> CalibratedChain:
         """Return the robot without its joint corrections, of which torques know nothing and which no URDF holds."""

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.arrays import frozen
 from calib.errors import MeasurementError, require
@@ -60,6 +61,29 @@ class PoseMeasurements:
                 continue
             require(len(value) == m, f"{name} has {len(value)} rows where q has {m}", MeasurementError, self.file)
             object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
+
+    @staticmethod
+    def of(
+        q: ArrayLike, position: ArrayLike, quaternion: ArrayLike | None = None, *,
+        joint_names: Sequence[str] = (), **more: Any,
+    ) -> Positions:  # fmt: skip
+        """Return arrays as measured positions, or, with `quaternion`, as measured poses.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            position: (m, 3) of the target in the instrument's frame [m].
+            quaternion: (m, 4) x y z w of unit norm.
+            joint_names: n names; q1 to qn by default.
+            more: other fields of `Positions` and `Poses`: ``sigma``, ``station``, ``tool_names`` ...
+
+        Raises:
+            MeasurementError: for arrays of other lengths than q.
+        """
+        values = np.atleast_2d(np.asarray(q, dtype=float))
+        names = tuple(joint_names) or tuple(f"q{j + 1}" for j in range(values.shape[1]))
+        if quaternion is None:
+            return Positions(values, names, np.asarray(position), **more)
+        return Poses(values, names, np.asarray(position), np.asarray(quaternion), **more)
 
     def __len__(self) -> int:
         return len(self.q)

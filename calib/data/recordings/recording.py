@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.arrays import frozen
 from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option
@@ -106,6 +108,30 @@ class Recording:
         for name in ("drive_gain", "effort_variance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @staticmethod
+    def of(
+        t: ArrayLike,
+        q: ArrayLike,
+        tau: ArrayLike,
+        *,
+        kind: str = "torque",
+        joint_names: Sequence[str] = (),
+        **more: Any,
+    ) -> Recording:
+        """Return arrays as a recording.
+
+        Args:
+            t: (N,) stamps [s]; q: (N, n) positions [rad or m]; tau: (N, n) torques [N m or N], or currents [A].
+            kind: what `tau` is, ``torque`` or ``current``.
+            joint_names: n names; q1 to qn by default.
+            more: other fields: ``v``, ``tau_link``, ``q_ref`` ...
+
+        Raises:
+            MeasurementError: for shapes that do not go together.
+        """
+        q = np.asarray(q, dtype=float)
+        return Recording(np.asarray(t), q, np.asarray(tau), kind, named(joint_names, q.shape[1]), **more)
 
     def __len__(self) -> int:
         return len(self.t)
