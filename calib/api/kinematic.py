@@ -357,7 +357,7 @@ def read_fitted(folder: str | Path) -> compensation.Fitted:
 @checked
 def compensate(
     fitted: GeometryFit | compensation.Fitted | str | Path,
-    targets: Targets | str | Path,
+    targets: Targets | str | Path | np.ndarray,
     *,
     frame: str = "base",
     tool: str = "flange",
@@ -371,7 +371,8 @@ def compensate(
 
     Args:
         fitted: a fit, the folder of one, or what was read of it.
-        targets: CSV file (``calib formats targets``) or targets in memory.
+        targets: CSV file (``calib formats targets``), targets in memory, or an array: poses (m, 4, 4) [m], or nominal
+            joint values (m, n) [rad or m].
         frame: what the targets are in: ``base`` of the calibrated robot, ``nominal``, or a station's name.
         tool: what stands there: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` [m, rad].
         dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only; None: as the targets say.
@@ -386,6 +387,9 @@ def compensate(
         with saved(fitted) as place:
             found = read_fitted(place)
     chain = found.nominal.chain
+    if isinstance(targets, np.ndarray):
+        poses = targets if targets.ndim == 3 else None
+        targets = Targets(targets) if poses is None else Targets(None, poses[:, :3, 3], poses[:, :3, :3])
     if not isinstance(targets, Targets):
         limits = (chain.lower, chain.upper)
         targets = read_targets(Path(targets), chain.joint_names, kinds=joint_kinds(chain), limits=limits)

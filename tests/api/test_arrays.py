@@ -20,6 +20,9 @@ def test_a_fit_of_arrays_brings_back_the_robot_that_made_them():
     assert isinstance(block, Poses) and type(PoseMeasurements.of(Q, pose[:, :3, 3])) is Positions
     fit = calib.fit_geometry(robot, block, calib.FitSettings(model="offsets"))
     np.testing.assert_allclose(fit.robot.forward(Q[0])[0, :3, 3], pose[0, :3, 3], atol=1e-6)
+    for targets in (Q[:3], pose[:3]):
+        found = calib.compensate(fit, targets, frame="nominal").q
+        np.testing.assert_allclose(robot.forward(found), pose[:3], atol=1e-5)
 
 
 def test_the_jacobian_is_the_slope_of_the_pose():
