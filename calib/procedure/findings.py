@@ -69,13 +69,6 @@ class Verdict:
         """Return the verdict of a model that cannot be exported, and `why`: a pass is one for prediction only."""
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}") if self.level == "pass" else self
 
-    def held_by(self, found: Iterable[Finding]) -> Verdict:
-        """Return the verdict, no better than the findings allow; the one that holds it comes first in its reason."""
-        worst = max(found, key=lambda one: RANKS.index(level_of(one)), default=None)
-        if worst is None or level_of(worst) in ("", "note") or LEVELS.index(level_of(worst)) < LEVELS.index(self.level):
-            return self
-        return Verdict(level_of(worst), f"{sentence(worst)}; {self.reason}", worst.code)
-
 
 UNJUDGED = Verdict("", "the session judges, by unseen rows: see verdict.json at its root")
 

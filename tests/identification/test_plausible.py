@@ -150,9 +150,9 @@ def test_one_joint_that_comes_late_is_no_clock_and_named() -> None:
 
 def test_a_finding_holds_the_verdict_until_it_is_accepted() -> None:
     wrong = finding("torques-against-masses", file="log", joints=["joint2"])
-    held = Verdict("pass", "5 %").held_by([wrong])
+    held = Verdict.of("5 %", [wrong])
     assert (held.level, held.code) == ("fail", wrong.code)
-    assert Verdict("pass", "5 %").held_by(settle([wrong], ("masses",))) == Verdict("pass", "5 %")
+    assert Verdict.of("5 %", settle([wrong], ("masses",))) == Verdict("pass", "5 %")
 
 
 def test_torques_beyond_all_limits_are_another_unit() -> None:
@@ -345,6 +345,6 @@ def test_a_description_that_cannot_be_allows_no_pass():
     bodies = np.array(chain.inertias)
     bodies[2, 9] = -1.0
     wrong = described(replace(chain, inertias=bodies))
-    assert Verdict("pass", "good").held_by(wrong).level == "marginal"
+    assert Verdict.of("good", wrong).level == "marginal"
     assert "a negative mass (M = -1 kg)" in wrong[0].values["bodies"][0]
-    assert Verdict("pass", "good").held_by(settle(wrong, ["description"])).level == "pass"
+    assert Verdict.of("good", settle(wrong, ["description"])).level == "pass"

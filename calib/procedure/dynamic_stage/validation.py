@@ -13,6 +13,7 @@ from os.path import realpath
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.errors import finding
 from calib.identification.cases import Case
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.friction.passivity import driven
@@ -33,10 +34,11 @@ from calib.procedure.dynamic_stage.tracking import Tracking, track
 from calib.procedure.dynamic_stage.verdict import (
     Resting,
     extrapolates,
+    friction_drives,
     judge,
+    too_narrow,
     warnings,
     with_duration,
-    with_intervals,
     with_prior,
 )
 from calib.procedure.findings import Verdict, lines_of, settle
@@ -158,9 +160,11 @@ def assess(
     signs = {case.name: signs_of(case, inputs.chain, settings.gravity) for case in (*inputs.cases, *inputs.unseen)}
     odd += plausibility.wrong_signs(signs, inputs.chain.joint_names)
     odd = settle(odd, inputs.options.accept)
-    verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
-    verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
-    verdict = with_duration(with_prior(verdict, findings.rests).held_by(odd), excitation)
+    figures, rules = judge(fit, proofs, repeated, excitation, labels)
+    if drives := friction_drives(joint + 1 for joint in wrong):
+        figures, rules = "", drives
+    rules += too_narrow({name: expected[name] for name in proofs if name in expected}, labels)
+    verdict = with_duration(with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), excitation)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (
@@ -170,7 +174,7 @@ def assess(
     verdict = _with_replays(verdict, tracking)
     verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}") if amperes else verdict
     said = (
-        *amperes, *lines_of(odd), *overlaps(inputs.cases, inputs.unseen),
+        *amperes, *lines_of([*odd, *rules]), *overlaps(inputs.cases, inputs.unseen),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
         *(line for name in validation if name in expected for line in extrapolates(name, expected[name])),
         *findings.notes,
@@ -184,5 +188,5 @@ def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
     """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
     if not any(one.inertia_added.any() for one in tracking.replays):
         return verdict
-    words = "its inertias are not physically consistent: predict torques with it, simulate the exported robot"
-    return replace(verdict, reason=f"{verdict.reason}; {words}")
+    (use,) = lines_of([finding("prediction-not-simulation")])
+    return replace(verdict, reason=f"{verdict.reason}; {use}")

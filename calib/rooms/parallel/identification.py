@@ -13,7 +13,7 @@ from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import UsageError
+from calib.errors import Finding, UsageError
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
@@ -27,6 +27,7 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
 from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, repeated_motion
 from calib.procedure.dynamic_stage.verdict import (
+    friction_drives,
     judge,
     motion_warnings,
     parameter_warnings,
@@ -34,7 +35,7 @@ from calib.procedure.dynamic_stage.verdict import (
     with_duration,
     with_prior,
 )
-from calib.procedure.findings import Verdict
+from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.robots import ParallelMechanism
@@ -116,28 +117,24 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
     excitation = {case.name: report_excitation(case.motion) for case in cases}
     proofs = {name: one for name, one in validation.items() if name not in repeated}
     validation |= {name: replace(one, evidence=name in proofs) for name, one in validation.items()}
+    verdict, rules = _judged(model, found, cases, fit, proofs, repeated, excitation)
     notes = (
-        *_contradictions(model, (*cases, *unseen)), *motion_warnings(validation, repeated, excitation),
-        *findings.notes, *_recording_notes(model, (*cases, *unseen)),
+        *lines_of(rules), *_contradictions(model, (*cases, *unseen)),
+        *motion_warnings(validation, repeated, excitation), *findings.notes, *_recording_notes(model, (*cases, *unseen)),
     )  # fmt: skip
-    verdict = _judged(model, found, cases, fit, proofs, repeated, excitation)
     return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, Tracking())
 
 
 def _judged(
     model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case], fit: Mapping[str, Score],
     proofs: Mapping[str, Score], repeated: Mapping[str, float], excitation: Mapping[str, ExcitationReport],
-) -> Verdict:  # fmt: skip
-    if driven := _driven_joints(model, found, cases):
-        return Verdict(
-            "fail",
-            f"friction drives joint {', '.join(driven)} instead of braking it, as in no robot: is a torque's sign "
-            "reversed, are columns swapped, is a payload on board that the options do not name?",
-        )
+) -> tuple[Verdict, list[Finding]]:  # fmt: skip
+    if drives := friction_drives(_driven_joints(model, found, cases), "a payload that the options do not name"):
+        return Verdict.of("", drives), drives
     labels = found.settings.torque_rows.titles(model.known.robot.joint_names)
     kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
-    verdict = judge(fit, proofs, repeated, excitation, (), labels, kind)
-    return with_duration(with_prior(verdict, resting_parameters(found)), excitation)
+    figures, rules = judge(fit, proofs, repeated, excitation, labels, kind)
+    return with_duration(with_prior(Verdict.of(figures, rules), resting_parameters(found)), excitation), rules
 
 
 def _driven_joints(

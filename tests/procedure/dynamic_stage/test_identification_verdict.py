@@ -34,7 +34,7 @@ def scored(joints, moving=None, total=5.0, share=1.0) -> Score:
 def judged(unseen: Score | None, own: Score | None = None) -> Verdict:
     motion = planted.case("train", 0).motion
     validation = {} if unseen is None else {"other": unseen}
-    return judge({"train": own or scored([4, 4, 4])}, validation, {}, {"train": report_excitation(motion)})
+    return Verdict.of(*judge({"train": own or scored([4, 4, 4])}, validation, {}, {"train": report_excitation(motion)}))
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def judged(unseen: Score | None, own: Score | None = None) -> Verdict:
         ([5, 5, 51], None, "marginal", "joint 3 (51 %"),
         ([5, 5, 102], None, "marginal", "joint 3 (102 %"),
         ([94, 5, 5], None, "marginal", "joint 1 (94 %"),
-        ([96, 5, 60], None, "fail", "joint 1 (96 % unexplained), joint 3 (60 %"),
+        ([96, 5, 60], None, "fail", "joint 1 (96 %), joint 3 (60 %"),
         ([96, 5, 5], [20, 5, 5], "pass", ""),  # wrong at rest only
         ([96, 5, 5], [np.nan, 5, 5], "pass", ""),  # never moves
     ],
@@ -52,31 +52,29 @@ def judged(unseen: Score | None, own: Score | None = None) -> Verdict:
 def test_a_joint_without_a_model_is_named_and_fails_where_its_torque_matters(joints, moving, level, named):
     found = judged(scored(joints, moving))
     assert found.level == level
-    assert named in found.reason and bool(named) == ("does not hold" in found.reason)
-
-
-def test_the_documented_thresholds_are_those_that_judge():
-    own = verdict
-    words = " ".join((own.__doc__ or "").split())
-    told = (
-        f"above {own.POOR:g} %", f"up to {own.GOOD:g} %", f"up to {own.TRANSFER:g} times", f"{own.LOST:g} % or more",
-        f"from {own.NOTHING:g} %", f"{100 * own.MATTERS:g} % or more",
-    )  # fmt: skip
-    assert [text for text in told if text not in words] == []
+    assert named in found.reason and found.code == ("joints-unexplained" if named else "")
 
 
 def test_the_total_says_which_criterion_was_missed():
-    assert "up to 10 % passes" in judged(scored([11, 11, 11], total=11.0)).reason
-    assert "up to 2 times" in judged(scored([9, 9, 9], total=9.0), scored([4, 4, 4], total=4.0)).reason
-    assert judged(scored([31, 31, 31], total=31.0)).level == "fail"
-    assert "joint 2 (70 %" in judged(None, scored([4, 70, 4])).reason, "without unseen motion the fit's own counts"
+    found = judged(scored([11, 11, 11], total=11.0))
+    assert (found.level, found.code) == ("marginal", "torque-unexplained")
+    found = judged(scored([9, 9, 9], total=9.0), scored([4, 4, 4], total=4.0))
+    assert (found.level, found.code) == ("marginal", "no-torque-transfer")
+    found = judged(scored([31, 31, 31], total=31.0))
+    assert (found.level, found.code) == ("fail", "torque-unexplained")
+
+
+def test_without_unseen_motion_the_joints_of_the_fit_count():
+    _, found = judge({"train": scored([4, 70, 4])}, {}, {}, {})
+    assert [one.code for one in found] == ["no-unseen-motion", "joints-unexplained"]
+    assert found[1].values["joints"] == ("joint 2 (70 %)",)
 
 
 @pytest.mark.parametrize("own, unseen, level", [(29, None, "marginal"), (31, None, "fail"), (31, 20, "fail")])
 def test_a_model_that_misses_its_own_motion_fails_without_unseen_motion_too(own, unseen, level):
     other = None if unseen is None else scored([4, 4, 4], total=unseen)
     found = judged(other, scored([4, 4, 4], total=own))
-    assert found.level == level and ("above 30 % fails" in found.reason) == (level == "fail")
+    assert found.level == level and (found.code == "training-torque-unexplained") == (level == "fail")
 
 
 def test_motion_far_beyond_the_limits_is_a_warning():
@@ -93,7 +91,7 @@ def test_motion_far_beyond_the_limits_is_a_warning():
 def test_most_parameters_from_the_cad_are_told_in_the_reason(drawn, told):
     rests = Resting(tuple(f"p{k}" for k in range(drawn)), 10, "cad")
     reason = with_prior(Verdict("marginal", "why"), rests).reason
-    assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not identify them") == told
+    assert (f"{drawn} of 10 parameters" in reason) == told
     assert told or reason == "why"
 
 
