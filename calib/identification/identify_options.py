@@ -128,7 +128,7 @@ def _no_zero(value: Any) -> Any:
 FINDINGS = (
     "masses", "speed", "lag", "clock", "sign", "order", "zero", "limit", "jump", "bodies", "loop", "description",
 )  # fmt: skip
-"""See `calib.procedure.dynamic_stage.plausibility`."""
+"""Names in ``accept``, see chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of them")]
 Gains = Annotated[tuple[float, ...], Expect("a list of numbers, finite and none of them zero"), Checked(_no_zero)]
 

@@ -120,7 +120,8 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
     verdict, rules = _judged(model, found, cases, fit, proofs, repeated, excitation)
     notes = (
         *lines_of(rules), *_contradictions(model, (*cases, *unseen)),
-        *motion_warnings(validation, repeated, excitation), *findings.notes, *_recording_notes(model, (*cases, *unseen)),
+        *motion_warnings(validation, repeated, excitation),
+        *findings.notes, *_recording_notes(model, (*cases, *unseen)),
     )  # fmt: skip
     return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, Tracking())
 
