@@ -40,6 +40,7 @@ from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
+MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
 MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
 
 
@@ -320,9 +321,7 @@ def _with_signs(
     motion, band = case.motion, 0.5 * case.motion.band
     measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
-    # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
-    max_following = 1.25
-    followed = away <= max_following * motion.velocity_noise(band)
+    followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
     if not followed.all():
         speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
         seen = observe(task.model, columns[drowned], replace(case, motion=replace(motion, v=speed)), task.decimator)

@@ -126,7 +126,7 @@ def test_where_the_simulation_does_not_follow_the_motion_drowned_signs_are_those
         return float(np.linalg.norm((values - truth(0.02)) / np.abs(truth(0.02)).max()))
 
     here, there = wrong(), wrong(slow)
-    monkeypatch.setattr(instrumental, "FOLLOWED", np.inf)
+    monkeypatch.setattr(instrumental, "MAX_FOLLOWING", np.inf)
     assert wrong() == pytest.approx(here, rel=1e-3) and there < 0.3 * wrong(slow)
 
 

@@ -49,7 +49,7 @@ def test_a_tolerance_holds_for_each_file_that_is_delivered(data, calib, here):
             "corrections": "pass",
         }
         code, out, _ = calib("export", "done", "--into", "out")
-        assert (code == 1) == (level == "fail") and "URDF alone, above the tolerance of 0.1 mm" in out
+        assert (code == 1) == (level == "fail") and "above the tolerance of 0.1 mm" in out
     assert "<!-- verdict fail" in Path("out/robot.urdf").read_text()
     assert "verdict" not in Path("out/robot_for_corrections.urdf").read_text()
     for more, code in (((), 1), (("--for-corrections",), 0)):
