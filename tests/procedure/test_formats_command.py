@@ -29,7 +29,10 @@ def test_every_format_has_its_documentation(calib):
         ("constraints", ("[target]", "sight", "[[obstacle]]")),
         ("mdh", ("[[joint]]", "alpha", "90 deg")),
         ("robot", ("[[element]]", "[[station]]", "[deflection]")),
-        ("identified", ("metrics.json", "torques_N.csv", "above_band_percent", "standing", "up to 10 %")),
+        (
+            "identified",
+            ("metrics.json", "torques_N.csv", "above_band_percent", "standing", "calib explain torque-unexplained"),
+        ),
         ("recordings", ("measured_torque", "JointState", "use_range")),
     ],
 )
@@ -37,6 +40,10 @@ def test_what_a_user_looks_for_is_there(calib, topic, words):
     out = calib("formats", topic)[1]
     for word in words:
         assert word in out, word
+
+
+def test_limits_of_a_verdict_are_those_that_the_catalogue_prints(calib):
+    assert "marginal where share > 10; fail where share > 30" in calib("explain", "torque-unexplained")[1]
 
 
 def test_the_session_file_is_printed_whole(calib):

@@ -2,7 +2,8 @@
 
 The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
 validation recording in which the robot moves and which does not repeat the training, beside the training's own error in
-its band; then every joint in the band, and while it moves. `calib explain` prints a rule's limits.
+its band; then every joint in the band, and while it moves. `calib explain torque-unexplained` prints the limits, and so
+on for each code of chapter 11.
 """
 
 from __future__ import annotations
