@@ -17,6 +17,7 @@ from PIL import Image
 from calib.procedure.report.style import AFTER, BEFORE, PAGE_WIDTH, QUIET, legend, log_axis, sheet, styled
 from calib.procedure.session.folder import Session
 from calib.rooms.cells import demo
+from calib.workers.threads import one_blas_thread
 
 PICTURE = Path(__file__).with_name("demo.png")
 README = Path(__file__).parents[1] / "README.md"
@@ -44,7 +45,8 @@ def main() -> None:
 def run(folder: Path) -> tuple[demo.DemoResult, dict[str, float]]:
     """Run the demonstration in a new folder; return what it came to, and its figures in README and picture."""
     began = time.process_time()
-    found = demo.run(folder, "lwr4plus", 0, print, lambda words: None)
+    with one_blas_thread():  # as in the command
+        found = demo.run(folder, "lwr4plus", 0, print, lambda words: None)
     seconds, session = time.process_time() - began, found.session
     truth = json.loads(session.path("truth.json").read_text(encoding="utf-8"))
     (unseen,) = _read(session.validation.path / "metrics.json")["validation"].values()
