@@ -8,6 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+MAX_CORE = 38_000  # lines of everything but calib/rooms
 SLACK = 40  # lines by which a package may stay below its row before the row has to be lowered
 
 
@@ -36,3 +37,4 @@ def test_packages_keep_their_budget():
     allowed = {package: int(lines.replace(",", "")) for package, lines, why in table if why.strip()}
     assert set(counted) == set(allowed)
     assert {name: n for name, n in counted.items() if not allowed[name] - SLACK <= n <= allowed[name]} == {}
+    assert sum(n for name, n in counted.items() if name != "calib/rooms") <= MAX_CORE

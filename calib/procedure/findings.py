@@ -28,7 +28,6 @@ from calib.words import listing
 
 RANKS = ("", "note", "marginal", "fail")
 UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}  # SI -> as printed; others as they are
-MAX_NAMES = 12  # of a list in a sentence
 PREDICTION_ONLY = "pass (prediction only)"  # of a model that predicts well and cannot be exported
 LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
 
@@ -79,7 +78,7 @@ class Verdicts:
 
     Attributes:
         stages: ``geometry``, ``dynamics`` → the verdict on what is to be delivered.
-        deliverables: of the geometry, ``urdf`` and ``corrections`` → the verdict on it; empty where nobody told apart.
+        deliverables: of the geometry, ``urdf`` and ``corrections`` → the verdict on it; empty where there is one only.
     """
 
     stages: Mapping[str, Verdict] = field(default_factory=dict)
@@ -213,6 +212,6 @@ class _Printer(Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         number, _, unit = format_spec.partition(" ")
         if isinstance(value, list | tuple):
-            return listing(value, int(number or MAX_NAMES))
+            return listing(value, int(number)) if number else listing(value)
         printed = format(value * UNITS.get(unit, 1.0) if unit else value, number)
         return printed + ("" if unit in ("", "°") else " ") + unit

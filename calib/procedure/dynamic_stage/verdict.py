@@ -26,13 +26,12 @@ from calib.procedure.findings import Verdict, limit, lines_of, sentence, settle
 from calib.robot.chain import Chain
 
 BEYOND = 0.05  # of a joint's range by which a recording may leave it: encoders and limits of a CAD are not exact
-CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
 BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
-# neighbouring rows that count as one from which on what is left is no noise, but something unmodelled
+# neighbouring rows that count as one from which on a residual is unmodelled dynamics, not noise
 MAX_CORRELATED_ROWS = 3.0
-SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
+SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is biased low
 
 
 @dataclass(frozen=True)
@@ -48,6 +47,11 @@ class Resting:
     names: tuple[str, ...] = ()
     of: int = 0
     source: str = ""
+
+    @property
+    def origin(self) -> str:
+        """What their values come from, in words."""
+        return "CAD values" if self.source == "cad" else "the usual sizes of such parameters"
 
 
 def judge(
@@ -154,16 +158,16 @@ def extrapolates(name: str, expected: TorqueIntervals) -> list[str]:
     if not (share := float(expected.beyond.mean())):
         return []
     joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]
-    ways = "; ".join(expected.ways(joints))
-    return [f"{name}: for {max(100 * share, 1.0):.0f} % of its time the model extrapolates: {ways}"]
+    return lines_of(
+        [finding("outside-training-range", file=name, share=max(share, 0.01), ways="; ".join(expected.ways(joints)))]
+    )
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
     """Return the verdict with it said where most parameters are not the motion's: what they are worth, CAD knows."""
     if 2 * len(rests.names) <= rests.of:
         return verdict
-    source = "CAD" if rests.source == "cad" else "a guess of their sizes"
-    one = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=source)
+    one = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
     return replace(verdict, reason=f"{verdict.reason}; {sentence(one)}")
 
 
@@ -176,24 +180,18 @@ def warnings(
     chain: Chain,
 ) -> list[str]:
     """Return what a user should know of the recordings, whatever model was identified, worst first."""
-    told = [line for case in (*cases, *unseen) for line in beyond(case, chain)]
-    return told + motion_warnings(validation, repeated, excitation)
+    found = [one for case in (*cases, *unseen) for one in beyond(case, chain)]
+    return lines_of(found) + motion_warnings(validation, repeated, excitation)
 
 
 def motion_warnings(
     validation: Mapping[str, Score], repeated: Mapping[str, float], excitation: Mapping[str, ExcitationReport]
 ) -> list[str]:
     """Return what a user should know of the recordings' motion, whatever the robot."""
-    told = [
-        f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
-        for name, share in repeated.items()
-    ]
-    for name, report in excitation.items():
-        told += [f"{name}: {note}" for note in report.notes]
-    return told + [
-        f"{name}: the robot stands there; its errors are of friction at rest, which no function of q, v, a predicts"
-        for name, scored in validation.items()
-        if scored.motion_share < MOVES
+    return [
+        *lines_of(finding("repeats-training", file=name, share=share) for name, share in repeated.items()),
+        *(f"{name}: {note}" for name, report in excitation.items() for note in report.notes),
+        *lines_of(finding("stands", file=name) for name, one in validation.items() if one.motion_share < MOVES),
     ]
 
 
@@ -201,38 +199,27 @@ def model_warnings(
     cases: Sequence[Case], found: Identification, excitation: Mapping[str, ExcitationReport]
 ) -> tuple[str, ...]:
     """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
-    told = parameter_warnings(found)
-    told += found.bias.lines(found.fitted.instrumental is not None)
-    told += _unmodelled(found)
-    told += _elastic(cases)
-    told += _slow_bias(cases, found)
-    return tuple(told)
+    noticed = [*_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)]
+    loop = found.bias.lines(found.fitted.instrumental is not None)
+    return (*parameter_warnings(found), *loop, *lines_of(noticed))
 
 
 def parameter_warnings(found: Identification[Any]) -> list[str]:
     """Return what a user should know of the parameters, whatever the robot: condition, bounds, prior."""
-    told, normalised = [], found.condition[1]
-    if normalised > CONDITION:
-        told.append(
-            f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
-            "design an excitation"
-        )
-    if found.fitted.held is not None:
-        told += found.fitted.held.lines()
-    return [*told, *_negative(found), *_rests(found)]
+    condition = settle([finding("motion-condition", condition=found.condition[1])])
+    held = found.fitted.held.lines() if found.fitted.held is not None else []
+    return [*lines_of(condition), *held, *lines_of([*_negative(found), *_rests(found)])]
 
 
-def beyond(case: Case, chain: Chain) -> list[str]:
-    """Say which joints a recording takes far beyond the robot's limits."""
+def beyond(case: Case, chain: Chain) -> list[Finding]:
+    """Return the joints that a recording takes far beyond the robot's limits."""
     q = np.asarray(case.motion.q)
     over = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
     far = np.flatnonzero(np.isfinite(over) & (over > BEYOND * (chain.upper - chain.lower)))
-    if not len(far):
-        return []
-    named = ", ".join(
+    named = [
         f"{chain.joint_names[j]} by {over[j]:.2g} {'m' if chain.joints[j].kind == 'prismatic' else 'rad'}" for j in far
-    )
-    return [f"{case.name}: far beyond the robot's limits ({named}): is this the robot, are the columns in its order?"]
+    ]
+    return [finding("beyond-joint-limits", file=case.name, joints=named)] if named else []
 
 
 def resting_parameters(found: Identification[Any]) -> Resting:
@@ -244,63 +231,43 @@ def resting_parameters(found: Identification[Any]) -> Resting:
     return Resting(names, found.base.b, found.prior.source)
 
 
-def _negative(found: Identification[Any]) -> list[str]:
-    """Say which inertia or friction of drives came out below zero, by more than `SURELY` sigmas, as of no drive."""
+def _negative(found: Identification[Any]) -> list[Finding]:
+    """Return the inertia and friction of drives that are below zero by more than `SURELY` sigmas."""
     estimate = found.fitted.estimate
     wrong = [
         f"{name} = {value:.3g} ± {sigma:.2g}"
         for name, one, value, sigma in zip(found.names, found.terms, estimate.values, estimate.sigma)
         if one is not None and one.nonnegative and value < -SURELY * sigma
     ]
-    if not wrong:
-        return []
-    return [
-        f"below zero, as of no drive: {', '.join(wrong)}; the motion or the friction's form lets others stand for it: "
-        "trust the sum on such motion, not the parts (a method with the prior keeps them at zero)"
-    ]
+    return [finding("negative-drives", names=wrong)] if wrong else []
 
 
-def _rests(found: Identification[Any]) -> list[str]:
-    """Say which parameters the motion does not tell."""
-    names = resting_parameters(found).names
-    if found.prior is None or not names:
-        return []
-    source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
-    how = f"drawn to {source} ({len(names)} of {found.base.b})"
-    return [f"not identifiable from this motion, {how}: {', '.join(names)}"]
+def _rests(found: Identification[Any]) -> list[Finding]:
+    """Return the parameters that the motion does not identify."""
+    rests = resting_parameters(found)
+    given = dict(count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
+    return [finding("regularised", **given)] if rests.names else []
 
 
-def _unmodelled(found: Identification) -> list[str]:
-    """Say where sigmas hold for this motion alone: the model lacks something there."""
+def _unmodelled(found: Identification) -> list[Finding]:
+    """Return the joints with autocorrelated residuals, whose sigmas hold for this motion alone."""
     alike = np.nan_to_num(found.fitted.inflation)
     rows = found.settings.torque_rows.numbered(found.dynamics.model.n)
-    joints = [f"{rows[k]} ({alike[k]:.0f} rows count as one)" for k in np.flatnonzero(alike >= MAX_CORRELATED_ROWS)]
-    if not joints:
-        return []
-    return [
-        f"what is left of joint {', '.join(joints)} is no noise but something that the model lacks: sigmas hold for "
-        "motion like this one, estimates from other motion may differ by more"
-    ]
+    joints = [f"{rows[k]} (effective samples 1/{alike[k]:.0f})" for k in np.flatnonzero(alike >= MAX_CORRELATED_ROWS)]
+    return [finding("autocorrelated-residual", joints=joints)] if joints else []
 
 
-def _elastic(cases: Sequence[Case]) -> list[str]:
-    """Say where second encoders show that joints bend: a rigid model does not know."""
-    told = []
+def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
+    """Yield where second encoders show that joints bend."""
     for case in cases:
         if case.motion.q_link is None:
             continue
-        apart = np.asarray(case.motion.q_link - case.motion.q)
-        bend = np.std(apart, axis=0)
-        joints = [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]
-        if joints:
-            told.append(
-                f"{case.name}: motor and link encoders move apart ({', '.join(joints)}, rms): elastic joints, "
-                "and what they store and release is beyond a rigid model"
-            )
-    return told
+        bend = np.std(np.asarray(case.motion.q_link - case.motion.q), axis=0)
+        if joints := [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]:
+            yield finding("elastic-joints", file=case.name, joints=joints)
 
 
-def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
+def _slow_bias(cases: Sequence[Case], found: Identification) -> list[Finding]:
     """Notice that rows of joints near standstill, where friction takes any value, are in the fit."""
     total = np.zeros(cases[0].motion.n)
     size = 0
@@ -313,10 +280,7 @@ def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
     slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if j in coulomb]
     if not slow:
         return _coulomb_shift(cases, found)
-    shown = ", ".join(f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow)
-    return [
-        f"rows of nearly standing joints are in the fit ({shown}): they draw Coulomb friction down; set cut_slow = true"
-    ]
+    return [finding("slow-samples", joints=[f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow])]
 
 
 def _coulomb(found: Identification) -> dict[int, int]:
@@ -326,7 +290,7 @@ def _coulomb(found: Identification) -> dict[int, int]:
     return {one.joint: k for k, one in enumerate(found.terms) if one and one.shape == "sign" and one.joint is not None}
 
 
-def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
+def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[Finding]:
     """Notice that the few rows near standstill move Coulomb friction by more than its sigma.
 
     Where a joint's friction is richer, they are modelled, not cut.
@@ -342,9 +306,4 @@ def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
         for j, k in coulomb.items()
         if j not in richer and abs(shift[k]) > sigma[k] and percent[k] > 0.0
     ]
-    if not moved:
-        return []
-    return [
-        f"the few rows of nearly standing joints move Coulomb friction by more than its sigma; without them: "
-        f"{', '.join(moved)}; for its value set cut_slow = true, or choose a friction with presliding"
-    ]
+    return [finding("slow-samples-shift", names=moved)] if moved else []

@@ -83,8 +83,9 @@ def test_motion_far_beyond_the_limits_is_a_warning():
     reach = float(np.abs(case.motion.q[:, 1]).max())
     tight = tuple(replace(one, lower=-0.8 * reach, upper=0.8 * reach) if j == 1 else one
                   for j, one in enumerate(chain.joints))  # fmt: skip
-    (told,) = verdict.beyond(case, replace(chain, joints=tight))
-    assert "joint2 by" in told and "joint1" not in told and "is this the robot" in told
+    (finding,) = verdict.beyond(case, replace(chain, joints=tight))
+    assert finding.code == "beyond-joint-limits"
+    assert [words.split(" by ")[0] for words in finding.values["joints"]] == ["joint2"]
 
 
 @pytest.mark.parametrize("drawn, told", [(5, False), (6, True)])
