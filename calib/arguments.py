@@ -3,8 +3,6 @@
 Loads nothing heavy: the command line builds default settings before it knows what it is asked for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from inspect import Signature, isgenerator, signature

@@ -1,7 +1,5 @@
 """Frozen arrays and the one shape check."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

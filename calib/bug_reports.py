@@ -4,8 +4,6 @@ The file holds the command, versions, and where the program stood; of a person's
 quotes.
 """
 
-from __future__ import annotations
-
 import platform
 import shlex
 import tempfile

@@ -7,8 +7,6 @@ options need not wait for. Complaints read ``file: key: what was expected, what 
 gives the same as a JSON schema.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Collection, Mapping, Sequence

@@ -4,8 +4,6 @@ pydantic checks by them and `calib.config` makes its complaints readable; it is 
 before.
 """
 
-from __future__ import annotations
-
 import ast
 import datetime
 import math

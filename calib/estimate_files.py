@@ -3,8 +3,6 @@
 Whatever was estimated, geometry or dynamics, its files have these two forms; nothing else reads or writes them.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Folders of results: written whole, beside their place, then moved there."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

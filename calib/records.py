@@ -8,8 +8,6 @@ JSON has no NaN: arrays annotated `Array`, and numbers annotated `Number`, hold 
 that is not finite is a mistake, which `calib.files.write_json`, the writer of all records, refuses.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

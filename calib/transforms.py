@@ -4,8 +4,6 @@ A pose maps coordinates of its own frame to its reference: p_ref = T @ [p; 1]. Q
 roll-pitch-yaw is URDF's: R = Rz(yaw) Ry(pitch) Rx(roll).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation

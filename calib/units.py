@@ -3,8 +3,6 @@
 SI stands in every file that we write, unless a header or a key names another.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

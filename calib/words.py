@@ -1,7 +1,5 @@
 """Lists and numbers of things as text, for every message."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 

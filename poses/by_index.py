@@ -1,7 +1,5 @@
 """Exchange over candidates for any index, by the singular values of every trial set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

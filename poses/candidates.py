@@ -1,7 +1,5 @@
 """Candidates: low-discrepancy poses within limits that keep every constraint and predicate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

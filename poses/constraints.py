@@ -6,8 +6,6 @@ written in, and, for exact gradients, ``tool_jacobian(q) -> (m, 6, n)``: velocit
 both in that same frame. Every constraint is smooth where stated, and pickles if the callables do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

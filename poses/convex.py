@@ -19,8 +19,6 @@ candidate violates the certificate joins, until it is tight. Working on a few hu
 Harman & Pronzato (2007) deletion rule, which needs repeats to be allowed. The set and its growth are our choice.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

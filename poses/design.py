@@ -7,8 +7,6 @@ With C = M⁻¹ and one pose z (rows, p), the matrix determinant lemma and Woodb
 so all candidates are judged by rows × rows blocks, and the scores d_i = tr(z_i C z_iᵀ) follow by one thin product.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The errors of pose selection: each says what was found, why it may be so, and what to try."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """Exchange over candidates for the determinant (O1): greedy start, pair exchange, DETMAX excursions."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

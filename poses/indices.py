@@ -18,8 +18,6 @@ O1 is the default everywhere in this package: multiplying a column of W (changin
 O1 of *every* set by the same factor, so its ranking of sets does not depend on units. That of O2-O5 and cond does.
 """
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Jacobians of candidates, checked and brought to coordinates in which all parameters weigh alike."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One verb for every way of choosing poses, and what it returns."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

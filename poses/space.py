@@ -1,7 +1,5 @@
 """Where poses may lie when a search leaves the candidates: limits, constraints, predicate, and the Jacobian there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

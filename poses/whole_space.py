@@ -14,8 +14,6 @@ climbs. That none outside lies higher rests on the climbs having found the globa
 make likely and do not prove; `climbs` says how many tried in vain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ jerk-limited motion; all joints move in proportion, so the approach is a straigh
 its ends. Imported at the first call.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -3,8 +3,6 @@
 q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ function,
 so a feasible c means feasible samples; what happens between the samples is `trajectories.design.verify`'s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """The errors of trajectory design: each says what was found, why it may be so, and what to try."""
 
-from __future__ import annotations
-
 
 class BadInput(ValueError):
     """An array or an option that cannot be what it should be (shape, NaN, limits that cross, an unknown name)."""

@@ -5,8 +5,6 @@
 Rest at the start, and by periodicity at the end: Σ k a_jk = 0 and Σ k² b_jk = 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A track as a ROS 2 message trajectory_msgs/msg/JointTrajectory, in JSON or in YAML (``ros2 topic pub`` reads it)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from typing import Any

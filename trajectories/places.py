@@ -4,8 +4,6 @@ Places and distances come from callables with derivative products; see `trajecto
 has.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

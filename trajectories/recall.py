@@ -7,8 +7,6 @@ The place is where the sum of squared differences between recording and referenc
 one cross-correlation by FFT. Unlike the peak of q ⋆ r alone it is not drawn to where the recording is large.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The order in which to visit places in least time: an open tour, and how long moves between joint values last."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from trajectories.errors import BadInput

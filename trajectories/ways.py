@@ -4,8 +4,6 @@ RRT-Connect (Kuffner & LaValle 2000): two trees, from either end, grow towards r
 then detours are cut short wherever a straight move is clear. What is clear is asked of the caller, in batches.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

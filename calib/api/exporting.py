@@ -1,7 +1,5 @@
 """What leaves the toolkit: calibrated geometry and identified dynamics in the forms other programs read."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the verbs take in several forms: one or many, a file that may be missing, a result or its folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

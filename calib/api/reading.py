@@ -1,7 +1,5 @@
 """Robots and measurements from files, as the verbs of `calib` take them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Guided sessions in Python: one folder per robot, made once, run as far as it goes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

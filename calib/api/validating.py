@@ -1,7 +1,5 @@
 """Results held against measurements they have not seen."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, overload

@@ -2,8 +2,6 @@
 but the verdict is fail, 2 input or usage, 3 not identifiable or not converged, 4 an internal error (what is
 needed to mend it stands in a file, see `calib.bug_reports`), 130 interrupted."""
 
-from __future__ import annotations
-
 import gc
 import io
 import os

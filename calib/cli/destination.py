@@ -1,7 +1,5 @@
 """Check where a verb's results go, before any work is done, for serial arms and other robots alike."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """The dynamics: identify."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The geometry: fit, select, export."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Motions: excite, recall, plan."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Commands made of functions: parameters are options, settings one per field, and docstrings say what each is about."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass

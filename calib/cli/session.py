@@ -1,7 +1,5 @@
 """The guided session: new, next, status, redo, demo; and formats."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """What several commands share: arguments, the console, progress, lists of numbers."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

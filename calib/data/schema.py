@@ -4,8 +4,6 @@ Poses, targets, waypoints and recordings read their tables by these declarations
 `refuse`: the value first, what to do last, then how many more rows are like it; the error carries file, row and column.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ of pivots, so that no rounding of a BLAS library decides between equals.
 Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrated one, where it holds only nearly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 

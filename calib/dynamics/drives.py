@@ -7,8 +7,6 @@ a coupled wrist (TX40: tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += I
 is not a special case. Joint numbers here count from 0, in names from 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

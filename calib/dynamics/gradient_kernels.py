@@ -4,8 +4,6 @@ Arrays and notation are those of `calib.dynamics.kernels`, whose forward pass is
 first.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

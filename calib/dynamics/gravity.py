@@ -1,7 +1,5 @@
 """Gravity torques of a chain whose masses are known, in batch."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.errors import RobotError

@@ -14,8 +14,6 @@ joint's axis is z, and ``parameters`` (10 B) follow `Bodies.order`. Row 0 of ``m
 i + 1 body i; row i of ``frames`` is its rotation (0 to 8) and origin (9 to 11) in its parent's frame.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -9,8 +9,6 @@ motors' torque, and a torque offset or a spring to Γ. Every term that depends o
 sign that the direction of Φ' decides, viscous friction goes with ṡ, which is not affine in ṡ².
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

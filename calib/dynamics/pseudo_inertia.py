@@ -8,8 +8,6 @@ about the link frame's origin. P ≻ 0 says that some density of mass ≥ 0 has 
 The map is linear and one to one, so the ten parameters of a body are a point of the cone of 4×4 matrices.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

@@ -5,8 +5,6 @@ parameters: a closed chain reduced to its actuated coordinates, a model of the p
 knows (limits of its joints, masses of its CAD, another geometry) goes to identification beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol

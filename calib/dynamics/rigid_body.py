@@ -5,8 +5,6 @@
 A static arm's drives show +g(q). numba is imported at the first call, not before.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.arrays import shaped

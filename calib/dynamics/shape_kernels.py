@@ -4,8 +4,6 @@ A shape's settings stand in one row of `acts`, from column 1 on, in the order of
 other columns are the simulator's. The code of a shape is the constant of its name.
 """
 
-from __future__ import annotations
-
 from math import cos, exp, isinf, pi, sin, sqrt, tanh
 
 from numba import njit

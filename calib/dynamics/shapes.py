@@ -12,8 +12,6 @@ Shapes that bend keep their value beyond an ``edge`` [rad/s or m/s], the fastest
 where it is not given): beyond it, friction goes on linearly.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2)
 power alone, vᵀ tau (`power`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby

@@ -1,7 +1,5 @@
 """Which columns of an observation matrix carry information of their own: the same question in geometry and dynamics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Estimates from residuals that are correlated in time: how much their scores scatter."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.arrays import shaped

@@ -1,7 +1,5 @@
 """From base to essential parameters: leave out, one by one, what the data do not identify, and write down each step."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum

@@ -1,7 +1,5 @@
 """What an estimation returns: values with their covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ the R factor of [Z W y], so that the triangles of `triangles` serve here too:
 the IV estimate solves A x = b, the residual of W on Z is Q2 B, and nothing is squared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ band that was kept. That is exact for columns which vary slowly against the resi
 values do not depend on it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

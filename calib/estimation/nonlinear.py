@@ -4,8 +4,6 @@ The problem is stated by two functions, so that the unknowns may live on a manif
 r = y - f(state) and W = ∂f/∂x, and ``retract(state, dx) -> state``. Robust losses enter as weights in ``linearise``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum

@@ -4,8 +4,6 @@ For e ~ N(0, S) with n joints the size d = (eᵀ S⁻¹ e)^½ is chi-distributed
 expectations below are means over 4000 quantiles of d², good to four digits.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -6,8 +6,6 @@ That guards against bad y; a sample with a bad W of great leverage draws the fit
 The samples stay in memory, since each round weights them anew: meant for decimated data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Used where measured signals stand on both sides, as the motor currents in the id
 payload (Gautier & Briot 2014): [V -W] [g; χ] = y, y the torque of the payload.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.linalg
 

@@ -1,7 +1,5 @@
 """What makes errors large: variances as a sum of known shapes with unknown weights, none negative."""
 
-from __future__ import annotations
-
 import numpy as np
 
 ROUNDS = 200  # of the fixed point

@@ -1,7 +1,5 @@
 """What the residuals still hold: correlation in time, departure from the normal law, and the share explained."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

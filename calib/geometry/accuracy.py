@@ -10,8 +10,6 @@
 ``rms`` is sqrt(mean |e|²) of the vector's norm, not per axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -13,8 +13,6 @@ With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import singledispatch

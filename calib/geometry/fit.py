@@ -1,7 +1,5 @@
 """Fit the geometry: Levenberg–Marquardt on whitened residuals of every kind of measurement at once."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

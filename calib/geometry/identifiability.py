@@ -1,7 +1,5 @@
 """Which geometric parameters the poses can identify, and what merges with what, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -19,8 +19,6 @@ Beside the calibrated robot itself (`calib.robot.description`, `calib.robot.cali
     nominal_station = [...]          # and nominal_tool: the frames that let the nominal arm fit best
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -9,8 +9,6 @@ two to three digits. Steps of least norm leave the configuration alone; joints a
 go beyond.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Both pickle, so that selection can run on several processes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

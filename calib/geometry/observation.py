@@ -1,7 +1,5 @@
 """The observation matrix of an installation: residual parts and their Jacobian for every block of measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

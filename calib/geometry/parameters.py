@@ -4,8 +4,6 @@ Order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base
 the target's own axes), of images the lenses' values and the boards' shapes, deflection coefficients (E).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

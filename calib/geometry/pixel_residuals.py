@@ -7,8 +7,6 @@ with (R, p) the board in the camera's frame. All corners of an image share the s
 sec. 5.3), so that thousands of images take the memory of thousands of poses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

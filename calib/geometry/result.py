@@ -1,7 +1,5 @@
 """What a geometric fit returns, and how it looks row by row."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ plane that touches it there, νᵀ β >= νᵀ β*: the same optimum, with one m
 as an equality (our choice; the cone is bent beyond it).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

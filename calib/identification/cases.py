@@ -1,7 +1,5 @@
 """One recording as identification sees it: its motion, the torques to explain, and what the robot carried."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

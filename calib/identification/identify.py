@@ -1,7 +1,5 @@
 """From cases to an identified model: base parameters, friction that pays, an estimate with covariance, a prediction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeGuard, cast

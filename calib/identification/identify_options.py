@@ -80,8 +80,6 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     payload = ["tool"]
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path

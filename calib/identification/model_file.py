@@ -36,8 +36,6 @@ Figures: ``plot_torque_N.png`` of every file in the order given, training first 
 geometry's uncertainty is known, what it adds to sigma.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

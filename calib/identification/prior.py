@@ -27,8 +27,6 @@ robot. It does not make the parameters those of possible bodies: that is the sem
 `bounded` keeps the drives' inertia positive, and lets friction brake at any speed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

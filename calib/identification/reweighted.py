@@ -1,7 +1,5 @@
 """An identification's estimate as a function of its rows: to be repeated on others, and to be differentiated."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Rods between the joints: what is known of the masses of a robot whose description holds none."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.dynamics import pseudo_inertia

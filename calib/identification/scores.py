@@ -1,7 +1,5 @@
 """How good a prediction of torques is: relative errors, moving and standing apart, and the share no model reaches."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

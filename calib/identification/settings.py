@@ -1,7 +1,5 @@
 """How to identify: which terms the drives have, how rows are weighed, what may be left out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeVar

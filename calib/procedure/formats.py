@@ -1,7 +1,5 @@
 """The file formats, as their own modules document them: `calib formats` prints those docstrings and nothing else."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from importlib import import_module

@@ -9,8 +9,6 @@ A search for ways asks of a few postures at a time, thousands of times: there Nu
     faces     (W, 5): capsule, normal, offset of a wall
 """
 
-from __future__ import annotations
-
 from math import cos, sin, sqrt
 
 import numpy as np

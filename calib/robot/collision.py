@@ -8,8 +8,6 @@ posture parts (`calib.robot.obstacles.inseparable`); the last are listed in `Col
 that a link never leaves is refused (`calib.robot.obstacles.check_reachable`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

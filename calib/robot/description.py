@@ -31,8 +31,6 @@ other chain is written element by element::
 Tables `station`, `tool` and `deflection` (and `truth`) may stand beside them: they belong to the callers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a robot's description says that cannot be: limits that are none, bodies that cannot exist."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.robot.chain import Chain, Joint

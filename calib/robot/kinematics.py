@@ -4,8 +4,6 @@ The sample axis runs last inside (structure of arrays), so that each elementary 
 operations over all poses, and so that a stacked observation matrix is column-major without a copy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

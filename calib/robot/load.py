@@ -1,7 +1,5 @@
 """Find a robot by what a person types: a library name, a file, or a folder with a ``robot.toml``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -40,8 +40,6 @@ The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in
     rpy = [0, 0, 0]
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

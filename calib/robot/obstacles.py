@@ -4,8 +4,6 @@ Distances are signed: negative is the depth inside. Those of convex bodies are c
 the nearest point of a line is found by golden sections, inside as outside.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce

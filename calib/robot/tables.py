@@ -4,8 +4,6 @@ A number may be a TOML number or a text: an expression of numbers, ``pi`` and ``
 behind it: ``"-pi/2"``, ``"90 deg"``, ``"110 deg/s"``, ``"-313 mm"`` (`calib.config_types.number`, `calib.units`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from functools import partial

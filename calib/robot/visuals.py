@@ -4,8 +4,6 @@ Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` 
 whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

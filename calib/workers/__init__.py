@@ -11,8 +11,6 @@ Processes are spawned, not forked, so that threads of numerical libraries do no 
 parallel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass

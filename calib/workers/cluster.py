@@ -1,7 +1,5 @@
 """A Dask cluster that runs tasks; the only module that knows Dask."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import pickle

@@ -1,7 +1,5 @@
 """What runs tasks, and how their results become one stream: retried, few at once, whatever runs them."""
 
-from __future__ import annotations
-
 import pickle
 import traceback
 from collections import deque

@@ -1,7 +1,5 @@
 """Ctrl-C where a minute's work is done and seconds are left: it waits."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Local processes that run tasks: spawned, one task each, so that who dies takes one task along."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal

@@ -5,8 +5,6 @@ process eighteen times. The API, the command, the workers and the tests all limi
 one of `VARIABLES` in the environment, or fewer threads than the library had before, as threadpoolctl sets them.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Generator, Iterator

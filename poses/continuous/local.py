@@ -6,8 +6,6 @@ stage ends with a restoration: Newton steps of least norm back onto what is viol
 is the best restored set by the index itself, unsmoothed.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Multistart: the local search from several sets of feasible candidates, on as many cores as `map` brings."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

@@ -11,8 +11,6 @@ are ours:
    pose whose replacement failed is spared until something else improves, so that every pose has its turn.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

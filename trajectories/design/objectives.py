@@ -16,8 +16,6 @@ optima lie: `sharpness` p < ∞ replaces max λ by (Σ λ^p)^(1/p) and min λ by
 least cond and at most b^(1/p) cond; its gradient is exact, too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 

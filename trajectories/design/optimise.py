@@ -4,8 +4,6 @@ A start is a random motion inside the joint limits (`trajectories.design.starts`
 repaired (the squared excess is minimised), then searched from (`trajectories.design.search`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Trade-offs between objectives: goals proposed from single-objective runs, and a front by sweeping one goal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ Goal attainment (Gembicki 1974; the paper's eq. 24): min γ subject to F_i - w_i
 condition number are compared by logarithm: the same optimum, well scaled from 10⁶ down (our choice).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

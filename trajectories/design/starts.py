@@ -3,8 +3,6 @@
 Also where they start again: smaller motions about a pose that keeps the limits.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from trajectories.basis import Basis, SampledMotion

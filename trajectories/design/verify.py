@@ -6,8 +6,6 @@ coefficients (*proved*); for torques, places and distances it is estimated as tw
 (*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no allowance beyond it).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

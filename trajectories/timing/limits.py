@@ -1,7 +1,5 @@
 """The dynamics that give a timed path its torques, and the largest velocities, accelerations and torques."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -10,8 +10,6 @@ iterated until both are at rest, so that q is a smooth function of σ. A quintic
 denser until the tool keeps to the line between them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Splines through joint waypoints are parametrised by chord length (knots s_k apar
 norm near one and the spline does not swing out where waypoints lie unevenly (de Boor 1978; Lee 1989 compares).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

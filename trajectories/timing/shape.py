@@ -6,8 +6,6 @@ which limit is active changes; the search goes by linear models over a simplex (
 tried it took the fewest evaluations for what it found). Where velocity limits rule, a few percent are there to be had.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

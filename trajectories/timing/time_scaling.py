@@ -13,8 +13,6 @@ What comes out is held against the full inverse dynamics between the grid points
 tightened on that interval by the excess and the path is timed again, until none is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

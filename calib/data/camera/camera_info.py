@@ -5,8 +5,6 @@
 (``width height K D``) are read, too.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

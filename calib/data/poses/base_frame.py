@@ -4,8 +4,6 @@ The study (Kolyubin et al. 2019, section 3.5) marks the base with LEDs of its ow
 between series. Both measurements are noisy, and the base's orientation noise acts over the distance to the target.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

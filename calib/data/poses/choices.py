@@ -1,7 +1,5 @@
 """What a fit of the geometry may be asked for, by name; loads nothing, so that the command line starts at once."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from calib.config_types import OneOf

@@ -1,7 +1,5 @@
 """Which column of a measurement file holds what: our names, the robot's, and those of the options file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field

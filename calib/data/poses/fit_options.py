@@ -43,8 +43,6 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     kind = "pose"                    # camera
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows that belong together: sockets, planes, pairs and bars."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations

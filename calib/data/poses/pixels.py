@@ -1,7 +1,5 @@
 """Corners of a board in images: what a camera measures; one image is one row."""
 
-from __future__ import annotations
-
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Lists of poses for the robot to take, and whether what was measured is what was planned."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

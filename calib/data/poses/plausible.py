@@ -1,7 +1,5 @@
 """Can these numbers be what their header says? Each complaint names the row, the column and the likely cause."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

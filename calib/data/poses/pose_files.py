@@ -19,8 +19,6 @@ tool                ``tool``: label of the reflector that a row saw
 All other columns are ignored and listed. Other forms: `calib.data.poses.robodk`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

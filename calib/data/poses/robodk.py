@@ -18,8 +18,6 @@ Three reflectors without a header (``format = "three_smr"``, only on request): N
 columns of padding, joints [deg] last; 18 to 21 columns for six joints. A reflector at 0, 0, 0 was not seen.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

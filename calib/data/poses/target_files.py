@@ -33,8 +33,6 @@ reason              why not, or what is odd
 ==================  ===================================================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -8,8 +8,6 @@ rows asked for are kept: a compressed member cannot be mapped into memory, so ti
 and memory with the cut.
 """
 
-from __future__ import annotations
-
 import lzma
 import struct
 import tokenize

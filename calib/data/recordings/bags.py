@@ -8,8 +8,6 @@ Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux 
 imported when a bag is read (75 ms). Memory grows with the joint states alone, time with their number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

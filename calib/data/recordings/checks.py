@@ -3,8 +3,6 @@
 What cannot be is refused; what is odd but possible becomes a note. Thresholds: `RecordingBounds`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 

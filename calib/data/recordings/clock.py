@@ -16,8 +16,6 @@ Seen in real logs: the Panda's is counted (6 % read twice, 7 % missed), the LWR4
 stamps are true.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

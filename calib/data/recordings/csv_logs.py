@@ -5,8 +5,6 @@ A quantity's name (`recording_options`) stands before or behind the joint's numb
 start at 0 or 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Recordings from files: NumPy archives, CSV tables, ROS bags; the first bytes say which."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -22,8 +22,6 @@ FloBaRoID writes times, positions, velocities, torques. Words before a name that
 (`MEASURED`: ``actual_q_0``, ``state.q[0]``) do not matter where no column has the plain name.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@ Gautier's rules, with ω_dyn the highest frequency at which the rigid body moves
 frequency below which 95 % of a joint's acceleration power lies, the floor of noise taken off, a resonance left out).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

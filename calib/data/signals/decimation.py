@@ -7,8 +7,6 @@ evaluated at the kept samples only, so it has no phase, can run over blocks, and
 window sticks out are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Zero-phase low-pass filters and central differences, along the first axis of evenly sampled arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg.lapack import dtbtrs  # type: ignore[attr-defined]
 

@@ -5,8 +5,6 @@ recorded (on the even grid): what filters them is the parallel decimation, which
 (`calib.data.signals.decimation`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

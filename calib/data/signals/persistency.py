@@ -1,7 +1,5 @@
 """What a motion can excite, before any model: is it one sine, do joints move together, is it the motion seen before?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

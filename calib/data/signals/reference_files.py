@@ -3,8 +3,6 @@
 Names are those of recordings (`recording_options`): t, and q_ref (or, without one, q); other columns are not looked at.
 """
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import replace
 from pathlib import Path

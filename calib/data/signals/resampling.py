@@ -1,7 +1,5 @@
 """A log on an even grid: samples dated, short gaps bridged, long ones left open, all of it counted."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

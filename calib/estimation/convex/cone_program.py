@@ -2,7 +2,6 @@
 
 # pyright: reportAttributeAccessIssue=false
 # clarabel is a compiled extension without stubs
-from __future__ import annotations
 
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ Constraints add knowledge, not consistency: where they bind at wrong values the 
 the bias of least squares in a loop.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import count
 

@@ -1,7 +1,5 @@
 """What holds between constraints alone, and between a constrained estimate and the free one."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.linalg
 

@@ -1,7 +1,5 @@
 """Rows that stand twice in what was measured: copied, or a file given twice. They count twice, and prove nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Whether the measurements and the model belong together: set-ups that change, errors no rigid geometry explains."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

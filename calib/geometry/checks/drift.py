@@ -1,7 +1,5 @@
 """Drift of an instrument or a base between two measurements of the same poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Both are looked at with the nominal arm: base and tool placement take up what th
 leave is small against either. All thresholds are our choice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

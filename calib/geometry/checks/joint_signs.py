@@ -1,7 +1,5 @@
 """Do the recorded joints turn the way the arm's do? Looked for with the nominal arm, base and tool placement free."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

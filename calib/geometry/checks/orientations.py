@@ -5,8 +5,6 @@ does not depend on the order. But to move the w is an odd permutation, a reflect
 what is read is P R_iᵀ Q with constant P, Q: an inverse, which no placement S, X brings to the arm's S A_i X.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

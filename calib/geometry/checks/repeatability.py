@@ -12,8 +12,6 @@ an accuracy of their own, while repeatability is the robot's (and the instrument
 norm's Euler angles are our choice; for the small angles at hand they differ by nothing that counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

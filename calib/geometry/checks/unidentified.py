@@ -1,7 +1,5 @@
 """What is not identifiable from the poses: rank, parameters that merge or stay at nominal, loose placements."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -9,8 +9,6 @@ ways together. The best is the one with the smallest median misfit. Images that 
 times.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

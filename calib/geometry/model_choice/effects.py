@@ -1,7 +1,5 @@
 """The effects a ladder of models may add to the geometry, each a family of deflection terms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

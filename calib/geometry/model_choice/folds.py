@@ -4,8 +4,6 @@ A random split of grid data holds out neighbours of what was fitted and flatters
 transfer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

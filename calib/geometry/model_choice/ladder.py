@@ -8,8 +8,6 @@ errors are gone. Without an instrument (sockets, planes, distances) the geometry
 strongly as the data say (`calib.geometry.fit`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

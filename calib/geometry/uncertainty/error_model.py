@@ -12,8 +12,6 @@ median of the ones to that of the others, and is larger outside the range of a j
 it was left out; sigmas are stated in units of the larger radius.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """How well a fit knows where the tool is: the covariance of its parameters, propagated to poses."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements

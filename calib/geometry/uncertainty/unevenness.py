@@ -7,8 +7,6 @@ heteroscedasticity), every a_j at its most probable (`calib.estimation.relevance
 Stated is exp(E f + var f / 2), the mean of s: it is larger where few poses, or none, were measured.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

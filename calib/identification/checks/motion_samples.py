@@ -1,7 +1,5 @@
 """A few samples of a recording, and how much of its torques columns explain: what quick looks at recordings share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -3,8 +3,6 @@
 Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -5,8 +5,6 @@ at on a few samples: sizes, signs and clocks, no model. All thresholds are our c
 recordings at hand (Panda, KR300, LWR4+, TX40, TIAGo, 22 of a UR10e) none is reached.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ its sigma takes each joint's vote for one draw, and both halves of the recording
 of this and its thresholds are our choice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -8,8 +8,6 @@ nearly: for rods between the joints their ratio is known up to 17 % on every rec
 whose last link has no known length, are not looked at: one gave 45. All thresholds are our choice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations

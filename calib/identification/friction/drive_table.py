@@ -1,7 +1,5 @@
 """Drives as simulators and URDFs know them: one motor inertia, one viscous and one Coulomb coefficient per joint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

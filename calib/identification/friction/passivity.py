@@ -1,7 +1,5 @@
 """Friction takes energy out of a robot, at every joint: a model in which it does not belongs to no possible robot."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -20,8 +20,6 @@ nor a single loud moment has a part in it). How strongly the columns are regular
 is told apart, and whether an order stays at all, time blocks that are left out decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

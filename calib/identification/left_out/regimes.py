@@ -5,8 +5,6 @@ its training data, and in the direction of travel that it has not seen. Blocks o
 some of everything.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

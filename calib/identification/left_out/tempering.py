@@ -1,7 +1,5 @@
 """How strong what is known beforehand should be: as strong as regimes left out of the motion ask for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

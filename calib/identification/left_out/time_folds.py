@@ -1,7 +1,5 @@
 """Models judged on time they have not seen: everything from triangles, one fit per fold."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

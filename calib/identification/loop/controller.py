@@ -8,8 +8,6 @@ in the logged positions but was not in the controller's would shrink the gains; 
 projection on functions of the reference, which knows nothing of noise (two-stage least squares; our choice).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot
 reference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

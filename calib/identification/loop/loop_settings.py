@@ -38,8 +38,6 @@ recording's: both count from their first sample. ``[files."run.csv"] reference =
 recording, relative to the options file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, Any

@@ -21,8 +21,6 @@ so that the model's part shows. All of this is our choice; the judgement itself 
 (2019, section 7), who miss it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

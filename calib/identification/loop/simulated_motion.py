@@ -1,7 +1,5 @@
 """The simulated motion of a loop in place of the recorded one: the same instants, the same low-pass."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Is least squares biased? The loop a recording came from, simulated, says so, and offers the estimate that is not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

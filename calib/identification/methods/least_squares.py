@@ -1,7 +1,5 @@
 """The methods of the least-squares family: ordinary, weighted, robust and total, on the rows as they were observed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol

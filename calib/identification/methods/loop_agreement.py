@@ -6,8 +6,6 @@ least squares not at all. Noise of the positions biases least squares, so parame
 torques must side against the loop as well, beside simulated motion, which is free of noise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A failure is a status, not an exception: studies compare methods over conditions
 that says what to do about it is in the estimate, for whoever wants it raised (`MethodEstimate.fit`).
 """
 
-from __future__ import annotations
-
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """All methods by the names that options and files call them, each with what a user asks of it before choosing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from calib.errors import UsageError, suggestion

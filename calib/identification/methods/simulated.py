@@ -1,7 +1,5 @@
 """Methods that simulate the closed loop a recording came from: instrumental variables, and DIDIM."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 from calib.dynamics.idim import IdentificationModel

@@ -9,8 +9,6 @@ With a pull γ towards the prior bodies P_i⁰ = L Lᵀ it is the Euclidean coun
 these coordinates no weight between kg and kg m² is needed; unlike the entropic one it does not keep off the border.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.linalg
 

@@ -1,7 +1,5 @@
 """The bodies that consistent parameters are regularised towards: the CAD's, else rods between the joints."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

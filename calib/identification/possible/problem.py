@@ -1,7 +1,5 @@
 """The cost of standard parameters that belong to bodies that can exist, as arrays: data, prior bodies, drive terms."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

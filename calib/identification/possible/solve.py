@@ -31,8 +31,6 @@ Newton's method solves it in milliseconds, strictly inside the cone; the nearest
 on the border, a semidefinite program for Clarabel (`nearest`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -22,8 +22,6 @@ rest on the fitted torque, and that hardly changes with g). For methods other th
 of WLS with their residuals' spread.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -13,8 +13,6 @@ How much the sizes of these errors differ from one block to another says how far
 sigma is that of which 1.96 hold 95 % where the logarithm of their size has a t distribution.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 

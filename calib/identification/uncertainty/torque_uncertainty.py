@@ -1,7 +1,5 @@
 """What an identified model does not know of its torques: standard deviations from the covariance of its parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One identification on two geometries, the nominal and the calibrated one, from the same torques."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Currents become torques: by gains that are stated, that the file brings, or that a known payload tells."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -14,8 +14,6 @@ Beside what every identification writes (``calib identify --out``)::
     chain_covariance.csv  that of the fit, for whoever goes on from this folder
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The identification as the guided procedure runs it: read, identify, predict other motion, say how far to trust it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

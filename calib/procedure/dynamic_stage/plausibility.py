@@ -4,8 +4,6 @@ The limits and sentences stand there. A finding that makes the numbers of a mode
 holds it at marginal, until the options' ``accept`` says that it is intended.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The second judgement of an identification: tracking with the model fed forward, in numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

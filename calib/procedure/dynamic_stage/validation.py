@@ -3,8 +3,6 @@
 `assess` is called of a model that was just identified and of one read back from its folder; they get the same answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product

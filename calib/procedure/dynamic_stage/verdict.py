@@ -6,8 +6,6 @@ its band; then every joint in the band, and while it moves. `calib explain torqu
 on for each code of chapter 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -17,8 +17,6 @@ limits = ["velocity limits: joint_1 1.92 rad/s (robot description)", ...]
 With ``family = "bspline"`` a joint has ``points``, control points of a periodic spline of ``degree`` on uniform knots.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

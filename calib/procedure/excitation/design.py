@@ -1,7 +1,5 @@
 """Designing exciting motions: a robot's regressor and limits handed to the package `trajectories`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Each is written whole, beside its place, then moved there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

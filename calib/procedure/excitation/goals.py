@@ -5,8 +5,6 @@
 information's determinant, or its smallest singular value, is made as large as can be in place of condition numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

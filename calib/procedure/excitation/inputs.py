@@ -1,7 +1,5 @@
 """What an excitation starts from: a robot's model and limits, joints that rest, and motions that count already."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -26,8 +26,6 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
     resonance = "5 Hz"               # the smallest resonance: all frequencies of the motion stay below
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

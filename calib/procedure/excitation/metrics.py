@@ -1,7 +1,5 @@
 """What ``metrics.json`` of a designed motion holds, as far as a report needs it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 

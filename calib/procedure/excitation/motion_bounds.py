@@ -5,8 +5,6 @@ No file that a robot may play is written without a `MotionBounds` (`calib.proced
 nothing limits. What they are stands at the head of each file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Planning a motion: a path through waypoints, timed by the package `trajectories` on the best model there is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -3,8 +3,6 @@
 The approach leads from where a robot stands to where a motion starts: calm, jerk-limited, held against the limits file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

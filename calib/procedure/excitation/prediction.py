@@ -10,8 +10,6 @@ that its own rules read from the accelerations. What is not known before a log i
 holds. It is taken as a share of the torque limits, stated or `DEFAULT_NOISE`; all sigmas go with it in proportion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -5,8 +5,6 @@ joint, the variance of one sample over the periods (``variance_q``, ``variance_t
 there were: the mean's variance is that over their number.
 """
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of designing and planning motions: one default each, for the commands, the guided run and scripts alike."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal

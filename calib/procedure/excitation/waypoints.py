@@ -6,8 +6,6 @@ plain headers are SI. With both, the place is met and the joints say in which co
 reached from the configuration before it, the first one from --start, or near the middle of the joint limits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

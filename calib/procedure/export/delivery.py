@@ -1,7 +1,5 @@
 """What leaves a session: the calibrated robot in the forms others read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

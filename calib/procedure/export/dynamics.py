@@ -27,8 +27,6 @@ parameters.json alone. Offsets, gear couplings and richer friction have no place
 them, and a note says so. The sign of Coulomb friction was smoothed as tanh(v / v0).
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

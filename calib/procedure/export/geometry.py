@@ -1,7 +1,5 @@
 """The calibrated geometry in the forms other programs read: a URDF in place, UR's kinematics YAML, joint offsets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

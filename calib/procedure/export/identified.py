@@ -1,7 +1,5 @@
 """An identification made ready for export: its estimate, all parameters of possible bodies, and what to say of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

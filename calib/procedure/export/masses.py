@@ -1,7 +1,5 @@
 """Masses and friction of an identified robot in a URDF and in MJCF, each checked against what Pinocchio reads."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """``parameters.json``: all parameters of an identified robot with units and covariances."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

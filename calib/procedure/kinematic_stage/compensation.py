@@ -17,8 +17,6 @@ Joint targets mean the pose that the nominal robot would have at these joints: w
 calibrated robot for ``base``; for the other two with its own best placement of base and target.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

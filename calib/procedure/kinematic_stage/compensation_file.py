@@ -1,7 +1,5 @@
 """What `calib compensate` writes and says."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The fit as the guided procedure runs it: select the model, judge on unseen rows, say what came of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -3,8 +3,6 @@
 A fit's folder is written whole, beside its place, then moved there. Nothing else knows what its files are called.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What a fit works on: the robot, the rows it may learn from, and the rows it must not see."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

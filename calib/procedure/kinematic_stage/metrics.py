@@ -1,7 +1,5 @@
 """What ``metrics.json`` of a fit holds, as values: errors of both arms, the ladder, outliers, the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

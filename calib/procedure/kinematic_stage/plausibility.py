@@ -1,7 +1,5 @@
 """What cannot be of this arm: values for the catalogue's first chapter, which holds the limits and the sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

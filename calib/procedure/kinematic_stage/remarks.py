@@ -1,7 +1,5 @@
 """Rows that do not fit, and whether rigid geometry explains the measurements."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Choosing the poses to measure: a robot's observation Jacobian handed to the package `poses`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """How poses are chosen and a geometry is fitted and judged: one value for command, guided run and scripts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -4,8 +4,6 @@ The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In t
 rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

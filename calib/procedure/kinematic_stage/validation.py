@@ -3,8 +3,6 @@
 `assess` is called by a fit that was just made and by one read back from its folder; they get the same answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

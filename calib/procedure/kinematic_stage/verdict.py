@@ -1,7 +1,5 @@
 """May one trust the calibrated arm? The rules' limits and sentences stand in the catalogue, chapter 4."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 ``[camera]`` of the constraints file states the camera (`calib formats constraints`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

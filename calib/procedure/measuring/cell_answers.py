@@ -4,8 +4,6 @@
 that there is no such thing, and nothing is missing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

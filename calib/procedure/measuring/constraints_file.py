@@ -45,8 +45,6 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     xyz = [0.8, 0.0, -0.05]
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

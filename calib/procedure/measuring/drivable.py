@@ -4,8 +4,6 @@ The same pose on another turn of its joints comes first. Of the candidates the o
 criterion among those that a straight move reaches, or, where there are none, among the best few by via-points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

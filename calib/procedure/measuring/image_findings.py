@@ -1,7 +1,5 @@
 """What a fit says of its images: how well corners are predicted, what the arm adds, where the scale is from."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

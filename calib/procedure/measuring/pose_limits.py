@@ -5,8 +5,6 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -5,8 +5,6 @@ measurements are as noisy as said and the model is the geometry that the poses w
 has the variance tr(J C Jᵀ), J its Jacobian. Effects that the fit adds, and errors that no parameter holds, add to it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ The file of a run has a row per stop, in time order::
     t, pose, q1 [deg], …             t [s]; pose: number of the pose in its list, counted from 1; 0 for a via-point
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """How a measuring run is driven."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -3,8 +3,6 @@
 ``calib select --out poses.csv`` leaves ``poses_prediction.json``; ``calib fit --selection poses.csv`` reads it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ With several targets (reflectors on one plate, each with a direction of its own)
 and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

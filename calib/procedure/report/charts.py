@@ -3,8 +3,6 @@
 Layers are lines, bars, marked levels, words, coloured dots, heat maps, histograms and boxes: nine ways to show numbers.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

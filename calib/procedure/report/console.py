@@ -1,7 +1,5 @@
 """The values of `page` for rich to print: the same tables and sentences that a certificate holds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 from rich import box

@@ -3,8 +3,6 @@
 A certificate draws the latter from what the folder keeps (`calib.procedure.report.figures`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """The dynamics in a report: what the console says of an identification and what stands on the certificate."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

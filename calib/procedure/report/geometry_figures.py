@@ -3,8 +3,6 @@
 Before is light and after is dark everywhere, so that a greyscale print still distinguishes them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The geometry in a report: what the console says of a fit and what stands on its certificate, from the same values."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path

@@ -3,8 +3,6 @@
 `html` and `console` show the same values; nothing here knows of either, nor of a robot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

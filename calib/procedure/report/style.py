@@ -3,8 +3,6 @@
 Margins are matplotlib's constrained layout; text is never read as mathematics, so that a ``$`` in a name is a ``$``.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager

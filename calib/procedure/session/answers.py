@@ -1,7 +1,5 @@
 """What `calib new` is given, by options or at a terminal; loads nothing, so that the command line starts at once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

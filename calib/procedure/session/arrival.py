@@ -1,7 +1,5 @@
 """Messages on measured and recorded files as they come: commanded joints, drift, another motion, reversed torques."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn

@@ -1,7 +1,5 @@
 """The certificate of a session: both stages' findings gathered from its folders and printed on one page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

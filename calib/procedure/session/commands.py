@@ -1,7 +1,5 @@
 """The guided procedure as the commands `calib new`, `next`, `status` and `redo` run it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Many sessions at once, one folder per robot: each goes on as far as it can, and none stops another."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """What each step of a session does. The same functions as the scriptable commands; only the files are the session's."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress

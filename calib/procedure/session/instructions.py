@@ -1,7 +1,5 @@
 """What a session asks of people, in two lines: what to do at the robot, and which file to bring, in which form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from calib.data.csv_table import read_table

@@ -1,7 +1,5 @@
 """Which poses a session asks for: chosen ones for the fit, random ones within the same limits for validation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """What `calib new` needs to know: instruments by name, options or questions at a terminal, each answer checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

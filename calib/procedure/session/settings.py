@@ -3,8 +3,6 @@
 Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter

@@ -1,7 +1,5 @@
 """The steps of a session as a table: what each reads, its settings, what it makes and what people bring to it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

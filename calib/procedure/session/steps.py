@@ -4,8 +4,6 @@ A step is current while its inputs' fingerprints are those recorded when it was 
 are kept and said. Before a step runs, it is marked as running; a killed one is found marked and made again.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import time

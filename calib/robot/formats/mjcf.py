@@ -5,8 +5,6 @@ joint's follower is tied to its leader by an equality, which MuJoCo keeps softly
 There are no meshes: grey capsules without contact and without mass show the links.
 """
 
-from __future__ import annotations
-
 from xml.sax.saxutils import quoteattr
 
 import numpy as np

@@ -1,7 +1,5 @@
 """URDFs as Pinocchio reads them: what was written is held against an independent reader."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 import warnings

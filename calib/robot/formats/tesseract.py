@@ -1,7 +1,5 @@
 """Joint origins as tesseract reads them: the file of ``<calibration_config filename=.../>`` in a SRDF."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

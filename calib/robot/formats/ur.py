@@ -1,7 +1,5 @@
 """UR's own frames: a nominal arm in them, and the kinematics YAML of ur_description."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -13,8 +13,6 @@ The inertia of a moving body includes every link fixed to it, on the way to the 
 actuated joints (a gripper's fingers) are not included.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

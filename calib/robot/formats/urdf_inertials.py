@@ -1,7 +1,5 @@
 """Masses and friction put into the text of a URDF; all else stays, byte for byte (see `urdf_write`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -4,8 +4,6 @@ Reads what the kinematics and the inertias need and nothing else; pictures, tran
 text, where `calib.robot.formats.urdf_write` leaves them untouched.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -13,8 +13,6 @@ chain says about the base; the fixed joints behind the last moving one stay as t
 other elements there (owner n), which the first fixed joint towards the tip then takes up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr

@@ -3,8 +3,6 @@
 A number always has a point, since YAML 1.1 takes 1e-05 for text; a key that could be read as something else is quoted.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

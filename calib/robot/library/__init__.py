@@ -1,7 +1,5 @@
 """Robots as data: one TOML table each, with the source of its numbers."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 

@@ -5,8 +5,6 @@ reprojection error. Seen from afar a plane has a second pose of nearly the same 
 line of sight (Schweighofer & Pinz 2006): both are refined, the better is taken.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Boards to print: SVG and PDF at true scale with a ruler, and their raster for a rendered camera."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

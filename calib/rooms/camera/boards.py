@@ -1,7 +1,5 @@
 """Boards to print, and a first look at images of them, for people: what `calib board` and `calib images` say."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path

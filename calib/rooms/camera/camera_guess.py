@@ -4,8 +4,6 @@ Every image gives the board's pose by its corners alone (`calib.rooms.camera.boa
 place camera and board in closed form (`calib.geometry.images.hand_eye`). Both ways of mounting are tried.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product

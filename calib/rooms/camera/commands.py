@@ -1,7 +1,5 @@
 """A camera as the instrument: board, images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

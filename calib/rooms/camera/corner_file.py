@@ -5,8 +5,6 @@ its ``problem`` and nothing else. Written beside the images, so that they are lo
 program has written is read as well (without ``sigma``: 0.1 px).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

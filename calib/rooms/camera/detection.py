@@ -5,8 +5,6 @@ of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standa
 its patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, and a floor.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -6,8 +6,6 @@ at one stop of the arm the first `max_per_stop` are kept. What is kept is writte
 --board board.toml --out FOLDER``): ``joints.csv``, ``corners.csv``, ``board.toml``, no images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -14,8 +14,6 @@ measurements, unless the options say so ([camera] mounting). A board of another 
 every length of the robot with it: measure the print.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

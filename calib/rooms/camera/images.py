@@ -1,7 +1,5 @@
 """Image files as a sensor gave them: grey, 8 bits, never turned."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

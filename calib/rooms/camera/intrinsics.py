@@ -5,8 +5,6 @@ Pereyra 1973; Kaufman 1975): for a lens every image has its own best pose, and w
 six columns is a least-squares problem in the lens alone. The focal length starts at the best of a few.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What an engineer with a camera brings and knows: its rough place for choosing poses, and a folder of images."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator

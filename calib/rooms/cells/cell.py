@@ -8,8 +8,6 @@ sees the base, too, and reports the tool in the base LEDs' frame: B_i⁻¹ y_i, 
 base's orientation noise acts with the lever between the two.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A calibration of a simulated robot: demo."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import typer

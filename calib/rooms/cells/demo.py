@@ -1,7 +1,5 @@
 """The demonstration: a session on a simulated cell, ended by a comparison with the truth it did not know."""
 
-from __future__ import annotations
-
 import resource
 import sys
 import time

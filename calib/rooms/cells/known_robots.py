@@ -1,7 +1,5 @@
 """Robots with known dynamics and known controllers, from the truths in the library."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

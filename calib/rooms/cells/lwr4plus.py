@@ -4,8 +4,6 @@ Rows of Table 2 are frames 0 to 8, columns alpha [rad], d [m], theta [rad], r [m
 arm in the camera's frame, frame 8 places the LED fixture behind joint 7.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What an engineer brings from the cell: a measured block, or a log, as the CSV files that `calib` reads."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

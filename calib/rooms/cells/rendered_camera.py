@@ -6,8 +6,6 @@ Reflectance is looked up along the ray of every sub-pixel, distortion included. 
 read² + shot · grey. Pixels of a board that bends are looked up on the bent surface.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Errors of a calibration against the hidden truth of a virtual cell: positions, torques, base parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -18,8 +18,6 @@ with z_k' = v_j while |z_k| < s_k (Iwan 1966; the friction ladder's stops are of
 the travel), and on the link's side the spring of a cable, c_j tanh(q_j / 0.5 rad).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ True inertias are the library's, made wrong body by body in a way that keeps eve
 masses, which a calibration is given, are off.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cells to practise on: the LWR4+ of the study, and any robot of the library made wrong on purpose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

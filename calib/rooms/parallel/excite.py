@@ -1,7 +1,5 @@
 """Design an exciting motion of a parallel robot as the command does."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Identify a parallel robot from encoders and motor torques: rows on its platform, its actuators, or their power."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path

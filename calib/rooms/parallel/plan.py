@@ -6,8 +6,6 @@ coordinates (a straight line between each two, where asked for); its timing is t
 (`trajectories.timing.time_scaling`) on the actuators' own motion along it, redundant torques those of least norm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -7,8 +7,6 @@ each actuator), ``trajectory.toml`` (the actuators' positions as Fourier series,
 ``metrics.json``. plan: the same without series.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

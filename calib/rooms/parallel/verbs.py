@@ -1,7 +1,5 @@
 """The verbs of parallel robots, as `calib.procedure.robot_kinds.stage_of` finds them."""
 
-from __future__ import annotations
-
 from calib.procedure.dynamic_stage.folder import check_identification_target
 from calib.procedure.robot_kinds import Stage
 from calib.rooms.parallel.excite import ParallelExcitation, excite_parallel

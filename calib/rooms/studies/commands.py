@@ -1,7 +1,5 @@
 """Comparing methods of identification: study (simulated, truth known), compare (recordings)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

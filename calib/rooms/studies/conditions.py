@@ -34,8 +34,6 @@ The same data set serves all methods. The 15 conditions of Leboutet et al. (2021
 others come with the toolkit: ``calib study --list``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ of a condition share the motion: the best by condition number of `MOTION_TRIES` 
 (self-collisions are not looked at).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Running what a study lacks: tasks to workers, rows to the store as they come."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator

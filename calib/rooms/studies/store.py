@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, get_type_hints
 
 from calib import files
 from calib.errors import CalibError, UsageError, refused_as, require, suggestion
@@ -30,8 +30,7 @@ from calib.rooms.studies.trial import COLUMNS, STATUSES, TrialRow
 JOURNAL, WHOLE, LOCK = "rows.csv", "rows.parquet", "study.lock"
 FORMAT = 1  # of the store: first cell of every header
 _HEAD = (f"calib-study-{FORMAT}", *COLUMNS)
-_KINDS = {"int": int, "float": float, "str": str}
-_TYPES = [_KINDS[str(TrialRow.__dataclass_fields__[name].type)] for name in COLUMNS]
+_TYPES = [get_type_hints(TrialRow)[name] for name in COLUMNS]
 
 
 class RowStore:

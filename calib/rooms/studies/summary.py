@@ -10,8 +10,6 @@ are as good as the best; a method of fewer than `MIN_DATA_SETS` runs is listed a
 taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

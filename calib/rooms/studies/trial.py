@@ -1,7 +1,5 @@
 """One trial: a method on one data set of a condition, as a row of figures of merit. Nothing it raises ends a study."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields

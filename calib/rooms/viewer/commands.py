@@ -1,7 +1,5 @@
 """What a folder holds, in Rerun: view."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

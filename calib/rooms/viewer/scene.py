@@ -4,8 +4,6 @@ A folder is that of a fit, an identification, an excitation, a planned motion, o
 All points are in the base of the arm that is drawn.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass, field, replace
 from pathlib import Path

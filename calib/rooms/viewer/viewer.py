@@ -4,8 +4,6 @@ Everything plays on one clock, the timeline ``time``, in the order of the work: 
 one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

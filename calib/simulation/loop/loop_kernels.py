@@ -20,8 +20,6 @@ passes on: half of the time otherwise. B bodies, n joints, T acts of friction th
     work    (B + 1, 46): pose, velocity 12, acceleration 18, twist 24, force 30, inertia about the origin 36 …
 """
 
-from __future__ import annotations
-
 from math import cos, sin, sqrt
 
 import numpy as np

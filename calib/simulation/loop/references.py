@@ -1,7 +1,5 @@
 """Where the robot shall be: references sampled at the controller's rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

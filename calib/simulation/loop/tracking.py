@@ -4,8 +4,6 @@ A second judgement beside the computed-torque test, which by itself is "not a di
 Shiriaev & Jubien 2019, section 7): an error of torque that the feedback swallows costs nothing here.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.dynamics.idim import IdentificationModel

@@ -11,8 +11,6 @@ from home along a straight line in steps too short to jump to another branch; a 
 as many actuators as freedoms that of the platform, must keep its sign along it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

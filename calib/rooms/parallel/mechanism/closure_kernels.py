@@ -6,8 +6,6 @@ are held. Loops over elements instead of array expressions: numba takes several 
 every array has one kind (C order, of the widest leg), so that each kernel is compiled once.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -13,8 +13,6 @@ plane) is left out. Parameters that depend on each other, gauge included, are re
 prior of `SPREAD`, and keep its covariance where the data do not identify them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -26,8 +26,6 @@ name = "motor1"
 d = 0.28
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

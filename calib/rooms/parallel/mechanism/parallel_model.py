@@ -10,8 +10,6 @@
 last joints, payloads on it after that. χ holds ten standard parameters of each, then the drives' terms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

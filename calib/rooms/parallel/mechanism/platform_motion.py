@@ -1,7 +1,5 @@
 """Motions given by the platform's coordinates x(t): what they need of the robot, with slopes to design them by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 

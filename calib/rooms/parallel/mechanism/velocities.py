@@ -4,8 +4,6 @@ q̇_k = J_k⁺ G_k D v              joints of leg k from the independent parts v
 q̈_k = J_k⁺ (G_k ṫ + g_k)        g_k: acceleration of the attachment at ṫ = 0 less that of the leg's end at q̈_k = 0
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

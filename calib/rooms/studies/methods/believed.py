@@ -1,7 +1,5 @@
 """The robot that a problem's parameters make, to be simulated, and where methods that simulate it start."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -16,8 +16,6 @@ least
 Where innovations are larger than the filter says, the covariance is widened by their mean square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 

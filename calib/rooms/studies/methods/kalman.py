@@ -12,8 +12,6 @@ and then P⁺ = D Dᵀ + N Nᵀ, which a covariance filter adds up, while a squa
 QR of the array [R^½ HS; 0 S] (Kaminski, Bryson & Schmidt 1971).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The survey's methods that nobody calibrates by, each with what a user asks of it before choosing."""
 
-from __future__ import annotations
-
 from calib.identification.methods.method import MethodEntry
 from calib.rooms.studies.methods.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF, UKF
 from calib.rooms.studies.methods.maximum_likelihood import ML

@@ -16,8 +16,6 @@ each log's spectrum and Σ_τ is what makes Σ S_k⁻¹ r_k r_kᵀ S_k⁻¹ = Σ
 equation.)
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Both come to rest at the minimum of ‖R⁻¹ (y - W x)‖²; what they add to i
 that parameters stay within stated bounds. Their noise of training is in the covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -12,8 +12,6 @@ the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`calib.
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

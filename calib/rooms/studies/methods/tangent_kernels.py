@@ -22,8 +22,6 @@ Arrays are those of `loop_kernels`; besides
     own      (B, 10): inertia of each body alone
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

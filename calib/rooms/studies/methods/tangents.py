@@ -1,7 +1,5 @@
 """Closed loops with their slopes by parameters: a whole run at once, or states advanced one at a time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

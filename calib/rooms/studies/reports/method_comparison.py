@@ -11,8 +11,6 @@ where the best predicts no better than no model does (100 %), or where all recor
 that does is left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -7,8 +7,6 @@ summary.csv              one line per condition and method: of every figure its 
 report.html              tables, box plots, the decision rule; one file
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

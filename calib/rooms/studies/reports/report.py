@@ -1,7 +1,5 @@
 """The report of a study: tables, box plots, and the decision rule, as one HTML file; the same tables for a console."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Sequence

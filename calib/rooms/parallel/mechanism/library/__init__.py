@@ -1,7 +1,5 @@
 """Parallel robots as data: one TOML table each (`parallel_files`), with the source of its numbers."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 
