@@ -11,7 +11,7 @@ from differences import check
 from planted import cell, load, measure, perturb, random_joints
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.model_choice.effects import EFFECTS
+from calib.geometry.model_choice.ladder import EFFECTS
 from calib.geometry.observation import observe, predict, prepare, target_jacobian
 from calib.geometry.parameters import layout, step
 from calib.robot.deflection import Deflection, Term

@@ -140,7 +140,7 @@ def fold_statistics(
         found: the model, fitted to all rows.
         measured: the blocks it was fitted to.
         terms: E deflection terms on offer.
-        groups, sizes: (E,) see `calib.geometry.model_choice.effects`.
+        groups, sizes: (E,) see `calib.geometry.model_choice.ladder`.
         reference: chain on which the terms' bases are evaluated.
         folds: partition of the rows.
         torques: gravity torques per block.

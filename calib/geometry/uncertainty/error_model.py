@@ -23,9 +23,8 @@ from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import SETTLED, Gram, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
-from calib.geometry.model_choice.effects import term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
-from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
+from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection, term_groups, term_sizes
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.left_out import LeftOut

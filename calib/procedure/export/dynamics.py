@@ -25,10 +25,14 @@ consistent, the moving link takes all and the others get mass zero. Links on joi
 (fingers) keep theirs, standing at zero. Payloads that were identified are not part of the robot: they are in
 parameters.json alone. Offsets, gear couplings and richer friction have no place in URDF and MJCF; parameters.json has
 them, and a note says so. The sign of Coulomb friction was smoothed as tanh(v / v0).
+
+``parameters.json``: all parameters of an identified robot with units and covariances.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,12 +40,57 @@ from calib import files
 from calib.folders import DRIVES, JOINT_ORIGINS, MJCF, PARAMETERS, write_staged
 from calib.procedure.export.identified import IdentifiedRobot, exported_prediction, notes_of, read
 from calib.procedure.export.masses import as_mjcf, as_urdf
-from calib.procedure.export.parameters import parameters
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.robot.calibrated import nominal_of
 from calib.robot.formats import urdf_write
 from calib.robot.formats.markup import text
 from calib.robot.formats.tesseract import joint_origins
+
+
+def parameters(given: IdentifiedRobot) -> dict[str, Any]:
+    """Return the content of ``parameters.json``."""
+    estimate, found, chain = given.information, given.found, given.chain
+    model = found.dynamics.model
+    covariance = given.robot.covariance
+    return {
+        "robot": chain.name,
+        "geometry": {
+            **_columns(chain.names, chain.units, chain.values),
+            "nominal": nominal_of(given.robot).values.tolist(),
+            "covariance": None if covariance is None else np.asarray(covariance).tolist(),
+        },
+        "dynamics": {
+            "gravity": model.bodies.gravity.tolist(),
+            "rows": model.torque_rows.name,
+            "base": {
+                **_columns(estimate.names, estimate.units, estimate.values),
+                "covariance": estimate.covariance.tolist(),
+            },
+            "standard": {
+                **_columns(model.names, model.units, found.dynamics.values),
+                "covariance": found.covariance.tolist(),
+                "frames": "about the chain's frame behind each joint (robot.toml), payloads about the tip",
+            },
+            "consistency": {
+                "possible": found.possible,
+                "nearest": found.nearest,
+                "distance": found.distance,
+                "allowed": found.allowed,
+                "margins_m": dict(zip(model.bodies.labels, found.margins.tolist())),
+                "weight": found.weight,
+                "prior": found.prior,
+                "sigmas_widened_by": found.doubt,
+                "drawn_to": found.source,
+                "blamed": dict(found.blamed),
+                "notes": list(found.notes),
+            },
+        },
+    }
+
+
+def _columns(names: Sequence[str], units: Sequence[str], values: np.ndarray) -> dict[str, Any]:
+    return {"names": list(names), "units": list(units), "values": np.asarray(values).tolist()}
+
 
 TABLE = ("joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit")
 SIGMAS = ("armature_sigma", "damping_sigma", "friction_sigma", "offset_sigma")

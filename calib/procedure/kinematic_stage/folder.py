@@ -31,7 +31,7 @@ from calib.procedure.kinematic_stage.metrics import (
     OutlierRow,
     ValidationMetrics,
 )
-from calib.procedure.kinematic_stage.remarks import Outlier
+from calib.procedure.kinematic_stage.plausibility import Outlier
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
 from calib.records import read_json, read_record, shielded

@@ -9,7 +9,7 @@ from calib.errors import Finding, finding
 from calib.procedure.findings import Verdict, catalogue, level_of, sentence
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.metrics import Findings
-from calib.procedure.kinematic_stage.remarks import FLOOR, TOO_GOOD
+from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
 
 RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry explains the measurements
 

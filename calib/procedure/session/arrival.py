@@ -11,7 +11,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plans import MAX_JOINT_DIFFERENCE
 from calib.data.recordings.recording import Recording
 from calib.errors import Finding, finding, refuse_data
-from calib.geometry.checks.drift import drift_between, drift_within, noise_of_difference
+from calib.geometry.checks.repeatability import drift_between, drift_within, noise_of_difference
 from calib.identification.checks.recorded_motion import (
     DesignedMotion,
     DifferentMotion,

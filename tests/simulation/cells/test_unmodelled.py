@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.dynamics.gravity import gravity_torques
-from calib.geometry.model_choice.effects import EFFECTS
+from calib.geometry.model_choice.ladder import EFFECTS
 from calib.robot.chain import random_joints
 from calib.robot.deflection import Deflection, evaluate
 from calib.rooms.cells.cell import true_poses
