@@ -20,7 +20,7 @@ from calib.data.poses.target_files import Targets, read_targets
 from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict
-from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
+from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import selection_prediction
 from calib.procedure.measuring.run import write_run
@@ -236,13 +236,13 @@ class JointCommands:
         A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
-            return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
+            return compensation.write(self.commands, self.fitted, self.targets, Path(path), partial)
 
     def __repr__(self) -> str:
         return f"<JointCommands: {int(self.commands.reached.sum())} of {len(self.q)} targets reached>"
 
     def __str__(self) -> str:
-        return "\n".join(compensation_file.lines(self.commands, self.targets, self.fitted))
+        return "\n".join(compensation.lines(self.commands, self.targets, self.fitted))
 
 
 @checked

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.geometry.uncertainty.unevenness import Unevenness, unevenness
+from calib.geometry.uncertainty.left_out import Unevenness, unevenness
 
 
 def drawn(loud: float, count: int = 300) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@
 
 with Σ the parameters' covariance, d the distance of q from the nearest pose of the fit and g that from
 the ranges of single joints that were, every joint counting by its lever [m]. s says where errors are larger than
-elsewhere (`calib.geometry.uncertainty.unevenness`). κ and v are the most probable ones of errors on held-out rows: at
+elsewhere (`calib.geometry.uncertainty.left_out`). κ and v are the most probable ones of errors on held-out rows: at
 random (near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius
 that holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.uncertainty.left_out`): nothing
 is said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the
@@ -27,9 +27,8 @@ from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection, term_groups, term_sizes
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
-from calib.geometry.uncertainty.left_out import LeftOut
+from calib.geometry.uncertainty.left_out import LeftOut, Profile, unevenness
 from calib.geometry.uncertainty.spread import pose_sigmas
-from calib.geometry.uncertainty.unevenness import Profile, unevenness
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
