@@ -69,8 +69,8 @@ class GeometricFit:
         """The calibrated robot of a fit without joint corrections; with some, see `calibrated_chain`."""
         return calibrated_chain(self)
 
-    def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float]]:
-        """Return (file, row, label, size in robust sigmas) of rows that do not fit, worst first.
+    def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
+        """Return (file, row, label, size in robust sigmas, size [m or rad]) of rows that do not fit, worst first.
 
         Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
         that an optimistic instrument does not make every row an outlier.
@@ -79,9 +79,10 @@ class GeometricFit:
         for piece in self.pieces:
             measured, part = self.blocks[piece.block].measured, piece.part.per_row()
             size = np.sqrt(np.mean(part.value**2, axis=0)) / max(robust.spread(part.value), 1e-15)
-            rows = measured.rows[part.index]
+            rows, sizes = measured.rows[part.index], part.sizes()
             result += [
-                (measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)
+                (measured.file, int(rows[i]), part.label, float(size[i]), float(sizes[i]))
+                for i in np.flatnonzero(size > threshold)
             ]
         return sorted(result, key=lambda item: -item[3])
 

@@ -203,7 +203,7 @@ def test_bad_corners_and_images_are_named_and_do_little_harm():
     pixel[3, 10] += [6.0, -4.0]
     pixel[17] += 40.0
     found = fit(start, [replace(block, pixel=pixel)], candidates, settings=Settings(loss="cauchy"))
-    named = [row for _, row, label, _ in found.outliers(8.0) if label == "position"]
+    named = [row for _, row, label, *_ in found.outliers(8.0) if label == "position"]
     assert named[0] == 18
     weight = found.pieces[0].weight
     part = found.pieces[0].part

@@ -19,7 +19,7 @@ Rows that stand twice in what was measured: copied, or a file given twice. They 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -29,6 +29,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare
+from calib.records import stored
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.words import counted
@@ -100,64 +101,98 @@ def _compared(
 
 
 SAME = 1e-3  # joints of one commanded pose, as read back, differ by less [rad or m]; our choice, as the next two
+ARMS = ("nominal", "calibrated")
+MeanAndMax = Mapping[str, float]
 APART = np.radians(30.0)  # directions of approach that differ by more are different ones
 
 
-@dataclass(frozen=True, eq=False)
-class Repeats:
-    """P poses that were measured several times.
+@dataclass(frozen=True)
+class RepeatedPose:
+    """One pose measured several times: its rows, AP of both arms per axis in the arm's base, RP, vAP; mm and deg."""
 
-    Attributes:
-        rows: per pose, the file's rows of its cycles.
-        cycles: (P,) how many.
-        accuracy: (P, 3) barycentre minus command, in the axes of the arm's base [m].
-        repeatability: (P,) RP [m].
-        turn_accuracy, turn_repeatability: (P, 3) of orientations about the base's axes [rad]; None for positions.
-        variation: (P,) vAP [m]; NaN where all cycles came from one direction.
-    """
-
-    rows: tuple[np.ndarray, ...]
-    cycles: np.ndarray
-    accuracy: np.ndarray
-    repeatability: np.ndarray
-    turn_accuracy: np.ndarray | None
-    turn_repeatability: np.ndarray | None
-    variation: np.ndarray
+    rows: tuple[int, ...]
+    repeatability_mm: float
+    nominal_mm: tuple[float, ...]
+    calibrated_mm: tuple[float, ...]
+    repeatability_deg: tuple[float, ...] = ()
+    multidirectional_mm: float | None = None
+    nominal_deg: tuple[float, ...] = ()
+    calibrated_deg: tuple[float, ...] = ()
 
 
-def repeats(
-    cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None, same: float = SAME
-) -> Repeats | None:
+@dataclass(frozen=True)
+class RepeatedPoses:
+    """Accuracy and repeatability of poses that were measured several times: each, and mean and largest of all."""
+
+    each: tuple[RepeatedPose, ...]
+
+    @stored
+    def poses(self) -> int:
+        """How many."""
+        return len(self.each)
+
+    @stored
+    def cycles(self) -> tuple[int, int]:
+        """The fewest and the most cycles of a pose."""
+        counts = [len(one.rows) for one in self.each]
+        return min(counts), max(counts)
+
+    @stored
+    def repeatability_mm(self) -> MeanAndMax:
+        """RP."""
+        return _mean_and_max([one.repeatability_mm for one in self.each])
+
+    @stored
+    def accuracy_mm(self) -> dict[str, MeanAndMax]:
+        """AP of each arm."""
+        return {arm: _mean_and_max([np.linalg.norm(getattr(one, f"{arm}_mm")) for one in self.each]) for arm in ARMS}
+
+    @stored
+    def orientation_repeatability_deg(self) -> MeanAndMax | None:
+        """RP of orientations, the largest of three axes."""
+        return _sizes([max(one.repeatability_deg) for one in self.each if one.repeatability_deg])
+
+    @stored
+    def orientation_accuracy_deg(self) -> dict[str, MeanAndMax | None]:
+        """AP of orientations of each arm."""
+        turns = {arm: [getattr(one, f"{arm}_deg") for one in self.each] for arm in ARMS}
+        return {arm: _sizes([np.linalg.norm(turn) for turn in each if turn]) for arm, each in turns.items()}
+
+    @stored
+    def multidirectional_mm(self) -> MeanAndMax | None:
+        """VAP."""
+        return _sizes([one.multidirectional_mm for one in self.each if one.multidirectional_mm is not None])
+
+
+def _mean_and_max(values: Sequence[Any]) -> MeanAndMax:
+    return {"mean": float(np.mean(values)), "max": float(np.max(values))}
+
+
+def _sizes(values: Sequence[Any]) -> MeanAndMax | None:
+    return _mean_and_max(values) if values else None
+
+
+def repeated_poses(
+    cells: tuple[Installation, Installation], measured: Sequence[PoseMeasurements], torques: Torques = None
+) -> RepeatedPoses | None:
     """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without any.
 
     Args:
-        cell: the arm whose commands are meant.
+        cells: the nominal and the calibrated arm, whose commands are meant.
         measured: blocks; those without an instrument say nothing of it.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
-        same: joints that differ by no more are one commanded pose [rad or m].
     """
+    ready = zip(measured, *(prepare(cell, measured, torques) for cell in cells))
     found = [
-        _one(cell, block, block.measured, index)
-        for block in prepare(cell, measured, torques)
-        if isinstance(block.measured, Positions)
-        for index in repeated_rows(block.measured, same)
+        _repeated_pose(cells, blocks, block, index)
+        for block, *blocks in ready
+        if isinstance(block, Positions)
+        for index in repeated_rows(block)
     ]
-    if not found:
-        return None
-    rows, shift, spread, turn, about, variation = zip(*found)
-    whole = all(each is not None for each in turn)
-    return Repeats(
-        rows,
-        np.array([len(each) for each in rows]),
-        np.array(shift),
-        np.array(spread),
-        np.array(turn) if whole else None,
-        np.array(about) if whole else None,
-        np.array(variation),
-    )
+    return RepeatedPoses(tuple(found)) if found else None
 
 
-def repeated_rows(measured: PoseMeasurements, same: float = SAME) -> list[np.ndarray]:
+def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
     """Return for each pose measured at least `min_cycles` times the indices of its rows, in the file's order.
 
     Rows with the very same numbers are copies of one measurement and count once. Empty for kinds without positions.
@@ -168,7 +203,7 @@ def repeated_rows(measured: PoseMeasurements, same: float = SAME) -> list[np.nda
     _, first = np.unique(np.round(table, 12), axis=0, return_index=True)
     rows = np.sort(first)
     key = np.hstack([measured.q[rows], 1e3 * measured.tool[rows, None]])  # another reflector is another pose
-    near = KDTree(key).query_ball_point(key, same, p=np.inf)
+    near = KDTree(key).query_ball_point(key, SAME, p=np.inf)
     groups, taken = [], np.zeros(len(rows), dtype=bool)
     min_cycles = 3  # cycles that make a repeated pose
     for k, each in enumerate(near):
@@ -185,21 +220,32 @@ def spread(points: np.ndarray) -> float:
     return float(length.mean() + 3.0 * length.std(ddof=1))
 
 
-def _one(cell: Installation, block: Block, measured: Positions, index: np.ndarray) -> tuple:
-    """Return rows, accuracy, repeatability, those of orientation or None, and variation of one pose."""
-    seen = predict(cell, block)
-    base = cell.stations[block.station][:3, :3]
+def _repeated_pose(
+    cells: Sequence[Installation], blocks: Sequence[Block], measured: Positions, index: np.ndarray
+) -> RepeatedPose:
+    """Return accuracy and repeatability of one pose by its rows."""
     points = measured.position[index]
-    command, shift = seen.point[:, index].mean(axis=1), points.mean(axis=0)
-    turn, about = None, None
-    if isinstance(measured, Poses):
-        turns = Rotation.from_quat(measured.quaternion[index])
-        middle = turns.mean()
-        wanted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)[index]).mean()
-        turn = base.T @ (middle * wanted.inv()).as_rotvec()
-        about = 3.0 * ((turns * middle.inv()).as_rotvec() @ base).std(axis=0, ddof=1)
-    variation = _variation(points, _directions(measured, index))
-    return measured.rows[index], base.T @ (shift - command), spread(points), turn, about, variation
+    turns = Rotation.from_quat(measured.quaternion[index]) if isinstance(measured, Poses) else None
+    own: dict[str, Any] = {}
+    for arm, cell, block in reversed(list(zip(ARMS, cells, blocks))):
+        seen, base = predict(cell, block), cell.stations[block.station][:3, :3]
+        own[f"{arm}_mm"] = _numbers(1e3 * base.T @ (points.mean(axis=0) - seen.point[:, index].mean(axis=1)))
+        if turns is not None:
+            middle, command = turns.mean(), Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)[index]).mean()
+            own[f"{arm}_deg"] = _numbers(np.degrees(base.T @ (middle * command.inv()).as_rotvec()))
+            spread_about = 3.0 * ((turns * middle.inv()).as_rotvec() @ base).std(axis=0, ddof=1)
+            own["repeatability_deg"] = _numbers(np.degrees(spread_about))
+    varied = _variation(points, _directions(measured, index))
+    return RepeatedPose(
+        tuple(int(row) for row in measured.rows[index]),
+        1e3 * spread(points),
+        multidirectional_mm=None if np.isnan(varied) else 1e3 * varied,
+        **own,
+    )
+
+
+def _numbers(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(values.tolist())
 
 
 def _directions(measured: Positions, index: np.ndarray) -> np.ndarray:
@@ -256,8 +302,8 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
     for block in fit:
         marks = _marks(block)
         first = {mark: k for k, mark in reversed(list(enumerate(marks)))}
-        within = _numbers(block, [first[mark] < k for k, mark in enumerate(marks)])
-        before = _numbers(block, [mark in known for mark in marks])
+        within = _row_numbers(block, [first[mark] < k for k, mark in enumerate(marks)])
+        before = _row_numbers(block, [mark in known for mark in marks])
         name = Path(block.file).name
         if within:
             notes.append(f"{name}: {_rows(within)} with the numbers of another row there: counted twice?")
@@ -270,9 +316,9 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
         copied = [mark in known for mark in _marks(aside.block)]
         again = _measured_again(fit, aside.block) & ~np.array(copied, dtype=bool)
         for chosen, words in ((copied, "with the numbers of a row of the fit"), (again, "at joints that were fitted")):
-            if told := _numbers(aside.block, chosen):
+            if told := _row_numbers(aside.block, chosen):
                 notes.append(f"{name}: {_rows(told)} {words}: not unseen")
-        same = _numbers(aside.block, again | copied)
+        same = _row_numbers(aside.block, again | copied)
         if len(same) > max_copied_share * len(aside.block) and not aside.held_out:
             proofless.add(name)
     return proofless, notes
@@ -292,7 +338,7 @@ def _marks(block: PoseMeasurements) -> list[bytes]:
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
-def _numbers(block: PoseMeasurements, chosen: Sequence[bool] | np.ndarray) -> list[int]:
+def _row_numbers(block: PoseMeasurements, chosen: Sequence[bool] | np.ndarray) -> list[int]:
     return [int(row) for row in dict.fromkeys(block.rows[np.array(chosen, dtype=bool)])]
 
 

@@ -124,7 +124,7 @@ class ModelStep:
     Attributes:
         model: its name, e.g. ``geometry`` or ``+ harmonics``.
         parameters: how many it fits.
-        cross_validated: rms error on unseen rows [m].
+        cross_validated_mm: rms error on unseen rows; None where an earlier version did not keep it.
         kept: whether the climb goes on from here.
         note: why, in words.
         corrections: how many of the parameters are small joint corrections, shrunk by a ridge.
@@ -132,10 +132,15 @@ class ModelStep:
 
     model: str
     parameters: int
-    cross_validated: float
+    cross_validated_mm: float | None
     kept: bool
     note: str = ""
     corrections: int = 0
+
+    @property
+    def cross_validated(self) -> float:
+        """The rms error on unseen rows [m]."""
+        return np.nan if self.cross_validated_mm is None else 1e-3 * self.cross_validated_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +279,7 @@ class _Climber:
             better = unseen < error * (1.0 - MIN_GAIN)
             wanted = better if model == "auto" else name == last
             self.rungs.append(
-                ModelStep(name, len(found.free), unseen, wanted, "" if better else "no better on unseen rows")
+                ModelStep(name, len(found.free), 1e3 * unseen, wanted, "" if better else "no better on unseen rows")
             )
             self.full = found if name == "geometry" else None
             if wanted:
@@ -372,7 +377,7 @@ class _Climber:
     ) -> ModelStep:
         rms = statistics.error(where).rms if rms is None else rms
         shrunk = statistics.alive(where)
-        return ModelStep(name, statistics.rigid + shrunk, rms, kept, note, shrunk)
+        return ModelStep(name, statistics.rigid + shrunk, 1e3 * rms, kept, note, shrunk)
 
     def _final(self, statistics: FoldStatistics, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
         """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""

@@ -9,21 +9,14 @@ from typing import Any
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics
-from calib.geometry.checks.repeatability import Repeats, repeats
+from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
+from calib.geometry.checks.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
-from calib.procedure.kinematic_stage.metrics import (
-    BothArms,
-    ComparedRows,
-    IntervalCoverage,
-    MeanAndMax,
-    RepeatedPose,
-    RepeatedPoses,
-)
+from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
 from calib.procedure.measuring.image_findings import reprojection
 from calib.robot.chain import Chain
 
@@ -153,7 +146,7 @@ def compare(
     corners: Any = tuple(reprojection(cell, blocks, torques) for cell in cells)
     return Comparison(
         tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, _repeated_poses(cells, blocks, torques), None if None in corners else corners,
+        shares_frames, repeated_poses(cells, blocks, torques), None if None in corners else corners,
     )  # fmt: skip
 
 
@@ -222,72 +215,17 @@ def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
     return gravity_torques(chain, block.q)
 
 
-POSES, CYCLES, USUAL_POSES = 5, 30, 100  # what the norm asks for; how many poses makers judge accuracy by
-ARMS = ("nominal", "calibrated")
-
-
-def _repeated_poses(
-    cells: tuple[Installation, Installation], blocks: Sequence[PoseMeasurements], torques: Torques
-) -> RepeatedPoses | None:
-    """Return accuracy and repeatability of repeated poses for both arms; None where there are none.
-
-    Args:
-        cells: nominal and calibrated arm.
-        blocks: the rows.
-        torques: gravity torques (m, n) per block [N m].
-    """
-    one, two = (repeats(cell, blocks, torques) for cell in cells)
-    if one is None or two is None:
-        return None
-    several = one.variation[~np.isnan(one.variation)]
-    spread, turns = one.turn_repeatability, [each.turn_accuracy for each in (one, two)]
-    turned = [_sizes(np.degrees(np.linalg.norm(turn, axis=1))) for turn in turns if turn is not None]
-    return RepeatedPoses(
-        poses=len(one.cycles),
-        cycles=(int(one.cycles.min()), int(one.cycles.max())),
-        repeatability_mm=_sizes(1e3 * one.repeatability),
-        accuracy_mm=BothArms(*(_sizes(1e3 * np.linalg.norm(each.accuracy, axis=1)) for each in (one, two))),
-        each=tuple(_pose(k, one, two) for k in range(len(one.cycles))),
-        orientation_repeatability_deg=None if spread is None else _sizes(np.degrees(spread).max(axis=1)),
-        orientation_accuracy_deg=BothArms(*turned) if turned else None,
-        multidirectional_mm=_sizes(1e3 * several) if len(several) else None,
-    )
-
-
-def _sizes(values: np.ndarray) -> MeanAndMax:
-    return MeanAndMax(float(values.mean()), float(values.max()))
-
-
-def _pose(k: int, one: Repeats, two: Repeats) -> RepeatedPose:
-    """Return one pose: its rows, AP of both arms per axis, RP, and vAP where there is one."""
-
-    def degrees(turn: np.ndarray | None) -> tuple[float, ...]:
-        return () if turn is None else tuple(np.degrees(turn[k]).tolist())
-
-    return RepeatedPose(
-        rows=tuple(int(row) for row in one.rows[k]),
-        repeatability_mm=1e3 * float(one.repeatability[k]),
-        nominal_mm=tuple((1e3 * one.accuracy[k]).tolist()),
-        calibrated_mm=tuple((1e3 * two.accuracy[k]).tolist()),
-        repeatability_deg=degrees(one.turn_repeatability),
-        multidirectional_mm=None if np.isnan(one.variation[k]) else 1e3 * float(one.variation[k]),
-        nominal_deg=degrees(one.turn_accuracy),
-        calibrated_deg=degrees(two.turn_accuracy),
-    )
-
-
-def iso9283_sentence(found: RepeatedPoses) -> str:
-    """Return RP and AP of repeated poses as a sentence."""
+def iso9283_sentence(found: RepeatedPoses, min_poses: int = 5, min_cycles: int = 30, usual_poses: int = 100) -> str:
+    """Return RP and AP of repeated poses as a sentence; the norm asks for `min_poses` and `min_cycles`."""
     least, most = found.cycles
     cycles = f"{least}" if least == most else f"{least} to {most}"
-    accuracy, repeatability = found.accuracy_mm, found.repeatability_mm
+    nominal, calibrated = (found.accuracy_mm[arm]["mean"] for arm in ARMS)
     words = (
-        f"ISO 9283 on {found.poses} poses repeated {cycles} times: RP {repeatability.mean:.3f} mm "
-        f"(at most {repeatability.max:.3f}), AP {accuracy.nominal.mean:.3f} mm nominal, "
-        f"{accuracy.calibrated.mean:.3f} mm calibrated"
+        f"ISO 9283 on {found.poses} poses repeated {cycles} times: RP {found.repeatability_mm['mean']:.3f} mm "
+        f"(at most {found.repeatability_mm['max']:.3f}), AP {nominal:.3f} mm nominal, {calibrated:.3f} mm calibrated"
     )
-    few = [f"{POSES} poses"] * (found.poses < POSES) + [f"{CYCLES} cycles"] * (least < CYCLES)
+    few = [f"{min_poses} poses"] * (found.poses < min_poses) + [f"{min_cycles} cycles"] * (least < min_cycles)
     words += f"; the norm asks for {' and '.join(few)}" if few else ""
     return words + (
-        f"; too few poses to state an accuracy (makers take {USUAL_POSES})" if found.poses < USUAL_POSES else ""
+        f"; too few poses to state an accuracy (makers take {usual_poses})" if found.poses < usual_poses else ""
     )

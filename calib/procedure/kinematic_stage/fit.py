@@ -25,8 +25,8 @@ from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import Comparison, gravity_of
 from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.metrics import Findings
-from calib.procedure.kinematic_stage.plausibility import Outlier, gross_rows, misfit, named_outliers
+from calib.procedure.kinematic_stage.metrics import Findings, Outlier
+from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.image_findings import image_notes

@@ -5,7 +5,7 @@ A fit's folder is written whole, beside its place, then moved there. Nothing els
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,16 +22,7 @@ from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.metrics import (
-    JUDGED,
-    SCHEMA,
-    Findings,
-    FitMetrics,
-    LadderStep,
-    OutlierRow,
-    ValidationMetrics,
-)
-from calib.procedure.kinematic_stage.plausibility import Outlier
+from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
 from calib.records import read_json, read_record, shielded
@@ -249,29 +240,19 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
 
 def metrics(outcome: Outcome) -> FitMetrics:
     """Return the content of ``metrics.json``."""
-    judged, tolerance = outcome.assessment.record, outcome.wanted.tolerance
+    tolerance = outcome.wanted.tolerance
     return FitMetrics(
+        **vars(outcome.assessment.record),
         fit=outcome.fit.record(len(outcome.selection.fit.free)),
         model=outcome.selection.chosen,
-        ladder=tuple(
-            LadderStep(r.model, r.parameters, 1e3 * r.cross_validated, r.kept, r.note, r.corrections)
-            for r in outcome.selection.rungs
-        ),
+        ladder=outcome.selection.rungs,
         seed=outcome.wanted.seed,
         status=outcome.selection.fit.solution.status.name.lower(),
         tolerance_mm=None if tolerance is None else 1e3 * tolerance,
         not_identifiable=tuple(lines_of(outcome.unclear)),
-        outliers=tuple(map(_outlier_row, outcome.outliers)),
+        outliers=tuple(outcome.outliers),
         findings=outcome.findings,
-        **{name: getattr(judged, name) for name in JUDGED},
     )
-
-
-def _outlier_row(one: Outlier) -> OutlierRow:
-    row = OutlierRow(one.file, one.row, one.nature, one.sigmas)
-    if one.nature == "orientation":
-        return replace(row, size_deg=float(np.degrees(one.size)))
-    return replace(row, size_mm=1e3 * one.size)
 
 
 def _record(outcome: Outcome) -> dict[str, object]:

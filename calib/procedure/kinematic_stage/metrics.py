@@ -2,59 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from calib.errors import Finding
 from calib.geometry.accuracy import ArmErrors, ErrorStatistics
+from calib.geometry.checks.repeatability import RepeatedPoses
+from calib.geometry.model_choice.ladder import ModelStep
 from calib.geometry.uncertainty.error_model import Discrepancy
 from calib.procedure.findings import Verdict
 
-JUDGED = ("validation", "verdict", "reason", "code", "advice", "warnings", "noticed", "deliverables", "deliverable")
-"""What `FitMetrics` and `ValidationMetrics` have in common."""
 SCHEMA = 3  # of metrics.json; 1 had no findings, 2 kept sentences in place of codes
-
-
-@dataclass(frozen=True)
-class MeanAndMax:
-    """Of some sizes."""
-
-    mean: float
-    max: float
-
-
-@dataclass(frozen=True)
-class BothArms:
-    """The same of the nominal and of the calibrated arm."""
-
-    nominal: MeanAndMax
-    calibrated: MeanAndMax
-
-
-@dataclass(frozen=True)
-class RepeatedPose:
-    """One pose measured several times: its rows, AP of both arms per axis, RP, vAP; mm and deg."""
-
-    rows: tuple[int, ...]
-    repeatability_mm: float
-    nominal_mm: tuple[float, ...]
-    calibrated_mm: tuple[float, ...]
-    repeatability_deg: tuple[float, ...] = ()
-    multidirectional_mm: float | None = None
-    nominal_deg: tuple[float, ...] = ()
-    calibrated_deg: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
-class RepeatedPoses:
-    """Accuracy and repeatability of poses that were measured several times (`iso9283`)."""
-
-    poses: int
-    cycles: tuple[int, int]
-    repeatability_mm: MeanAndMax
-    accuracy_mm: BothArms
-    each: tuple[RepeatedPose, ...] = ()
-    orientation_repeatability_deg: MeanAndMax | None = None
-    orientation_accuracy_deg: BothArms | None = None
-    multidirectional_mm: MeanAndMax | None = None
 
 
 @dataclass(frozen=True)
@@ -104,20 +61,8 @@ class ComparedRows:
 
 
 @dataclass(frozen=True)
-class LadderStep:
-    """One model tried, with its error on held-out rows; of its parameters `corrections` are shrunk by a ridge."""
-
-    model: str
-    parameters: int
-    cross_validated_mm: float | None
-    kept: bool
-    note: str = ""
-    corrections: int = 0
-
-
-@dataclass(frozen=True)
-class OutlierRow:
-    """A row that does not fit, in robust standard deviations and in mm or deg."""
+class Outlier:
+    """A row that does not fit: its residual in robust standard deviations of all rows, and in mm or deg."""
 
     file: str
     row: int
@@ -125,6 +70,16 @@ class OutlierRow:
     sigmas: float
     size_mm: float | None = None
     size_deg: float | None = None
+
+    @property
+    def size(self) -> str:
+        """Its residual with the unit."""
+        return f"{self.size_mm:.3g} mm" if self.size_deg is None else f"{self.size_deg:.3g} deg"
+
+    @property
+    def words(self) -> str:
+        """File, row and size."""
+        return f"{Path(self.file).name} row {self.row} ({self.size}, {self.sigmas:.1f} sigma)"
 
 
 @dataclass(frozen=True)
@@ -156,7 +111,7 @@ class Findings:
     rigid_cross_validated: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ValidationMetrics:
     """What holding a fit against unseen rows came to: their errors, the verdict, what to know.
 
@@ -179,29 +134,19 @@ class ValidationMetrics:
     deliverable: str = ""
 
 
-@dataclass(frozen=True)
-class FitMetrics:
+@dataclass(frozen=True, kw_only=True)
+class FitMetrics(ValidationMetrics):
     """The content of ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
 
     fit: ComparedRows
-    validation: Mapping[str, ComparedRows]
     model: str
-    ladder: tuple[LadderStep, ...]
+    ladder: tuple[ModelStep, ...]
     seed: int
-    verdict: str
-    reason: str
     tolerance_mm: float | None
-    warnings: tuple[str, ...]
     not_identifiable: tuple[str, ...]
-    outliers: tuple[OutlierRow, ...]
+    outliers: tuple[Outlier, ...]
     findings: Findings | None = None
-    noticed: tuple[Finding, ...] = ()
-    code: str = ""
-    advice: str = ""
-    schema: int = SCHEMA
     status: str = ""
-    deliverables: Mapping[str, Verdict] = field(default_factory=dict)
-    deliverable: str = ""
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:

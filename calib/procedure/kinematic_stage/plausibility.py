@@ -4,8 +4,6 @@ Rows that do not fit, and whether rigid geometry explains the measurements.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -18,43 +16,22 @@ from calib.geometry.checks.instrument_scale import Scale, length_factor, mirrore
 from calib.geometry.checks.joint_signs import reversed_joints
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.observation import observe
 from calib.geometry.result import GeometricFit
 from calib.procedure.findings import level_of, limit
+from calib.procedure.kinematic_stage.metrics import Outlier
 from calib.units import ERRORS
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
 TOO_GOOD = 2e-6  # rms [m]: less is left by no instrument (our choice)
 
 
-@dataclass(frozen=True)
-class Outlier:
-    """A row that does not fit: how large its residual is [m or rad], and in robust standard deviations of all rows."""
-
-    file: str
-    row: int
-    nature: str
-    sigmas: float
-    size: float
-
-    @property
-    def words(self) -> str:
-        factor, unit = ERRORS[self.nature]
-        return f"{Path(self.file).name} row {self.row} ({factor * self.size:.3g} {unit}, {self.sigmas:.1f} sigma)"
-
-
 def named_outliers(found: GeometricFit) -> list[Outlier]:
     """Return rows of the fit beyond four robust sigmas, worst first; several targets of one row count once."""
-    sizes: dict[tuple[str, int, str], float] = {}
-    for block in found.blocks:
-        for each in observe(found.cell, block, np.array([], dtype=int)):
-            part = each.per_row()
-            for row, size in zip(_file_rows(block.measured)[part.index], part.sizes()):
-                key = block.measured.file, int(row), part.label
-                sizes[key] = max(float(size), sizes.get(key, 0.0))
     result: dict[tuple[str, int, str], Outlier] = {}
-    for file, row, label, sigmas in found.outliers():
-        result.setdefault((file, row, label), Outlier(file, row, NATURE[label], sigmas, sizes[file, row, label]))
+    for file, row, label, sigmas, size in found.outliers():
+        factor, unit = ERRORS[NATURE[label]]
+        one = Outlier(file, row, NATURE[label], sigmas, **{f"size_{unit}": factor * size})
+        result.setdefault((file, row, label), one)
     return list(result.values())
 
 
@@ -109,10 +86,6 @@ def _left(found: GeometricFit) -> float:
 def _remains(found: ModelSelection, reach: float) -> float:
     """Return what the chosen model leaves on held-out rows, over `FLOOR` of the reach."""
     return ([rung.cross_validated for rung in found.rungs if rung.kept] or [np.inf])[-1] / (FLOOR * reach)
-
-
-def _file_rows(block: PoseMeasurements) -> np.ndarray:
-    return block.rows
 
 
 MAX_TURN, MAX_SHIFT = 0.1, 0.03  # of a healthy arm's elements [rad], of the reach (our choice)

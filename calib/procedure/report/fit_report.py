@@ -18,7 +18,7 @@ from calib.geometry.parameters import layout
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
-from calib.procedure.kinematic_stage.metrics import JUDGED, FitMetrics, ValidationMetrics
+from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
 from calib.procedure.measuring.image_findings import ImageCoverage, image_coverage
 from calib.records import read_json
@@ -118,7 +118,7 @@ class Report:
 
     def with_unseen(self, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
         """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
-        metrics = replace(self.metrics, **{name: getattr(found, name) for name in JUDGED})
+        metrics = replace(self.metrics, **vars(found))
         fresh = {one.name for one in sets}
         return replace(self, metrics=metrics, sets=(*(one for one in self.sets if one.name not in fresh), *sets))
 

@@ -6,17 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.geometry.accuracy import rms_sigma
+from calib.geometry.accuracy import ErrorStatistics, rms_sigma
+from calib.geometry.checks.repeatability import RepeatedPose
+from calib.geometry.model_choice.ladder import ModelStep
 from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.metrics import (
-    ComparedRows,
-    ErrorStatistics,
-    FitMetrics,
-    LadderStep,
-    OutlierRow,
-    RepeatedPose,
-)
+from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text, relative_sigma
@@ -208,7 +203,7 @@ def _ladder_table(metrics: FitMetrics) -> Table:
     return Table("Ladder of models", header, rows, note, frozenset(strong), (1, 2))
 
 
-def _counted(step: LadderStep) -> str:
+def _counted(step: ModelStep) -> str:
     """Return how many parameters a model has: of the geometry, and the small joint corrections as well."""
     rigid = step.parameters - step.corrections
     return f"{rigid} + {step.corrections}" if step.corrections else str(rigid)
@@ -255,26 +250,18 @@ def _outlier_sentences(metrics: FitMetrics) -> list[str]:
     if not metrics.outliers:
         return []
     count = len({(each.file, each.row) for each in metrics.outliers})
-    worst = "; ".join(map(_outlier_words, metrics.outliers[:MAX_NAMED_OUTLIERS]))
+    worst = "; ".join(each.words for each in metrics.outliers[:MAX_NAMED_OUTLIERS])
     more = "; ..." if len(metrics.outliers) > MAX_NAMED_OUTLIERS else ""
     loss = metrics.findings.loss if metrics.findings else ""
     how = "kept in the fit" if loss in ("", "none") else f"weighed down by the {loss} loss"
     return [f"{count} rows beyond 4 robust sigma, {how}: {worst}{more}"]
 
 
-def _outlier_words(each: OutlierRow) -> str:
-    return f"{Path(each.file).name} row {each.row} ({_outlier_size(each)}, {each.sigmas:.1f} sigma)"
-
-
-def _outlier_size(each: OutlierRow) -> str:
-    return f"{each.size_mm:.3g} mm" if each.size_deg is None else f"{each.size_deg:.3g} deg"
-
-
 def _outlier_table(metrics: FitMetrics) -> Table:
     """Return the rows that do not fit, worst first."""
     found = metrics.outliers
     rows = [
-        (Path(each.file).name, str(each.row), each.nature, _outlier_size(each), f"{each.sigmas:.1f}")
+        (Path(each.file).name, str(each.row), each.nature, each.size, f"{each.sigmas:.1f}")
         for each in found[:MAX_OUTLIERS]
     ]
     note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."

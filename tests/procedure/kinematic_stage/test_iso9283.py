@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from calib import cli
 from calib.data.poses.measurements import Poses, Positions
 from calib.geometry.checks import repeatability
+from calib.geometry.checks.repeatability import RepeatedPoses
 from calib.geometry.installation import Installation, see
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics
@@ -40,22 +41,28 @@ def repeated(poses: int = 4, cycles: int = 8, shift=(0.0, 0.0, 0.0), spread: flo
     return cell, block
 
 
+def iso(cell: Installation, block: Positions) -> RepeatedPoses:
+    found = repeatability.repeated_poses((cell, cell), [block])
+    assert found is not None
+    return found
+
+
 def test_accuracy_is_the_barycentre_from_the_command_in_the_bases_axes():
     cell, block = repeated(shift=(1e-3, -2e-3, 3e-3))
-    found = repeatability.repeats(cell, [block])
-    assert found is not None and found.cycles.tolist() == [8] * 4
-    assert np.abs(found.accuracy - [1e-3, -2e-3, 3e-3]).max() < 1e-4  # the joints read back are off by 20 µrad
-    assert found.turn_accuracy is not None and np.abs(found.turn_accuracy).max() < 1e-4
-    assert found.repeatability.max() < 1e-9
+    found = iso(cell, block)
+    assert found.cycles == (8, 8) and found.poses == 4
+    for one in found.each:  # the joints read back are off by 20 µrad
+        assert one.nominal_mm == one.calibrated_mm == pytest.approx([1.0, -2.0, 3.0], abs=0.1)
+        assert np.abs(one.calibrated_deg).max() < np.degrees(1e-4)
+    assert found.repeatability_mm["max"] < 1e-6
 
 
 def test_repeatability_is_the_mean_radius_and_three_deviations():
     points = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 3.0, 0], [0, -3.0, 0]])  # radii 1 1 3 3
     assert repeatability.spread(points) == pytest.approx(2.0 + 3.0 * np.sqrt(4.0 / 3.0))
-    cell, block = repeated(poses=3, cycles=400, spread=1e-4, seed=1)
-    found = repeatability.repeats(cell, [block])
+    found = iso(*repeated(poses=3, cycles=400, spread=1e-4, seed=1))
     # of normal noise the radius is Maxwell's: mean 1.596 σ, deviation 0.673 σ
-    assert found is not None and found.repeatability / 1e-4 == pytest.approx(1.596 + 3 * 0.673, rel=0.1)
+    assert [one.repeatability_mm / 0.1 for one in found.each] == pytest.approx([1.596 + 3 * 0.673] * 3, rel=0.1)
 
 
 def test_turns_are_counted_about_the_bases_axes():
@@ -63,14 +70,12 @@ def test_turns_are_counted_about_the_bases_axes():
     rng, base = np.random.default_rng(2), Rotation.from_matrix(STATION[:3, :3])
     small = Rotation.from_rotvec(rng.normal(0.0, [1e-4, 2e-4, 3e-4], (400, 3)) + np.array([5e-4, 0.0, 0.0]))
     turned = base * small * base.inv() * Rotation.from_quat(block.quaternion)
-    block = Poses(block.q, block.joint_names, block.position, turned.as_quat())
-    found = repeatability.repeats(cell, [block])
-    assert found is not None and found.turn_accuracy is not None and found.turn_repeatability is not None
-    assert found.turn_accuracy[0] == pytest.approx([5e-4, 0.0, 0.0], abs=1e-4)
-    assert found.turn_repeatability[0] == pytest.approx([3e-4, 6e-4, 9e-4], rel=0.15)
+    (one,) = iso(cell, Poses(block.q, block.joint_names, block.position, turned.as_quat())).each
+    assert np.radians(one.nominal_deg) == pytest.approx([5e-4, 0.0, 0.0], abs=1e-4)
+    assert np.radians(one.repeatability_deg) == pytest.approx([3e-4, 6e-4, 9e-4], rel=0.15)
 
 
-def test_what_depends_on_the_direction_of_approach_is_told():
+def test_what_depends_on_the_direction_of_approach_is_stated():
     """A pose that is reached 0.1 mm short of where it comes from, alternately from two sides."""
     chain = load("ur5")
     cell = Installation(chain, STATION[None])
@@ -82,17 +87,17 @@ def test_what_depends_on_the_direction_of_approach_is_told():
     points = see(cell, q).point.T.copy()
     way = points[1::2] - points[0::2]
     points[1::2] -= 1e-4 * way / np.linalg.norm(way, axis=1, keepdims=True)
-    found = repeatability.repeats(cell, [Positions(q, chain.joint_names, points)])
-    assert found is not None
-    target = [k for k in range(3) if found.cycles[k] == 12]
+    found = iso(cell, Positions(q, chain.joint_names, points))
     chord = np.linalg.norm(way[0] / np.linalg.norm(way[0]) - way[1] / np.linalg.norm(way[1]))
-    assert found.variation[target[0]] == pytest.approx(1e-4 * chord, rel=1e-3)
-    assert np.isnan(np.delete(found.variation, target)).all()
+    for one in found.each:
+        wanted = None if len(one.rows) != 12 else pytest.approx(0.1 * chord, rel=1e-3)
+        assert one.multidirectional_mm == wanted
+    assert found.cycles == (6, 12)
 
 
 def test_copies_and_single_poses_are_no_repeats():
     cell, block = repeated(poses=3, cycles=1)
-    assert repeatability.repeats(cell, [block]) is None
+    assert repeatability.repeated_poses((cell, cell), [block]) is None
     copy = [0] * 9 + [1, 2]
     block = Positions(block.q[copy], block.joint_names, block.position[copy])
     assert repeatability.repeated_rows(block) == []
@@ -127,11 +132,11 @@ def test_the_fit_states_them_beside_its_own_errors(files, capsys):
     said = capsys.readouterr().out
     assert "ISO 9283 on 5 poses repeated 30 times" in said and "too few poses to state an accuracy" in said
     found = json.loads(Path("done/metrics.json").read_text())
-    iso = found["validation"]["iso.csv"]["iso9283"]
+    stated = found["validation"]["iso.csv"]["iso9283"]
     assert found["fit"]["iso9283"] is None
     noise = 0.02 * (1.596 + 3 * 0.673)
-    assert iso["repeatability_mm"]["mean"] == pytest.approx(noise, rel=0.2)
-    assert iso["accuracy_mm"]["calibrated"]["mean"] < 0.3 * iso["accuracy_mm"]["nominal"]["mean"]
+    assert stated["repeatability_mm"]["mean"] == pytest.approx(noise, rel=0.2)
+    assert stated["accuracy_mm"]["calibrated"]["mean"] < 0.3 * stated["accuracy_mm"]["nominal"]["mean"]
     (table,) = iso9283_tables(read_record(FitMetrics, found))
     assert len(table.rows) == 5 and "100 and more" in table.note
 
