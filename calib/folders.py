@@ -16,8 +16,6 @@ REPORT, CERTIFICATE = "report.json", "certificate.html"
 """What figures and a certificate are made from, and the certificate."""
 OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
 """By which an export is known, of a geometry and of dynamics."""
-MJCF, DRIVES, JOINT_ORIGINS = "robot.xml", "drives.csv", "joint_origins.yaml"
-"""Of an export of dynamics."""
 
 
 def check_target(

@@ -8,7 +8,7 @@ from calib.api.given import optional, saved
 from calib.api.kinematic import GeometryFit
 from calib.arguments import checked
 from calib.errors import CalibWarning, RobotError, UsageError, refused_as
-from calib.procedure.export import delivery, dynamics, geometry
+from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
 from calib.procedure.robot_kinds import MechanismResult, stage_of
 from calib.robot.load import resolve
@@ -44,12 +44,13 @@ def export(
     into = Path(into)
     with saved(result) as place:
         stage_of(place, "export")
-        identified = is_identified(place)
-        delivery.check_into(into, place, optional(urdf), dynamics.WRITTEN if identified else delivery.WRITTEN)
-        if identified:
-            lines = dynamics.deliver_dynamics(place, optional(urdf), into, prior)
+        source = optional(urdf)
+        if is_identified(place):
+            wanted = delivery.Export(source, identified=place, prior=prior)
         else:
-            lines = delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into)
+            wanted = delivery.Export(source or _source_of(place), place)
+        delivery.check_into(wanted, into, place)
+        lines = delivery.deliver(wanted, into)
         judged = delivery.mark(into, delivery.verdicts(place))
     for words in judged:
         warnings.warn(words, CalibWarning, stacklevel=3)

@@ -164,24 +164,17 @@ def export(
         return
     words = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
     require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), words, UsageError)
-    found = geometry.read(folder)
-    targets = geometry.targets(urdf, out, ur_kinematics, offsets)
+    form = delivery.CORRECTED_URDF if for_corrections else delivery.URDF
+    asked = [(form, out, (".urdf",)), (delivery.UR_KINEMATICS, ur_kinematics, (".yaml", ".yml")),
+             (delivery.OFFSETS, offsets, (".csv",))]  # fmt: skip
+    targets = [(path, suffixes) for _, path, suffixes in asked if path]
     own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
+    found = geometry.read(folder)
     with results(targets, [urdf, *geometry.results(folder)], overwrite):
-        read = geometry.export_urdf(found, urdf, out, for_corrections, own.remark) if urdf and out else ""
-        if ur_kinematics:
-            geometry.export_ur_kinematics(found, ur_kinematics, own.remark)
-        if offsets:
-            geometry.export_offsets(found, offsets)
-    if urdf and out:
-        say(f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
-            f"them; {read}")  # fmt: skip
-    if ur_kinematics:
-        say(f"{ur_kinematics}: for kinematics_params_file of ur_description")
-        if note := geometry.flange_note(found):
-            say(f"note: {note}")
-    if offsets:
-        say(f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones")
+        lines = delivery.deliver_single(
+            delivery.Export(urdf, folder, remark=own.remark), {name: path for name, path, _ in asked if path}
+        )
+    say(*lines)
     if found.corrections is not None:
         say(f"note: the corrections in {folder}/joint_corrections.csv are in none of these files")
     if own.level:

@@ -32,8 +32,8 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         ),
     ),
     "exports": (
-        "what calib export --into writes of an identified robot",
-        ("calib.procedure.export.dynamics", "calib.identification.possible.solve"),
+        "what calib export --into writes",
+        ("calib.procedure.export.delivery", "calib.identification.possible.solve"),
     ),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.measuring.constraints_file",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),

@@ -1,16 +1,58 @@
-"""What leaves a session: the calibrated robot in the forms others read."""
+"""The calibrated robot in the forms other programs read; each file is read back before it is put in place.
+
+``calib export FIT --into DIR [--urdf SOURCE.urdf]`` writes, from the folder of a fit, robot.toml, robot.urdf,
+joint_offsets.csv, the joint corrections where there are any, and ur_kinematics.yaml of a UR arm;
+``calib export IDENTIFIED --into DIR [--urdf SOURCE.urdf]``, from the folder of an identification,
+
+robot.urdf            the source with calibrated joint origins, masses and friction; comments, meshes, limits, all else
+                      as it was. ``<inertial>`` of a link: origin at its centre of mass, axes of the link.
+                      ``<dynamics damping friction>``: Fv and Fc. URDF has no place for motor inertia: see drives.csv.
+robot.xml             MJCF for MuJoCo: bodies, armature (Ia), damping (Fv), frictionloss (Fc); no meshes.
+drives.csv            joint, armature, damping, friction, offset, and the sigma of each: for simulators that take them;
+                      by hand. A sigma is empty where the model has no such term. Then a row per coupling, as
+                      "joint5 + joint6", of a motor that turns with both.
+joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
+                      calibration / joints / name / position x y z [m], orientation x y z w.
+parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, what
+                      consistency cost, and ``prediction``: unexplained torque [%] by the exported robot (robot.urdf
+                      with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
+README.txt            what each file is for, and the verdict on it.
+
+Masses are those of physically consistent bodies (`calib.identification.possible.solve`). What the torques do not
+identify is regularised towards the masses of the robot's description: by the entropic (log-det) prior, which keeps off
+the border of the physically consistent; with ``--prior euclidean`` by its second order, which does not, so that a body
+may come out thin. A link to which others are fixed (flange, covers, sensors) is identified with them as one body: the
+others keep the masses the source gives them, and the moving link takes the rest. Where that rest is not physically
+consistent, the moving link takes all and the others get mass zero. Links on joints that are not part of the arm
+(fingers) keep theirs, standing at zero. Payloads that were identified are not part of the robot: they are in
+parameters.json alone. Offsets, gear couplings and richer friction have no place in URDF and MJCF; parameters.json has
+them, and a note says so. The sign of Coulomb friction was smoothed as tanh(v / v0).
+"""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from calib import files
-from calib.errors import RobotError, UsageError
-from calib.folders import DRIVES, JOINT_ORIGINS, MJCF, OFFSETS, PARAMETERS, check_target, write_staged
+from calib.errors import UsageError
+from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry
 from calib.procedure.export.geometry import results
-from calib.procedure.export.identified import ExportedPrediction
+from calib.procedure.export.identified import (
+    ExportedPrediction,
+    IdentifiedRobot,
+    exported_prediction,
+    notes_of,
+    parameters,
+    read,
+)
+from calib.procedure.export.masses import as_mjcf, as_urdf
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import (
     CORRECTED_URDF,
@@ -22,99 +64,231 @@ from calib.procedure.kinematic_stage.folder import (
     FitFolder,
     ValidationFolder,
 )
-from calib.robot.calibrated import ROBOT
+from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.description_checks import impossible_bodies
-from calib.robot.formats.markup import with_comment
+from calib.robot.formats import urdf_write
+from calib.robot.formats.markup import text, with_comment
+from calib.robot.formats.tesseract import joint_origins
 
-README = "README.txt"
-COPIED = (ROBOT, TERMS, FORMULA)
-UR_KINEMATICS = "ur_kinematics.yaml"
-WRITTEN = (*COPIED, URDF, CORRECTED_URDF, OFFSETS, UR_KINEMATICS)
-MARKS = (OFFSETS, PARAMETERS)  # by which an earlier export is known, of a geometry or of dynamics
-USES = {
-    URDF: "for ROS, MoveIt and simulators; if in doubt, take this one",
-    CORRECTED_URDF: f"only for programs that apply {TERMS}, worse than {URDF} without them; masses as in the source",
-    TERMS: "small corrections of each joint, which no URDF can hold",
-    FORMULA: "how to apply them",
-    ROBOT: "for this toolkit: geometry with covariance, and the corrections",
-    OFFSETS: "for the controller: joint offsets to add to its mastering; the rest of the geometry left out",
-    UR_KINEMATICS: "for ur_description: kinematics_params_file",
-    MJCF: "for MuJoCo: geometry, masses, motor inertia and friction",
-    DRIVES: "for simulators: motor inertia, friction and offset of each joint, with sigmas",
-    JOINT_ORIGINS: "for tesseract",
-    PARAMETERS: "all parameters of geometry and dynamics with covariances",
-}
-MARKED = (URDF, CORRECTED_URDF, MJCF, UR_KINEMATICS)  # state their verdict themselves
-CORRECTED, DYNAMIC = (CORRECTED_URDF, TERMS, ROBOT), (URDF, MJCF)
+README, UR_KINEMATICS = "README.txt", "ur_kinematics.yaml"
+GEOMETRY, DYNAMICS = "geometry", "dynamics"
+READ_BACK = "Pinocchio reads the same poses and torques to 1e-9"
+DRIVE_COLUMNS = (
+    "joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit",
+    "armature_sigma", "damping_sigma", "friction_sigma", "offset_sigma",
+)  # fmt: skip
 
 
-def deliver(fit: Path, source: Path, out: Path) -> list[str]:
-    """Write the calibrated robot into `out`: TOML, URDF (the source's own XML where it is one), joint offsets.
+@dataclass(frozen=True, eq=False)
+class Export:
+    """What the files of an export are made of.
 
-    Args:
-        fit: the folder of the fit.
-        source: the robot's description.
-        out: folder for the files.
+    Attributes:
+        source: description of the nominal robot: a URDF is edited in place, else a URDF is written anew.
+        fit: folder of the fit; None: identified dynamics alone.
+        identified: folder of the identification; None: geometry alone.
+        prior: what masses that the torques do not identify are regularised towards, see
+            `calib.identification.possible.solve.PRIORS`.
+        remark: for the head of files that a robot or a simulation moves by.
+    """
+
+    source: Path | None
+    fit: Path | None = None
+    identified: Path | None = None
+    prior: str = "entropic"
+    remark: str = ""
+
+    @cached_property
+    def robot(self) -> CalibratedChain:
+        return geometry.read(self.fit or self.identified or Path())
+
+    @cached_property
+    def dynamics(self) -> IdentifiedRobot:
+        return read(self.identified or Path(), self.prior)
+
+    @cached_property
+    def prediction(self) -> ExportedPrediction | None:
+        return exported_prediction(self.dynamics, self.identified or Path())
+
+    @property
+    def urdf(self) -> Path | None:
+        """The source where it is a URDF."""
+        return self.source if self.source is not None and self.source.suffix == ".urdf" else None
+
+    @cached_property
+    def with_masses(self) -> tuple[str, list[str]]:
+        """The URDF with identified masses and friction, and notes."""
+        found = self.dynamics
+        if self.urdf is None:
+            return as_urdf(found, urdf_write.write_new(found.chain), "the chain's own URDF", found.chain)
+        return as_urdf(found, text(self.urdf)[0], str(self.urdf), nominal_of(found.robot))
+
+    @property
+    def files(self) -> list["ExportFile"]:
+        """The files this export may leave, in the order they are written."""
+        stages = {GEOMETRY: self.fit is not None, DYNAMICS: self.identified is not None}
+        return [one for one in FILES if any(stages[stage] for stage in one.stages)]
+
+
+def _urdf(export: Export, path: Path) -> list[str]:
+    if export.identified is None:
+        return _geometric_urdf(export, path, URDF)
+    edited, notes = export.with_masses
+    files.write(path, edited.encode("utf-8" if export.urdf is None else text(export.urdf)[1]))
+    made = f"{URDF}: joint origins, masses and friction; {READ_BACK}"
+    return [*([str(export.prediction)] if export.prediction else []), made, *notes_of(export.dynamics), *notes]
+
+
+def _corrected_urdf(export: Export, path: Path) -> list[str]:
+    return [] if export.robot.corrections is None else _geometric_urdf(export, path, CORRECTED_URDF)
+
+
+def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
+    if export.urdf is not None:
+        content, read_by = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
+        made = f"joint origins of {export.urdf} calibrated, all else kept, base link and flange as the source has them"
+    else:
+        content = ((export.fit or Path()) / name).read_bytes()
+        chain = export.robot.chain if name == URDF else export.robot.complete
+        read_by, made = geometry.check_readback(content.decode(), name, chain), "written from the calibrated table"
+    files.write(path, _remarked(content, export.remark))
+    kept = impossible_bodies(export.robot.chain) if name == URDF else ()
+    return [f"{path.name}: {made}; {read_by}", *(f"as the source has it: {each}" for each in kept)]
+
+
+def _copy(export: Export, path: Path) -> list[str]:
+    original = (export.fit or Path()) / path.name
+    if not original.exists():
+        return []
+    files.write(path, original.read_bytes())
+    return [f"{TERMS}: corrections for {CORRECTED_URDF}; formula in {FORMULA}"] if path.name == TERMS else []
+
+
+def _offsets(export: Export, path: Path) -> list[str]:
+    geometry.export_offsets(export.robot, path)
+    return [f"{path.name}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones"]
+
+
+def _ur_kinematics(export: Export, path: Path) -> list[str]:
+    files.write(path, _remarked(geometry.ur_kinematics(export.robot).encode(), export.remark))
+    flange = geometry.flange_note(export.robot)
+    return [f"{path.name}: for kinematics_params_file of ur_description" + (f"; {flange}" if flange else "")]
+
+
+def _mjcf(export: Export, path: Path) -> list[str]:
+    files.write(path, as_mjcf(export.dynamics, path.name))
+    return [f"{path.name}: MJCF with armature, damping and frictionloss; {READ_BACK}"]
+
+
+def _drives(export: Export, path: Path) -> list[str]:
+    joints, drives = export.dynamics.chain.joints, export.dynamics.drives
+    named = [(joint.name, joint) for joint in joints]
+    named += [(f"{joints[i].name} {'+' if w > 0 else '-'} {joints[j].name}", joints[i]) for i, j, w in drives.pairs]
+    rows, values = [], np.vstack([drives.values, drives.couplings])
+    sigmas = np.zeros(values.shape) if drives.sigma is None else drives.sigma
+    for (name, joint), row, sigma in zip(named, values, sigmas, strict=True):
+        linear = joint.kind == "prismatic"
+        units = ("kg", "N s/m", "N") if linear else ("kg m²", "N m s/rad", "N m")
+        rows.append((name, *map(float, row), *units, *(float(one) or None for one in sigma)))
+    files.write_table(path, DRIVE_COLUMNS, rows)
+    return [f"{path.name}, {PARAMETERS}" + ("" if export.urdf is None else ", joint_origins.yaml (tesseract's SRDF)")]
+
+
+def _joint_origins(export: Export, path: Path) -> list[str]:
+    if export.urdf is not None:
+        files.write(path, joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
+    return []
+
+
+def _parameters(export: Export, path: Path) -> list[str]:
+    files.write_json(path, parameters(export.dynamics) | {"prediction": export.prediction})
+    return []
+
+
+@dataclass(frozen=True)
+class ExportFile:
+    """A file that an export leaves.
+
+    Attributes:
+        name: in the folder.
+        write: writes it at a path where the robot has such, and returns what to know of it.
+        use: for README.txt.
+        stages: of which it is made.
+        deliverable: whose verdict holds for it; empty: neither robot nor simulation moves by it.
+        marked: its head states a verdict that is no pass.
+    """
+
+    name: str
+    write: Callable[[Export, Path], list[str]]
+    use: str
+    stages: tuple[str, ...] = (GEOMETRY,)
+    deliverable: str = ""
+    marked: bool = False
+
+
+_TO_MASTER = "for the controller: joint offsets to add to its mastering; the rest of the geometry left out"
+_ONLY = f"only for programs that apply {TERMS}, worse than {URDF} without them; masses as in the source"
+_TO_SIMULATE = "for simulators: motor inertia, friction and offset of each joint, with sigmas"
+_UR = "for ur_description: kinematics_params_file"
+_MUJOCO = "for MuJoCo: geometry, masses, motor inertia and friction"
+_ROS = "for ROS, MoveIt and simulators; if in doubt, take this one"
+FILES = (
+    ExportFile(URDF, _urdf, _ROS, (GEOMETRY, DYNAMICS), "urdf", marked=True),
+    ExportFile(CORRECTED_URDF, _corrected_urdf, _ONLY, deliverable="corrections", marked=True),
+    ExportFile(TERMS, _copy, "small corrections of each joint, which no URDF can hold", deliverable="corrections"),
+    ExportFile(FORMULA, _copy, "how to apply them"),
+    ExportFile(ROBOT, _copy, "for this toolkit: geometry with covariance and corrections", deliverable="corrections"),
+    ExportFile(OFFSETS, _offsets, _TO_MASTER),
+    ExportFile(UR_KINEMATICS, _ur_kinematics, _UR, deliverable="urdf", marked=True),
+    ExportFile("robot.xml", _mjcf, _MUJOCO, (DYNAMICS,), "urdf", marked=True),
+    ExportFile("drives.csv", _drives, _TO_SIMULATE, (DYNAMICS,)),
+    ExportFile("joint_origins.yaml", _joint_origins, "for tesseract", (DYNAMICS,)),
+    ExportFile(PARAMETERS, _parameters, "all parameters of geometry and dynamics with covariances", (DYNAMICS,)),
+)
+
+
+def deliver(export: Export, out: Path) -> list[str]:
+    """Write the calibrated robot into the folder `out`, in all forms (see the module).
 
     Returns:
-        What was written, in words.
+        What was written and what to know of it, in words.
+
+    Raises:
+        RobotError: where a file does not read back as the robot; nothing is written.
     """
     notes: list[str] = []
-    write_staged(out, USES, lambda staging: notes.extend(_write(fit, source, staging)))
+
+    def write(staging: Path) -> None:
+        for file in export.files:
+            with suppress(geometry.NoSuchArm):
+                notes.extend(file.write(export, staging / file.name))
+
+    write_staged(out, [file.name for file in export.files], write)
     return notes
 
 
-def check_into(into: Path, folder: Path, urdf: Path | None, written: Sequence[str]) -> None:
+def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
+    """Write files by the names they have in `FILES`, each to a path of its own.
+
+    Returns:
+        What was written and what to know of it, in words.
+    """
+    return [note for file in export.files if file.name in targets for note in file.write(export, targets[file.name])]
+
+
+def check_into(export: Export, into: Path, folder: Path) -> None:
     """Refuse, before any work is done, a folder for exports that cannot be one, or holds what is read or another's.
 
     Args:
-        into: where `written` is to go.
-        folder: of the fit or the identification; urdf: the description to edit.
-        written: names of the files.
+        into: where the files are to go.
+        folder: of the fit or the identification.
 
     Raises:
         UsageError: with the file or folder concerned.
     """
-    earlier = any((into / mark).exists() for mark in MARKS)
-    check_target(into, written, () if earlier else (PARAMETERS,), "export", [urdf, *results(folder)])
-
-
-def _write(fit: Path, source: Path, out: Path) -> list[str]:
-    for name in COPIED:
-        if (fit / name).exists():
-            files.write(out / name, (fit / name).read_bytes())
-    found = geometry.read(fit)
-    given = source.suffix == ".urdf"
-    urdfs = {URDF: found.chain}
-    if found.corrections is not None:
-        urdfs[CORRECTED_URDF] = found.corrections.chain
-    read = ""
-    for name, chain in urdfs.items():
-        if given:
-            read = geometry.export_urdf(found, source, out / name, for_corrections=name != URDF)
-        else:
-            written = (fit / name).read_text(encoding="utf-8")
-            read = geometry.check_readback(written, name, chain)
-            files.write(out / name, written)
-    made = (
-        "the given URDF with calibrated joint origins, all else kept" if given else "written from the calibrated table"
-    )
-    notes = [
-        f"robot.urdf: {made}; {read}",
-        *(f"as the source has it: {each}" for each in impossible_bodies(found.chain)),
-    ]
-    geometry.export_offsets(found, out / OFFSETS)
-    notes.append("robot.toml, joint_offsets.csv")
-    try:
-        geometry.export_ur_kinematics(found, out / UR_KINEMATICS)
-        flange = geometry.flange_note(found)
-        words = f"{UR_KINEMATICS}: for kinematics_params_file of ur_description"
-        notes.append(f"{words}; {flange}" if flange else words)
-    except (RobotError, UsageError):  # no UR arm
-        pass
-    if found.corrections is not None:
-        notes.append(f"{TERMS}: what a URDF cannot hold, on top of {CORRECTED_URDF}; formula in {FORMULA}")
-    return notes
+    earlier = any((into / mark).exists() for mark in (OFFSETS, PARAMETERS))
+    names = [file.name for file in export.files]
+    check_target(into, names, () if earlier else (PARAMETERS,), "export", [export.urdf, *results(folder)])
 
 
 def verdicts(folder: Path) -> Verdicts:
@@ -138,11 +312,8 @@ def verdicts(folder: Path) -> Verdicts:
 def by_file(out: Path, found: Verdicts) -> dict[str, Verdicts]:
     """Return what was judged of each exported file that is there, and that a robot or a simulation may move by."""
     dynamic = (out / PARAMETERS).exists()
-    return {
-        name: found.of("corrections" if name in CORRECTED else "urdf", dynamic and name in DYNAMIC)
-        for name in (*MARKED, *CORRECTED)
-        if (out / name).exists()
-    }
+    judged = [file for file in FILES if file.deliverable and (out / file.name).exists()]
+    return {file.name: found.of(file.deliverable, dynamic and "dynamics" in file.stages) for file in judged}
 
 
 def prediction(out: Path) -> ExportedPrediction | None:
@@ -163,9 +334,9 @@ def mark(out: Path, found: Verdicts) -> list[str]:
         What does not pass, in words.
     """
     judged = by_file(out, found)
-    for name, own in judged.items():
-        if own.remark and name in MARKED:
-            mark_file(out / name, own.remark)
+    for file in FILES:
+        if file.marked and file.name in judged and judged[file.name].remark:
+            files.write(out / file.name, _remarked((out / file.name).read_bytes(), judged[file.name].remark))
     readme, known = out / README, prediction(out)
     if not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith("verdict "):
         head = [str(found) if found.level else "verdict unknown", *([str(known)] if known else []), ""]
@@ -178,17 +349,19 @@ def mark(out: Path, found: Verdicts) -> list[str]:
 def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
     """Yield what each exported file is for, and the verdict on it."""
     holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses as in the source"
-    for name, use in USES.items():
+    for file in FILES:
+        name = file.name
         if (out / name).exists():
-            yield f"{name}: {use}" + (f"; geometry with {holds}" if name == URDF else "")
+            yield f"{name}: {file.use}" + (f"; geometry with {holds}" if name == URDF else "")
             if name in judged and judged[name].level:
                 yield f"    {judged[name]}" if name in (URDF, CORRECTED_URDF) else f"    verdict {judged[name].level}"
     if (out / PARAMETERS).exists():
         yield "the geometry alone: calib export FIT --urdf SOURCE.urdf --out robot_geometry_only.urdf"
 
 
-def mark_file(path: Path, words: str) -> None:
-    """Write words, one line, at the head of an XML or YAML file, as a comment."""
-    content = path.read_bytes()
+def _remarked(content: bytes, remark: str) -> bytes:
+    """Return an XML or YAML file with a remark, one line, at its head, as a comment."""
+    if not remark:
+        return content
     xml = b"<" in content[:8]  # behind a byte order mark, perhaps in UTF-16; our YAML begins with a comment
-    files.write(path, with_comment(content, words) if xml else f"# {words}\n".encode() + content)
+    return with_comment(content, remark) if xml else f"# {remark}\n".encode() + content

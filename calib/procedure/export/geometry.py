@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.errors import RobotError, UsageError
+from calib.errors import RobotError, UsageError, refused_as
 from calib.folders import files_of
 from calib.procedure.dynamic_stage import folder as identification
 from calib.procedure.kinematic_stage.folder import OURS, FitFolder
@@ -13,7 +13,7 @@ from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import ur, urdf, urdf_write
-from calib.robot.formats.markup import text, with_comment
+from calib.robot.formats.markup import text
 from calib.robot.formats.readback import link_poses, tip_poses
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
@@ -21,6 +21,10 @@ from calib.transforms import invert
 
 OFFSETS_HEADER = ("joint", "unit", "offset", "sigma")
 MAX_DIFFERENCE = 1e-9  # of poses read back [m, and as a rotation matrix], and of torques over the largest
+
+
+class NoSuchArm(UsageError):
+    """The arm is none of the kind that a file format is for."""
 
 
 def read(folder: Path) -> CalibratedChain:
@@ -37,31 +41,13 @@ def read(folder: Path) -> CalibratedChain:
     return robot
 
 
-def targets(
-    source: Path | None, out: Path | None = None, ur_kinematics: Path | None = None, offsets: Path | None = None
-) -> files.Results:
-    """Return the files to be written, with their suffixes: URDF edited from a source, UR kinematics YAML, offsets.
-
-    Raises:
-        UsageError: where one is the source.
-    """
-    asked = [(out, (".urdf",)), (ur_kinematics, (".yaml", ".yml")), (offsets, (".csv",))]
-    written = [(path, suffixes) for path, suffixes in asked if path is not None]
-    for target, _ in written:
-        if source is not None and files.same_file(source, target):
-            raise UsageError(f"{target} is the source URDF, which stays as it is; give another name to write to")
-    return written
-
-
 def results(folder: Path) -> list[Path]:
     """Return the files of a fit's or an identification's folder that make it one: no export replaces them."""
     return [folder / name for name in files_of(folder, (*OURS, *identification.OURS))]
 
 
-def export_urdf(
-    robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False, remark: str = ""
-) -> str:
-    """Put the calibrated geometry into the XML of `source`, have others read it back, and write it to `out`.
+def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = False) -> tuple[bytes, str]:
+    """Return the XML of `source` with the calibrated geometry, and who has read it back.
 
     Only the origins of the arm's joints change. The base link stays where the nominal robot has its base, and the fixed
     joints behind the last moving one stay as they are: the choice of base and flange is the source's.
@@ -69,20 +55,12 @@ def export_urdf(
     Args:
         robot: the calibrated robot.
         source: a URDF of the nominal robot.
-        out: the file to write.
         for_corrections: take the geometry that the joint corrections belong to, which is worse without them.
-        remark: to stand at its head.
-
-    Returns:
-        Who has read it back.
     """
     chain = robot.complete if for_corrections else robot.chain
     content, encoding = text(source)
     edited = urdf_write.edit(content, nominal_of(robot), chain, str(source))
-    read = check_readback(edited, str(source), chain)
-    data = edited.encode(encoding)
-    files.write(out, with_comment(data, remark) if remark else data)
-    return read
+    return edited.encode(encoding), check_readback(edited, str(source), chain)
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
@@ -128,20 +106,17 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     return files.write_table(out, OFFSETS_HEADER, rows)
 
 
-def export_ur_kinematics(robot: CalibratedChain, out: Path, remark: str = "") -> Path:
-    """Write the kinematics YAML of ur_description (see `calib.robot.formats.ur.kinematics`).
+def ur_kinematics(robot: CalibratedChain) -> str:
+    """Return the kinematics YAML of ur_description (see `calib.robot.formats.ur.kinematics`).
 
     ur_description puts its tool0 where wrist_3 is: fixed joints of the robot's file behind it (a flange, a tool) are
     not part of it, see `flange_note`.
 
     Raises:
-        UsageError: for an arm that has not UR's axes.
+        NoSuchArm: for an arm that has not UR's axes.
     """
-    try:
-        content = ur.kinematics(nominal_of(robot), robot.chain)
-    except RobotError as error:
-        raise UsageError(f"'{robot.chain.name}' has not the axes of a UR arm: {error}") from error
-    return files.write(out, f"# {remark}\n{content}" if remark else content)
+    with refused_as(NoSuchArm, RobotError, f"'{robot.chain.name}' has not the axes of a UR arm: {{}}"):
+        return ur.kinematics(nominal_of(robot), robot.chain)
 
 
 def flange_note(robot: CalibratedChain) -> str:

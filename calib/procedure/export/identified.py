@@ -1,7 +1,9 @@
 """An identification made ready for export: its estimate, all parameters of possible bodies, and what to say of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_torques
 from calib.procedure.export import geometry
 from calib.procedure.findings import lines_of
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain
 from calib.robot.description_checks import impossible_bodies
 
@@ -123,3 +125,48 @@ def notes_of(given: IdentifiedRobot) -> list[str]:
     }
     found += [finding(code, names=names, times=MAX_MASS_RATIO) for code, names in optional.items() if len(names)]
     return [*lines_of(found), *solved.notes]
+
+
+def parameters(given: IdentifiedRobot) -> dict[str, Any]:
+    """Return the content of ``parameters.json``."""
+    estimate, found, chain = given.information, given.found, given.chain
+    model = found.dynamics.model
+    covariance = given.robot.covariance
+    return {
+        "robot": chain.name,
+        "geometry": {
+            **_columns(chain.names, chain.units, chain.values),
+            "nominal": nominal_of(given.robot).values.tolist(),
+            "covariance": None if covariance is None else np.asarray(covariance).tolist(),
+        },
+        "dynamics": {
+            "gravity": model.bodies.gravity.tolist(),
+            "rows": model.torque_rows.name,
+            "base": {
+                **_columns(estimate.names, estimate.units, estimate.values),
+                "covariance": estimate.covariance.tolist(),
+            },
+            "standard": {
+                **_columns(model.names, model.units, found.dynamics.values),
+                "covariance": found.covariance.tolist(),
+                "frames": "about the chain's frame behind each joint (robot.toml), payloads about the tip",
+            },
+            "consistency": {
+                "possible": found.possible,
+                "nearest": found.nearest,
+                "distance": found.distance,
+                "allowed": found.allowed,
+                "margins_m": dict(zip(model.bodies.labels, found.margins.tolist())),
+                "weight": found.weight,
+                "prior": found.prior,
+                "sigmas_widened_by": found.doubt,
+                "drawn_to": found.source,
+                "blamed": dict(found.blamed),
+                "notes": list(found.notes),
+            },
+        },
+    }
+
+
+def _columns(names: Sequence[str], units: Sequence[str], values: np.ndarray) -> dict[str, Any]:
+    return {"names": list(names), "units": list(units), "values": np.asarray(values).tolist()}

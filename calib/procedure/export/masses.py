@@ -7,7 +7,6 @@ import numpy as np
 
 from calib.dynamics import pseudo_inertia, rigid_body
 from calib.errors import RobotError
-from calib.folders import MJCF
 from calib.procedure.export import geometry
 from calib.procedure.export.geometry import MAX_DIFFERENCE
 from calib.procedure.export.identified import IdentifiedRobot
@@ -19,14 +18,14 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert
 
 
-def as_mjcf(given: IdentifiedRobot) -> str:
+def as_mjcf(given: IdentifiedRobot, where: str) -> str:
     """Return the MJCF of an identified robot.
 
     Raises:
         RobotError: where Pinocchio reads other poses, torques or drives.
     """
     model = mjcf.text(given.chain, given.bodies, *given.drives.values.T[:3])
-    _check(given, model, given.chain, MJCF, mjcf=True)
+    _check(given, model, given.chain, where, mjcf=True)
     return model
 
 

@@ -24,7 +24,6 @@ from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
-from calib.procedure.session.geometry_steps import deliver_identified
 from calib.records import read_json
 from calib.robot.load import load_calibrated
 
@@ -217,12 +216,13 @@ def predict(session: Session, say: Say) -> list[str]:
 
 def _as_delivered(session: Session, found: Assessment) -> Verdict:
     """Return the verdict on the robot as it will be exported; of a model that cannot be, for prediction only."""
+    from calib.procedure.export.delivery import Export, deliver
     from calib.procedure.export.delivery import prediction as prediction_of_export
 
     verdict, known = found.verdict, None
     with TemporaryDirectory() as folder:
         try:
-            deliver_identified(session, Path(folder))
+            deliver(Export(session.robot_file, identified=session.identification.path), Path(folder))
             known = prediction_of_export(Path(folder))
         except CalibError as error:
             verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")

@@ -230,34 +230,23 @@ def export(session: Session, say: Say) -> list[str]:
 
 
 def _exported(session: Session, out: Path, say: Say) -> list[str]:
-    from calib.procedure.export.delivery import USES, deliver
+    from calib.procedure.export.delivery import FILES, Export, deliver
 
-    source = session.robot_file
-    if session.geometric:
-        lines = deliver(session.fit.path, source, out)
-    else:
-        lines = [calibrated.ROBOT]
-        write_staged(out, USES, partial(shutil.copy, session.fit.robot))
+    if not session.geometric:
+        write_staged(out, [file.name for file in FILES], partial(shutil.copy, session.fit.robot))
     if not session.dynamic:
-        return lines
+        return deliver(Export(session.robot_file, session.fit.path), out)
     say("all parameters of possible bodies")
-    for name in USES:  # a second robot.urdf, by earlier versions
-        (out / "dynamics" / name).unlink(missing_ok=True)
+    for name in FILES:  # a second robot.urdf, by earlier versions
+        (out / "dynamics" / name.name).unlink(missing_ok=True)
     with suppress(OSError):  # not there, or not empty
         (out / "dynamics").rmdir()
+    whole = Export(session.robot_file, session.fit.path if session.geometric else None, session.identification.path)
     try:
-        found = deliver_identified(session, out)
+        return deliver(whole, out)
     except CalibError as error:  # the geometry stands by itself
-        return [*lines, f"the dynamics were not exported: {error}"]
-    return [*found, *(lines[1:] if session.geometric else lines)]
-
-
-def deliver_identified(session: Session, out: Path) -> list[str]:
-    """Write the identified robot into `out`, see `calib.procedure.export.dynamics.deliver_dynamics`."""
-    from calib.procedure.export.dynamics import deliver_dynamics
-
-    source = session.robot_file
-    return deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
+        alone = deliver(replace(whole, identified=None), out) if session.geometric else [calibrated.ROBOT]
+        return [*alone, f"the dynamics were not exported: {error}"]
 
 
 def clear_staging(session: Session) -> None:

@@ -19,7 +19,8 @@ from calib.dynamics.idim import from_chain
 from calib.errors import RobotError
 from calib.identification.model_file import to_table
 from calib.identification.prediction import Dynamics
-from calib.procedure.export import dynamics, identified
+from calib.procedure.export import identified
+from calib.procedure.export.delivery import Export, deliver
 from calib.robot import description
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_tree import read as read_tree
@@ -81,7 +82,7 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     source = SOURCE.replace("AXIS", kind)
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
-    notes = dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    notes = deliver(Export(tmp_path / "source.urdf", identified=folder), tmp_path / "out")
     assert any("no place for motor inertias" in note for note in notes)
     given = identified.read(folder)
     check_torques_with_pinocchio(tmp_path / "out" / "robot.urdf", given)
@@ -127,7 +128,7 @@ def test_all_else_of_the_source_stays(tmp_path):
     source = SOURCE.replace("AXIS", "revolute")
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
-    dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    deliver(Export(tmp_path / "source.urdf", identified=folder), tmp_path / "out")
     after = (tmp_path / "out" / "robot.urdf").read_text()
 
     def bare(text: str) -> str:
@@ -144,7 +145,7 @@ def test_tesseracts_yaml_moves_the_source_to_the_export(tmp_path):
     source = SOURCE.replace("AXIS", "revolute")
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
-    dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    deliver(Export(tmp_path / "source.urdf", identified=folder), tmp_path / "out")
     table = yaml.safe_load((tmp_path / "out" / "joint_origins.yaml").read_text())["calibration"]["joints"]
     after = read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after")
     assert set(table) == {"a", "b"}
@@ -160,18 +161,18 @@ def test_a_cover_heavier_than_the_body_gives_way_and_a_finger_is_refused(tmp_pat
     folder = write_identification(tmp_path / "found", source)
     heavy = source.replace('<mass value="3"/>', '<mass value="30"/>')
     (tmp_path / "source.urdf").write_text(heavy)
-    notes = dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    notes = deliver(Export(tmp_path / "source.urdf", identified=folder), tmp_path / "out")
     assert any("flange" in note and "mass zero" in note for note in notes)
     assert read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after").bodies["flange"] is None
     (tmp_path / "source.urdf").write_text(source.replace('<mass value="0.05"/>', '<mass value="50"/>'))
     with pytest.raises(RobotError, match="finger"):
-        dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "never")
+        deliver(Export(tmp_path / "source.urdf", identified=folder), tmp_path / "never")
     assert not (tmp_path / "never").exists()
 
 
 def test_a_robot_without_urdf_gets_a_new_one(tmp_path):
     folder = write_identification(tmp_path / "found", SOURCE.replace("AXIS", "prismatic"))
-    dynamics.deliver_dynamics(folder, None, tmp_path / "out")
+    deliver(Export(None, identified=folder), tmp_path / "out")
     assert not (tmp_path / "out" / "joint_origins.yaml").exists()
     check_torques_with_pinocchio_by_joint_names(tmp_path / "out" / "robot.urdf")
 
@@ -187,7 +188,7 @@ def test_mujoco_reads_the_mjcf(tmp_path):
     if not interpreter:
         pytest.skip("MuJoCo is not part of the environment: set CALIB_MUJOCO to a python that has it")
     folder = write_identification(tmp_path / "found", SOURCE.replace("AXIS", "revolute"))
-    dynamics.deliver_dynamics(folder, None, tmp_path / "out")
+    deliver(Export(None, identified=folder), tmp_path / "out")
     given = identified.read(folder)
     from calib.dynamics import rigid_body
 

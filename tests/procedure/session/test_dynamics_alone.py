@@ -15,7 +15,7 @@ from sessions import go_on
 from without_figures import run
 
 from calib.errors import NotConverged
-from calib.procedure.export import dynamics as export
+from calib.procedure.export import delivery as export
 from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.session import steps
 from calib.procedure.session.commands import begin
