@@ -49,6 +49,7 @@ _FLAGS = (
     "--no-refit-frames",
     "--overwrite",
     "--verbose",
+    "-v",
 )
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
@@ -139,7 +140,7 @@ def _spread(arguments: list[str]) -> list[str]:
     result: list[str] = []
     option, positionals, spreading = "", 0, False
     for word in arguments:
-        if word.startswith("--"):
+        if word.startswith("--") or word in _FLAGS:
             option = "" if word in _FLAGS or "=" in word else word
             spreading = False
         elif option:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Out, Seed, Verbose, exit_failed, numbers, progress, say, say_written
+from calib.cli.shared import Out, Seed, exit_failed, numbers, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 
 app = typer.Typer()
@@ -24,7 +24,6 @@ def fit(
     base: str | None = None,
     tip: str | None = None,
     plots: bool = True,
-    verbose: Verbose = False,
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and judge it.
 
@@ -58,8 +57,7 @@ def fit(
         )  # fmt: skip
         show("writing")
         found.save(out, plots=plots)
-    lines = list(found.renderables())
-    say_written(lines if verbose else shown.brief(lines), out, found.verdict.level)
+    say_written(found.renderables(), out, found.verdict.level)
 
 
 @command(app)

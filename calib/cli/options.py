@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 import typer
 from typer.models import ParameterInfo
 
+from calib.cli.shared import printing
 from calib.config import described, parse
 from calib.config_types import OneOf, Typed
 
@@ -26,17 +27,18 @@ class Common:
         tip: URDF: the link the arm ends at.
         workers: local processes, or the address of a Dask scheduler.
         plots: draw figures, or leave them out.
-        verbose: print the tables, and all that was noticed.
+        verbose: print all that there is to say, tables included.
         overwrite: replace files, whatever they hold; without: those of an earlier run.
     """
 
 
-def command(app: typer.Typer, name: str | None = None) -> Callable[[F], F]:
+def command(app: typer.Typer, name: str | None = None, listing: bool = False) -> Callable[[F], F]:
     """Return a decorator that adds a function to `app` as a command.
 
     What ``Args:`` of its docstring, or `Common`, says of a parameter is the option's help; a flag that is off by
     default has no name to switch it off. A parameter that is annotated with a settings dataclass becomes an option per
-    field, described under ``Attributes:`` of that class; fields that the function takes itself are left to it.
+    field, described under ``Attributes:`` of that class; fields that the function takes itself are left to it. Every
+    command has ``-v``, without which it prints what `calib.cli.shared.printing` lets through; not so one that lists.
     """
 
     def add(function: F) -> F:
@@ -51,10 +53,16 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[F], F]:
                 annotation = _with_help(hints[key], about.get(key, ""), names, one.default is Parameter.empty)
                 made.append(one.replace(annotation=annotation, kind=Parameter.KEYWORD_ONLY))
 
+        if not listing:
+            words = _with_help(bool, about["verbose"], ("-v", "--verbose"), False)
+            made = [one for one in made if one.name != "verbose"]
+            made.append(Parameter("verbose", Parameter.KEYWORD_ONLY, default=False, annotation=words))
+
         @wraps(function)
         def call(**given: Any) -> Any:
             built = {key: _built(kind, given) for key, kind in settings.items()}
-            return function(**built, **{key: value for key, value in given.items() if key in own})
+            with printing(given.get("verbose", True)):
+                return function(**built, **{key: value for key, value in given.items() if key in own})
 
         call.__signature__ = signature(function).replace(parameters=made)  # type: ignore[attr-defined]
         call.__annotations__ = {}

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Seed, exit_failed, make_console, reporting, say
+from calib.cli.shared import Seed, exit_failed, reporting, say
 from calib.errors import CalibError, UsageError, command_line, require
 from calib.procedure.session.answers import Answers
 
@@ -76,7 +76,7 @@ def _asked(given: Answers) -> Answers:
     return given
 
 
-@command(app)
+@command(app, listing=True)
 def formats(topic: Annotated[str | None, typer.Argument()] = None, schema: bool = False) -> None:
     """Print what files hold: columns, keys, units.
 
@@ -93,7 +93,7 @@ def formats(topic: Annotated[str | None, typer.Argument()] = None, schema: bool 
         print(documents.describe(topic) if topic else "\n".join(documents.overview()))
 
 
-@command(app)
+@command(app, listing=True)
 def explain(code: Annotated[str | None, typer.Argument()] = None) -> None:
     """Print what a finding or a term means, and what to do.
 
@@ -123,12 +123,11 @@ def redo(folder: Folder, step: str, plots: bool = True) -> None:
 
 @command(app)
 def status(folder: Folder) -> None:
-    """Show how far a session is, and what is stale."""
+    """Show how far a session is, and what is stale; with -v, what was noted as its steps were made."""
     from calib.procedure.session import commands
 
-    console = make_console()
-    for renderable in commands.status_lines(folder):
-        console.print(renderable, soft_wrap=True)
+    say(*commands.status_lines(folder), result=True)
+    say(*commands.noted(folder))
 
 
 @command(app)
@@ -154,7 +153,7 @@ def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
             progress(f"{len(outcomes)} of {len(folders)} sessions")
     places = [str(folder) for folder in folders]
     outcomes.sort(key=lambda one: places.index(one.folder))
-    say(fleet.table(outcomes))
+    say(fleet.table(outcomes), result=True)
     say(*fleet.remarks(outcomes))
     say(fleet.summary(outcomes, time.perf_counter() - started))
     if code := fleet.worst_code(outcomes):

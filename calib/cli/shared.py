@@ -1,10 +1,12 @@
 """What several commands share: arguments, the console, progress, lists of numbers."""
 
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
@@ -13,9 +15,10 @@ from typing import Annotated, Any
 import typer
 
 PIPED = 160  # columns of tables that no terminal bounds
+MAX_LINES = 25  # that a command prints without -v, warnings and verdicts not counted
+MAX_LAST_LINES = 9  # of these the ones it ends with
 
 Out = Annotated[Path, typer.Option()]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose")]
 Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
 
 
@@ -28,11 +31,59 @@ def make_console(**options: Any) -> Any:
     return Console(highlight=False, **options)
 
 
-def say(*lines: Any, console: Any = None) -> None:
-    """Print lines of text as they are, and what rich renders."""
+class _Output:
+    """What a command prints: with -v all; without, no details (indented lines, tables) and at most `MAX_LINES`."""
+
+    def __init__(self, verbose: bool) -> None:
+        self.verbose, self.printed, self.left_out = verbose, 0, 0
+        self.last: list[Any] = []  # what is printed at the end, with its console
+
+    def show(self, line: Any, console: Any, result: bool) -> None:
+        words = " " if hasattr(line, "add_column") else str(line)
+        if self.verbose or result or re.match(r"\s*(verdict|warning)\b", words):
+            self.last.append((line, console, True))
+        elif words.startswith(" "):
+            self.left_out += getattr(line, "row_count", 1)
+        else:
+            self.printed += 1
+            self.last.append((line, console, False))
+        if self.printed <= MAX_LINES - MAX_LAST_LINES:
+            self.flush()
+        elif self.printed > MAX_LINES:
+            self.last.remove(next(one for one in self.last if not one[2]))
+            self.printed, self.left_out = self.printed - 1, self.left_out + 1
+
+    def flush(self) -> None:
+        for line, console, _ in self.last:
+            console.print(line, soft_wrap=True, markup=False)
+        self.last = []
+
+    def end(self) -> None:
+        self.flush()
+        if self.left_out:
+            make_console().print(f"… {self.left_out} more lines with -v")
+
+
+_OUTPUT = ContextVar("output", default=_Output(verbose=True))
+
+
+@contextmanager
+def printing(verbose: bool) -> Iterator[None]:
+    """Let what `say` is given through, or the most important of it: all that a command prints goes this way."""
+    output = _Output(verbose)
+    token = _OUTPUT.set(output)
+    try:
+        yield
+    finally:
+        _OUTPUT.reset(token)
+        output.end()
+
+
+def say(*lines: Any, console: Any = None, result: bool = False) -> None:
+    """Print lines of text as they are, and what rich renders; a `result` is what was asked for, and no detail."""
     console = console or make_console()
     for line in lines:
-        console.print(line, soft_wrap=True, markup=False)
+        _OUTPUT.get().show(line, console, result)
 
 
 def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:

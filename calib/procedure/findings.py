@@ -158,9 +158,14 @@ def sentence(one: Finding) -> str:
     return _filled(catalogue()[one.code].says, one.values)
 
 
+class Warned(str):
+    """A line on a finding that keeps a verdict from pass: a command always prints it."""
+
+
 def lines_of(found: Iterable[Finding]) -> list[str]:
     """Return findings as lines for a user: the sentence, the advice, and how to accept it."""
-    return [_line(one, catalogue()[one.code]) for one in found]
+    lines = [(_line(one, catalogue()[one.code]), level_of(one)) for one in found]
+    return [Warned(words) if level in LEVELS else words for words, level in lines]
 
 
 def _line(one: Finding, entry: Entry) -> str:

@@ -11,6 +11,7 @@ import pytest
 from without_figures import words
 
 from calib import cli
+from calib.cli.shared import MAX_LINES
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.robot.load import load
@@ -72,6 +73,9 @@ def calib(capsys: pytest.CaptureFixture[str], figures: bool):
     def run(*arguments: object) -> tuple[int, str, str]:
         code = cli.run([str(argument) for argument in arguments] if figures else words(*arguments))
         said = capsys.readouterr()
+        lines = [line for line in said.out.splitlines() if not line.lstrip().startswith(("verdict", "warning"))]
+        results_are_tables = {"formats", "explain", "run", "study", "compare", "-v"} & set(arguments)
+        assert results_are_tables or len(lines) <= MAX_LINES + 1, "without -v a command prints 25 lines at most"
         return code, said.out, said.err
 
     return run

@@ -7,10 +7,9 @@ from rich.console import RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from calib.procedure.findings import LEVELS
+from calib.procedure.findings import LEVELS, Warned
 from calib.procedure.report.page import Block, Section, Table, Text
 
-MAX_LINES = 16
 COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
 
 
@@ -20,8 +19,9 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
         if isinstance(block, Table):
             yield _rich_table(block)
         elif isinstance(block, Text):
-            label = [(block.label, "yellow"), ": "] if block.label else []
-            yield from (RichText.assemble(*label, line) for line in block.lines)
+            for line in block.lines:
+                label = "warning" if isinstance(line, Warned) else block.label
+                yield RichText.assemble(*([(label, "yellow"), ": "] if label else []), line.replace(":: ", ": "))
 
 
 def _rich_table(table: Table) -> RichTable:
@@ -41,15 +41,6 @@ def _rich_table(table: Table) -> RichTable:
         else:
             result.add_row(*map(RichText, row), style="bold" if number in table.strong else "")
     return result
-
-
-def brief(shown: Iterable[RenderableType]) -> list[str | RichText]:
-    """Return what a command prints by default: the lines without the tables, `MAX_LINES` at most, the verdict last."""
-    lines = [one for one in shown if isinstance(one, str | RichText)]
-    if len(lines) > MAX_LINES:
-        more = f"… {len(lines) - MAX_LINES + 1} more lines, and the tables, with -v and in the report"
-        lines[MAX_LINES - 2 : -1] = [RichText(more)]
-    return lines
 
 
 def section(shown: Section) -> Iterator[RenderableType]:

@@ -104,12 +104,7 @@ def read_blocks(inputs: IdentificationInputs) -> list[Block]:
         lines.append(
             f"{case.name.rstrip(':')}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}"
         )
-    return [Text("What was read", [*lines, *(f"  {_plain(note)}" for note in inputs.notes)])]
-
-
-def _plain(note: str) -> str:
-    """Return a note to print; a cut that is open at its end has a colon of its own."""
-    return note.replace(":: ", ": ")
+    return [Text("What was read", [*lines, *(f"  {note}" for note in inputs.notes)])]
 
 
 def outcome_section(outcome: IdentificationOutcome) -> Section:
@@ -128,7 +123,7 @@ def outcome_section(outcome: IdentificationOutcome) -> Section:
         *_interval_blocks(found.validation, rows, units),
         *tracking_blocks(found.tracking, found.tracking_failure),
     ]
-    blocks.append(Text("", [_plain(line) for line in found.warnings], "note"))
+    blocks.append(Text("", found.warnings, "note"))
     return Section("Dynamics", blocks, found.verdict, found.reason)
 
 

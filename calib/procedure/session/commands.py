@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import RenderableType
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from calib.config import parse
 from calib.errors import UsageError, command_line, require
@@ -19,7 +19,7 @@ from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import VERDICT, Session, create, locked, open_session
+from calib.procedure.session.folder import VERDICT, Session, create, locked, open_session, read_state
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.robot.chain import Chain
@@ -137,16 +137,21 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
     """Say how every step of a session stands, and what comes next."""
     session = open_session(folder)
     settings, found = session.settings, steps.states(session)
-    yield f"[bold]{escape(settings.name)}[/], {escape(settings.instrument.name)}, made {settings.created[:10]}"
+    yield Text.assemble((settings.name, "bold"), f", {settings.instrument.name}, made {settings.created[:10]}")
     table = Table("", "step", "state", "", box=None, pad_edge=False)
     for number, state in enumerate(found, 1):
-        colour = COLOURS[state.kind]
-        table.add_row(str(number), state.step.name, f"[{colour}]{state.kind}[/]", escape(state.words))
+        table.add_row(str(number), state.step.name, Text(state.kind, COLOURS[state.kind]), Text(state.words))
     yield table
     ahead = next((state for state in found if state.kind not in (steps.DONE, steps.KEPT)), None)
     if ahead is None:
-        yield escape(f"certificate: {session.path(CERTIFICATE)}")
+        yield f"certificate: {session.path(CERTIFICATE)}"
     elif ahead.kind == steps.WAITING:
-        yield from (escape(line) for line in instructions.asks(session, ahead))
+        yield from instructions.asks(session, ahead)
     else:
-        yield escape(f"next: {command_line('next', folder)}")
+        yield f"next: {command_line('next', folder)}"
+
+
+def noted(folder: Path) -> list[str]:
+    """Return what was noted as each step of a session was made."""
+    recorded = read_state(open_session(folder)).steps
+    return [f"  {name}: {note}" for name, record in recorded.items() for note in record.notes]

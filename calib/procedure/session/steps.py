@@ -13,6 +13,7 @@ from datetime import datetime
 
 from calib.errors import SessionError
 from calib.files import fingerprint
+from calib.procedure.findings import Warned
 from calib.procedure.report import certificate
 from calib.procedure.session.folder import EXPORT, SETTINGS, Session, StateFile, StepRecord, read_state
 from calib.procedure.session.geometry_steps import clear_staging
@@ -175,7 +176,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
     session.write_state(StateFile({**recorded.steps, step.name: made}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
-        say(f"    {note}")
+        say(f"    {'warning: ' if isinstance(note, Warned) else ''}{note}")
 
 
 def forget(session: Session, step: SessionStep) -> None:

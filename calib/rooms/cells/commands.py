@@ -48,5 +48,5 @@ def demo(
     for words, name in found.results:
         place, folder = found.session.folder / name, found.session.folder
         how = f"  ({command_line(place, program='rerun')}, or {command_line('view', folder)})"
-        say(f"  {words:15} {place}{how if words == 'to play' else ''}")
+        say(f"{words:15} {place}{how if words == 'to play' else ''}")
     exit_failed(found.verdict)

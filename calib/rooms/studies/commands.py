@@ -62,7 +62,7 @@ def study(
         blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
     else:
         blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]
-    say(*console.rendered(blocks))
+    say(*console.rendered(blocks), result=True)
     say(*found.described(), f"written to {folder}: {outcome.REPORT} shows it")
 
 
@@ -110,7 +110,7 @@ def compare(
         found = compare_methods(
             given, chosen, friction, progress, lambda one: say_now(method_comparison.line(one))
         )  # fmt: skip
-    say(*console.section(method_comparison.section(found, caveats(given, found))))
+    say(*console.section(method_comparison.section(found, caveats(given, found))), result=True)
     if out is not None:
         with files.results(table, overwrite=overwrite):
             say(f"written to {write_table(found, out)}")

@@ -262,7 +262,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     )
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 1
-    said = capsys.readouterr().out.strip().split("\n")[-1]
+    said = capsys.readouterr().out.strip().split("\n")[-2]
     assert said.startswith("verdict fail: exported for inspection only") and "done; " not in said
     head = (place / "robot.urdf").read_text().split("<robot", 1)[0]
     assert "<!-- verdict fail: geometry: " in head and "do not use -->" in head
