@@ -64,7 +64,7 @@ class _Output:
             make_console().print(f"… {self.left_out} more lines with -v")
 
 
-_OUTPUT = ContextVar("output", default=_Output(verbose=True))
+_OUTPUT: ContextVar[_Output | None] = ContextVar("output", default=None)
 
 
 @contextmanager
@@ -81,9 +81,9 @@ def printing(verbose: bool) -> Iterator[None]:
 
 def say(*lines: Any, console: Any = None, result: bool = False) -> None:
     """Print lines of text as they are, and what rich renders; a `result` is what was asked for, and no detail."""
-    console = console or make_console()
+    console, output = console or make_console(), _OUTPUT.get() or _Output(verbose=True)
     for line in lines:
-        _OUTPUT.get().show(line, console, result)
+        output.show(line, console, result)
 
 
 def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:

@@ -115,7 +115,7 @@ def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
     table = np.column_stack([good["t"], np.degrees(good["q"][:, :1]), good["q"][:, 1:], good["tau"]])
     header = "t,q1 [deg],q2,q3,tau1,tau2,tau3"
     np.savetxt(path, table, delimiter=",", header=header, comments="")
-    assert run(robot, path, "--out", tmp_path / "out", "--friction", "standard") == 0
+    assert run(robot, path, "--out", tmp_path / "out", "--friction", "standard", "-v") == 0
     assert "differ in their units (deg, no unit)" in " ".join(capsys.readouterr().out.split())
 
 
