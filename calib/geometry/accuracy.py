@@ -79,6 +79,11 @@ class Errors:
         chosen = self.position if self.position is not None else self.distance
         return np.zeros(0) if chosen is None else chosen
 
+    @property
+    def rms(self) -> float:
+        """Root mean square of the errors to judge by; 0 without any."""
+        return float(np.sqrt(np.mean(self.main**2))) if len(self.main) else 0.0
+
     def summary(self) -> ArmErrors:
         """Return statistics of each nature, in the units they are printed in."""
         sizes = (getattr(self, nature) for nature in ERRORS)

@@ -109,7 +109,7 @@ def findings(
         left: cross-validated error of the chosen model [m]; None where it was not computed.
         reach: of the arm [m].
     """
-    before, after = (_rms(cell, blocks, torques) for cell in (nominal, fit.cell))
+    before, after = (errors(cell, blocks, torques).rms for cell in (nominal, fit.cell))
     remains = after if left is None else left
     shown, pulled = _as_positions(blocks, torques)
     result = _wrong_way(nominal, shown, pulled, before, reach)
@@ -190,8 +190,3 @@ def _scale(codes: tuple[str, str], one: Scale | None) -> list[Finding]:
         "sigmas": off / max(one.sigma, 1e-300),
     }
     return [each for code in codes if level_of(each := finding(code, **values))][:1]
-
-
-def _rms(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None]) -> float:
-    sizes = errors(cell, blocks, torques).main
-    return float(np.sqrt(np.mean(sizes**2))) if len(sizes) else 0.0

@@ -1,9 +1,11 @@
 """Both arms on rows that were fitted and on rows that were not, and what that comes to: one assessment for all who ask.
 
 `assess` is called by a fit that was just made and by one read back from its folder; they get the same answer.
+
+May one trust the calibrated arm? The rules' limits and sentences stand in the catalogue, chapter 4.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,16 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.data.poses.measurements import Positions
 from calib.errors import Finding, finding
-from calib.geometry.accuracy import Errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
-from calib.procedure.findings import Verdict, lines_of
+from calib.procedure.findings import Verdict, catalogue, level_of, lines_of, sentence
 from calib.procedure.kinematic_stage.comparison import (
     INTERVAL,
     MARGIN,
@@ -32,10 +33,154 @@ from calib.procedure.kinematic_stage.comparison import (
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, ValidationMetrics
+from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.verdict import judge
 from calib.robot.chain import Chain
 from calib.transforms import invert
+
+RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry explains the measurements
+
+
+@dataclass(frozen=True)
+class _Proof:
+    """What the arms are judged by: rms errors [m], and on which rows."""
+
+    before: float
+    after: float
+    where: str
+    rows: Comparison | None = None
+
+    @property
+    def left(self) -> float:
+        """Share of the nominal arm's error that is left."""
+        return self.after / max(self.before, 1e-300)
+
+
+def judge(
+    fit: Comparison,
+    validation: Mapping[str, Comparison],
+    findings: Findings,
+    *,
+    asked: str = "auto",
+    tolerance: float | None = None,
+    cross_validated: float | None = None,
+    arm: str = "",
+) -> Verdict:
+    """Judge a calibration by the rows it has not seen; without unseen files, by cross-validation.
+
+    Rules, the first group that says something; inside a group the worst finding decides:
+
+    1. ``placed-elsewhere``, ``far-off``; ``orientations-off``; ``above-tolerance``;
+    2. ``frames-only``, where no more was asked for;
+    3. frames were chosen: no model of the arm is better than the nominal one. ``nothing-to-gain`` (pass) where what
+       remains is below `FLOOR` of the reach, ``transfer-untested`` where stations could not be left out as a whole,
+       else ``no-better-model``. With any model a pass where the nominal arm leaves less than any instrument
+       (`TOO_GOOD`);
+    4. ``worse-than-nominal``; by cross-validation alone, where both leave less than `FLOOR` of the reach,
+       ``keep-nominal``, since the nominal arm may have been fitted to these very rows;
+    5. ``no-unseen-poses``;
+    6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``no-transfer``, ``intervals-too-narrow``,
+       ``small-gain``, ``many-outliers``; none of them: pass.
+
+    The fit's other findings, those of `calib.procedure.kinematic_stage.plausibility`, count in every group.
+
+    Args:
+        fit: both arms on the fit's rows.
+        validation: both arms on other rows.
+        findings: what the fit says of itself.
+        asked: the model asked for.
+        tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+        cross_validated: error of what is judged on held-out rows [m]; None where it was not computed.
+        arm: what is judged, in a word or two, where there are several deliverables.
+    """
+    proofs = {name: comparison for name, comparison in validation.items() if comparison.proves}
+    nominal, own = (each.rms for each in fit.errors)
+    if findings.nominal_cross_validated is not None:
+        nominal = findings.nominal_cross_validated
+    found = [_Proof(one.errors[0].rms, one.errors[1].rms, f"on {name}, unseen", one) for name, one in proofs.items()]
+    if not found and cross_validated is not None:
+        found = [_Proof(nominal, cross_validated, "by cross-validation only")]
+    worst = max(found, key=lambda proof: proof.after, default=None)
+    others = [one for one in findings.noticed if one.code not in RIGID]
+    for rules in (
+        _far_off(found, {"the fitted poses": fit, **proofs}, tolerance, findings.reach),
+        [finding("frames-only", rms=own)] if findings.model == asked == "frames" else [],
+        _nothing_gained(found, findings),
+        _worse(found, findings.reach),
+    ):
+        if group := list(filter(level_of, rules)):
+            if level_of(group[0]) == "note":  # it stands for the figures
+                return Verdict.of(sentence(group[0]), others)
+            return Verdict.of("" if worst is None else _figures(worst, arm), [*others, *group])
+    if worst is None:
+        return Verdict.of("", [finding("no-unseen-poses"), *others])
+    rules = [*findings.noticed, *_doubts(worst, own, cross_validated, proofs, findings)]
+    verdict = Verdict.of(_figures(worst, arm), rules)
+    return Verdict("pass", _figures(worst, arm, tolerance)) if verdict.level == "pass" else verdict
+
+
+def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
+    values = {"after": worst.after, "before": worst.before, "where": worst.where, "arm": arm, "tolerance": tolerance}
+    return sentence(finding("errors", **values))
+
+
+def _far_off(
+    found: Sequence[_Proof], sets: Mapping[str, Comparison], tolerance: float | None, reach: float
+) -> Iterator[Finding]:
+    """Yield files on which both arms are far off (the instrument stood elsewhere, or it is another robot), or too far.
+
+    Orientations that are off, of all sets of rows, and errors above the tolerance.
+    """
+    for proof in found:
+        if proof.rows is not None:
+            code = "placed-elsewhere" if proof.rows.shares_frames else "far-off"
+            yield finding(code, share=min(proof.before, proof.after) / reach)
+    for name, rows in sets.items():
+        if (angle := rows.errors[1].orientation) is not None:
+            yield finding("orientations-off", where=name, angle=float(np.sqrt(np.mean(angle**2))))
+    if tolerance is not None:
+        for proof in found:
+            yield finding("above-tolerance", tolerance=tolerance, times=proof.after / tolerance)
+
+
+def _nothing_gained(found: Sequence[_Proof], findings: Findings) -> list[Finding]:
+    proof = max(found, key=lambda one: one.before, default=_Proof(np.inf, np.inf, ""))
+    nothing = [finding("nothing-to-gain", before=proof.before, where=proof.where)]
+    if findings.model != "frames":
+        return nothing if proof.before < TOO_GOOD else []
+    if not proof.before <= FLOOR * findings.reach < np.inf:
+        return [finding("no-better-model")]
+    return [finding("transfer-untested", stations=findings.blind)] if findings.blind else nothing
+
+
+def _worse(found: Sequence[_Proof], reach: float) -> list[Finding]:
+    worse = [one for proof in found if level_of(one := finding("worse-than-nominal", times=proof.left))]
+    if worse and found[0].rows is None and found[0].after <= FLOOR * reach < np.inf:
+        return [finding("keep-nominal")]
+    return worse
+
+
+def _doubts(
+    worst: _Proof, own: float, cross_validated: float | None, proofs: Mapping[str, Comparison], findings: Findings
+) -> Iterator[Finding]:
+    """Yield the findings of the last group, worst first; those without a level count for nothing."""
+    times = worst.after / max(own, 1e-300)
+    shared = any(rows.shares_frames for rows in proofs.values())
+    remedy = catalogue()["placed-elsewhere"].advice if shared else ""
+    if proofs and cross_validated is not None and not any(one.code in RIGID for one in findings.noticed):
+        promised = worst.after / max(cross_validated, 1e-300)
+        yield finding("refuted", times=times, promised=promised, left=worst.left, remedy=remedy)
+    yield finding("no-transfer", times=times, remedy=remedy)
+    for name, rows in proofs.items():
+        if (held := rows.intervals) is not None:
+            chance = 3.0 * float(np.sqrt(0.95 * 0.05 / len(held.size)))
+            yield finding(
+                "intervals-too-narrow", where=name, errors=len(held.size), covered=held.covered,
+                median=np.median(held.radius), missing=0.95 - chance - held.covered,
+            )  # fmt: skip
+    yield finding("small-gain", left=worst.left)
+    yield finding("many-outliers", share=findings.outlier_share)
+
 
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 OUTLIER_SIGMAS = 8.0  # our choice
@@ -130,9 +275,10 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
         for other in judged.keys() - {chosen}
     ]
     copies = _copies(inputs)
+    usual = float(np.median(fitted.errors[0].main)) if len(fitted.errors[0].main) else np.inf
     noticed = (
         *others, *findings.noticed, *([finding("not-unseen", files=copies)] if copies else []),
-        *_elsewhere(fitted, validation), *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
+        *(one for name, each in validation.items() for one in _noticed(name, each, usual)),
     )  # fmt: skip
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     notes = (*inputs.notes, *(note for block in blocks for note in block.notes))
@@ -156,7 +302,7 @@ def judge_deliverables(
 def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
     """Return the largest rms error of a deliverable on unseen rows; without any, that by cross-validation [m]."""
     alone = deliverable == "urdf"
-    sizes = [_rms((each.of_urdf if alone else each).errors[1]) for each in validation.values() if each.proves]
+    sizes = [(each.of_urdf if alone else each).errors[1].rms for each in validation.values() if each.proves]
     by_folds = findings.rigid_cross_validated if alone else findings.cross_validated
     return max(sizes, default=np.nan if by_folds is None else by_folds)
 
@@ -166,14 +312,11 @@ def _copies(inputs: Inputs) -> list[str]:
     words = []
     for name, unseen in inputs.unseen.items():
         if unseen.seen:
-            own = next((Path(block.file).name for block in inputs.fit if _same_rows(block, unseen.block)), "")
+            rows = unseen.block.q, unseen.block.measured
+            own = next((Path(b.file).name for b in inputs.fit if all(map(np.array_equal, (b.q, b.measured), rows))), "")
             same = "was fitted on" if own == name else f"is a copy of {own}"
             words.append(f"{name} {same if own else 'repeats rows of the fit'}")
     return words
-
-
-def _same_rows(one: PoseMeasurements, other: PoseMeasurements) -> bool:
-    return np.array_equal(one.q, other.q) and np.array_equal(one.measured, other.measured)
 
 
 def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
@@ -182,61 +325,36 @@ def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
     return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings, torques).cell
 
 
-def _elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[Finding]:
-    """Return validation files whose errors look like another placement of the instrument, not like an arm's."""
-    usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
-    sizes = {name: float(np.median(found.errors[0].main)) for name, found in validation.items()}
-    return [
-        finding("validation-elsewhere", file=name, rms=size) for name, size in sizes.items() if size > ELSEWHERE * usual
-    ]
+def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
+    """Yield the findings on one set of unseen rows.
 
-
-def _doubtful(validation: Mapping[str, Comparison]) -> list[Finding]:
-    """Return unseen rows whose error is more than `OUTLIER_SIGMAS` times the median: they may be wrong measurements."""
-    result = []
-    for name, each in validation.items():
-        sizes, numbers = each.errors[1].main, [row for block in each.blocks for row in _numbers(block)]
-        far = np.flatnonzero(sizes > OUTLIER_SIGMAS * np.median(sizes)) if len(sizes) == len(numbers) else []
-        if not len(far):
-            continue
-        rest = np.delete(sizes, far)
-        beyond = None if each.intervals is None else each.intervals.beyond
-        outside = 0 if beyond is None or len(beyond) != len(sizes) else int(np.count_nonzero(beyond[far]))
-        result.append(
-            finding(
-                "doubtful-rows", file=name, rows=[f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far],
-                median=np.median(sizes), without=float(np.sqrt(np.mean(rest**2))), outside=outside,
-            )
+    Errors that look like another placement of the instrument than the `usual` nominal ones [m], rows that may be wrong
+    measurements, a placement of base and tool that did not settle or took up most of the errors, and how many errors
+    are within the 95 % interval.
+    """
+    before, sizes = (found.main for found in each.errors)
+    if np.median(before) > ELSEWHERE * usual:
+        yield finding("validation-elsewhere", file=name, rms=float(np.median(before)))
+    rows = [int(row) for block in each.blocks for row in block.rows]
+    far = np.flatnonzero(sizes > OUTLIER_SIGMAS * np.median(sizes)) if len(sizes) == len(rows) else []
+    if len(far):
+        beyond = np.zeros(len(sizes), bool) if each.intervals is None else each.intervals.beyond
+        yield finding(
+            "doubtful-rows", file=name, rows=[f"row {rows[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far],
+            median=np.median(sizes), without=float(np.sqrt(np.mean(np.delete(sizes, far) ** 2))),
+            outside=int(np.count_nonzero(beyond[far])),
         )  # fmt: skip
-    return result
-
-
-def _interval_notes(validation: Mapping[str, Comparison]) -> list[Finding]:
-    """Return how many errors on unseen rows are within the 95 % interval, and where the model extrapolates."""
-    result = []
-    for name, each in validation.items():
-        if (found := each.intervals) is None or not each.settled or each.placed_by is not None:
-            continue
+    if not each.settled:
+        yield finding("placement-unsettled", file=name)
+    elif each.placed_by is not None:
+        measured, fitted = each.placed_by
+        yield finding("placement-takes-all", file=name, measured=measured, fitted=fitted, wanted=MARGIN * fitted)
+    elif (found := each.intervals) is not None:
         count = len(found.size)
         values = {"covered": found.covered, "errors": count, "median": np.median(found.radius)}
-        result.append(finding("interval-coverage", file=name, **values))
+        yield finding("interval-coverage", file=name, **values)
         if beyond := int(found.beyond.sum()):
-            result.append(finding("outside-fitted-range", file=name, beyond=beyond, poses=count, joints=found.joints))
-    return result
-
-
-def _unsettled(validation: Mapping[str, Comparison]) -> list[Finding]:
-    """Return unseen files on which the placement of base and tool did not settle, or took up most of the errors."""
-    result = []
-    for name, each in validation.items():
-        if not each.settled:
-            result.append(finding("placement-unsettled", file=name))
-        elif each.placed_by is not None:
-            measured, fitted = each.placed_by
-            result.append(
-                finding("placement-takes-all", file=name, measured=measured, fitted=fitted, wanted=MARGIN * fitted)
-            )
-    return result
+            yield finding("outside-fitted-range", file=name, beyond=beyond, poses=count, joints=found.joints)
 
 
 def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
@@ -248,7 +366,7 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
     rows: list[list[object]] = []
     for name, each in validation.items():
         q = np.concatenate([block.q for block in each.blocks])
-        numbers = [row for block in each.blocks for row in _numbers(block)]
+        numbers = [int(row) for block in each.blocks for row in block.rows]
         sizes = [found.main for found in each.errors]
         if len(sizes[0]) == len(q):
             places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
@@ -275,11 +393,3 @@ def _places(found: Comparison, number: int) -> np.ndarray:
 
 def _cell(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
-
-
-def _numbers(block: PoseMeasurements) -> list[int]:
-    return [int(row) for row in block.rows]
-
-
-def _rms(found: Errors) -> float:
-    return float(np.sqrt(np.mean(found.main**2))) if len(found.main) else 0.0

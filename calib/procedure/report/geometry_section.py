@@ -130,7 +130,7 @@ def _key_figures(report: Report) -> list[KeyFigure]:
 
 
 def _left_out(metrics: FitMetrics) -> KeyFigure | None:
-    """Return the errors of both arms by cross-validation; None where they did not judge (`verdict.judge`)."""
+    """Return the errors of both arms by cross-validation; None where they did not judge (`validation.judge`)."""
     found, nominal = metrics.findings, metrics.fit.nominal.main
     if found is None or found.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
         return None

@@ -12,8 +12,7 @@ from calib.geometry.accuracy import Errors
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.validation import judge_deliverables
-from calib.procedure.kinematic_stage.verdict import judge
+from calib.procedure.kinematic_stage.validation import judge, judge_deliverables
 
 
 def rows(
