@@ -33,11 +33,12 @@ from calib.identification.identify import Identification, identify_model
 from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.rooms.parallel.excite import ParallelDesign, design_parallel
+from calib.rooms.parallel.excite import ParallelExcitation, design_parallel
 from calib.rooms.parallel.mechanism import library, parallel_files
 from calib.rooms.parallel.mechanism.closure import closed
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
+from calib.rooms.parallel.robots import ParallelMechanism
 
 RATE, SECONDS = 1000.0, 6.0  # of a recording: Hz, s
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}  # truth: mass as weighed, the others as the papers identify them
@@ -101,14 +102,13 @@ def put_into_readme(rows: list[str]) -> None:
     path.write_text("\n".join([head + MARKS[0], *rows, tail]), encoding="utf-8")
 
 
-def designed(seed: int) -> ParallelDesign:
+def designed(seed: int) -> ParallelExcitation:
     """Return a motion that excites robot and payload within 127 N m (a fifth of it kept free) and 25 g."""
     robot = Robot()
     settings = ExcitationSettings(period=0.5, harmonics=5, starts=1, evaluations=MOST, seed=seed, rate=RATE)
     limits = np.array([ACCELERATION, ACCELERATION, np.inf])
-    return design_parallel(
-        robot.model, settings, values=robot.values, acceleration=limits, margin=0.2, preload=PRELOAD, index="logdet"
-    )
+    found = ParallelMechanism(robot.known, library.path("dualv"))
+    return design_parallel(found, robot.model, robot.values, settings, acceleration=limits, preload=PRELOAD)
 
 
 class Robot:
@@ -122,7 +122,7 @@ class Robot:
         for name, value in PAYLOAD.items():
             self.values[self.model.names.index(name)] = value
 
-    def run(self, design: ParallelDesign, carried: tuple[str, ...], seed: int) -> ParallelRun:
+    def run(self, design: ParallelExcitation, carried: tuple[str, ...], seed: int) -> ParallelRun:
         controller = ComputedTorque(self.values, preload=PRELOAD, rate=RATE, encoder=ENCODER_NOISE, torque=TORQUE_NOISE)
         orders = design.orders(np.arange(int(SECONDS * RATE)) / RATE)
         return simulate(self.model, self.values, controller, *orders, carried, seed)
@@ -209,7 +209,7 @@ class Trial:
         }
 
 
-def report(designs: list[ParallelDesign], found: list[Trial]) -> dict[str, Any]:
+def report(designs: list[ParallelExcitation], found: list[Trial]) -> dict[str, Any]:
     """Return the metrics of all seeds."""
     return {
         "truth": {name: float(found[0].truth[name]) for name in NINE},
@@ -217,8 +217,9 @@ def report(designs: list[ParallelDesign], found: list[Trial]) -> dict[str, Any]:
         "inertial_base_parameters": found[0].inertial,
         "designs": [
             {
-                "evaluations": one.found.evaluations, "merit": one.found.merit, "condition": one.condition,
-                "peak_torque": one.peak.tolist(), "peak_g": (one.fastest[:2] / 9.81).tolist(),
+                "evaluations": one.designed.found.evaluations, "merit": one.designed.found.merit,
+                "condition": one.designed.condition.table(), "peak_torque": one.peaks[0].tolist(),
+                "peak_g": (one.peaks[1][:2] / 9.81).tolist(),
             }
             for one in designs
         ],

@@ -111,22 +111,29 @@ def excite(
 
     Ctrl-C ends the search; the best motion found so far is verified and returned.
     """
-    say = progress or (lambda words: None)
     given = read_inputs(robot, settings, model, limits, base, tip)
+    try:
+        return search_motion(given, settings, map, progress)
+    except NothingFeasible as error:
+        raise located(error) from error
+
+
+def search_motion(
+    given: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
+) -> Designed:
+    """Search for a motion of what was read: an arm, or the platform's coordinates of a parallel robot."""
+    say = progress or (lambda words: None)
     check_playback(settings, given)
     problem, checked, notes = _excitation_problem(given, settings)
     condition = _condition_objective(given, settings)
     wanted = read_goals(settings, given, condition)
     report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
     search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
-    try:
-        found, problem = _searched(problem, wanted, settings.starts, search, say)
-        say("verifying")
-        found, problem = _whole(found, problem, settings.rate)
-        with finishing():
-            found, proof = ensured(problem, found, checked)
-    except NothingFeasible as error:
-        raise located(error) from error
+    found, problem = _searched(problem, wanted, settings.starts, search, say)
+    say("verifying")
+    found, problem = _whole(found, problem, settings.rate)
+    with finishing():
+        found, proof = ensured(problem, found, checked)
     front = None
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short

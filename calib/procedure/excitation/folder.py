@@ -269,7 +269,7 @@ def _margins(planned: Planned) -> dict[str, _PlanMargin]:
     used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
     left = {name: 1.0 - shares.max(axis=0) for name, shares in used.items()}  # shares of the limits
     result = {}
-    for name, joints in ({"position": planned.margins} | left).items():
+    for name, joints in (({} if planned.margins is None else {"position": planned.margins}) | left).items():
         j = int(np.argmin(joints))
         joint, size = planned.chain.joints[j], planned.upper - planned.lower
         share = joints[j] / size[j] if name == "position" else joints[j]

@@ -1,7 +1,7 @@
 """What limits the speed and the acceleration of a motion, joint by joint, and where each limit is stated.
 
 No file that a robot may play is written without a `MotionBounds` (`calib.procedure.excitation.folder`,
-`calib.rooms.parallel.results`), and none exists of a joint whose speed, or whose acceleration and torque,
+`calib.rooms.parallel.excite`), and none exists of a joint whose speed, or whose acceleration and torque,
 nothing limits. What they are stands at the head of each file.
 """
 

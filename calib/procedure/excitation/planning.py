@@ -59,12 +59,12 @@ class Planned:
     """A planned motion.
 
     Attributes:
-        chain: the robot, and `law`: its dynamics; None where its masses are not known.
+        chain: the robot.
         bounds: what limits its speed and acceleration, and where that is stated.
         limits, lower, upper: what the motion keeps, margins of torque taken off.
         timings: one per path: a single one through all waypoints, or one per tool line.
         track: the motion at the controller's rate.
-        margins: (n,) to the joint limits [rad or m].
+        margins: (n,) to the joint limits [rad or m]; None where the path is none of joints.
         deviation: (2,) of the tool from its lines [m, rad]; None for joint paths.
         shaped: what the outer loop found; None without one.
         approach, rehearsal: tracks; None where not asked for.
@@ -74,20 +74,19 @@ class Planned:
     """
 
     chain: Chain
-    law: PathDynamics | None
     bounds: MotionBounds
     limits: TimingLimits
     lower: np.ndarray
     upper: np.ndarray
     timings: tuple[Timing, ...]
     track: Setpoints
-    margins: np.ndarray
-    deviation: np.ndarray | None
-    shaped: Shaped | None
-    approach: Setpoints | None
-    rehearsal: Setpoints | None
-    sigma: np.ndarray | None
     notes: tuple[str, ...]
+    margins: np.ndarray | None = None
+    deviation: np.ndarray | None = None
+    shaped: Shaped | None = None
+    approach: Setpoints | None = None
+    rehearsal: Setpoints | None = None
+    sigma: np.ndarray | None = None
 
 
 def plan(
@@ -148,8 +147,8 @@ def plan(
     if settings.start is not None:
         lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
     return Planned(
-        chain, law, known.bounds, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
-        slowed(motion, settings.slower) if settings.slower != 1 else None, sigma, (*known.notes, *notes, *remarks),
+        chain, known.bounds, bounds, lower, upper, timings, motion, (*known.notes, *notes, *remarks), margins,
+        deviation, shaped, lead, slowed(motion, settings.slower) if settings.slower != 1 else None, sigma,
     )  # fmt: skip
 
 

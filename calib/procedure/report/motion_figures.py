@@ -11,6 +11,7 @@ import numpy as np
 from calib.procedure.report.charts import Chart, Panel, level, line, save_all, text
 from calib.procedure.report.geometry_figures import outlook_figure
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
+from calib.robot.chain import Chain
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
 from trajectories.constraints import BoxLimit
@@ -131,8 +132,10 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def design_figures(designed: Designed) -> dict[str, Chart]:
-    """Return the figures of a designed motion by name: motion, tool path, search, front and outlook if any."""
-    figures = {"motion": _motion_figure(designed), "path": _path_figure(designed), "history": _history_figure(designed)}
+    """Return the figures of a designed motion by name: motion, an arm's tool path, search, front and outlook if any."""
+    figures = {"motion": _motion_figure(designed), "history": _history_figure(designed)}
+    if isinstance(designed.inputs.chain, Chain):
+        figures["path"] = _path_figure(designed)
     if designed.front is not None and len(designed.front.values):
         figures["front"] = _front_figure(designed.front)
     if (look := designed.outlook) is not None and look.by_period:

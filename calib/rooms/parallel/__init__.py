@@ -7,7 +7,7 @@ TOPICS = {
         (
             "calib.rooms.parallel.mechanism.parallel_files",
             "calib.rooms.parallel.loop_fit",
-            "calib.rooms.parallel.results",
+            "calib.rooms.parallel.verbs",
         ),
     )
 }

@@ -1,45 +1,73 @@
-"""Design an exciting motion of a parallel robot as the command does."""
+"""Design an exciting motion of a parallel robot: the search of serial arms, on its platform's coordinates."""
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, cast
 
 import numpy as np
 
 from calib import files
+from calib.api.motions import ExcitationDesign, Sampled
 from calib.dynamics import base as bases
-from calib.dynamics.base import Base
 from calib.dynamics.shapes import V0
 from calib.errors import RobotError, UsageError
+from calib.folders import METRICS, check_target, write_staged
 from calib.identification.model_file import MODEL
-from calib.procedure.excitation import coefficients
+from calib.procedure.excitation import coefficients, folder
 from calib.procedure.excitation.coefficients import PLANNED
-from calib.procedure.excitation.goals import SCALINGS
+from calib.procedure.excitation.design import GUARD, INSTANTS, search_motion
+from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, IdentifiableColumns
+from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.motion_bounds import MotionBounds
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
+from calib.robot.chain import Joint
 from calib.robot.tables import dumps
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
-from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
+from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, loop_jacobians
-from calib.rooms.parallel.results import ParallelResult, ResultFolder, write_motion
 from calib.rooms.parallel.robots import ParallelMechanism
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.objectives import Excitation, Index, condition_numbers
-from trajectories.design.optimise import design
-from trajectories.design.problem import ExcitationProblem
-from trajectories.design.search import SearchResult
-from trajectories.design.verify import Verification, dense_motion, ensured
-from trajectories.fourier import Fourier, fourier_family
+from trajectories.design.verify import dense_motion
 from trajectories.setpoints import Setpoints
 
 SAMPLES = 100  # instants over the period while searching
-INSTANTS = 1000  # over the period, at which condition numbers and torques are reported
+DRIVES = ("Ia", "Fv", "Fc", "off")
+READ = ("period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook")  # of the settings
+FIGURES = "plot_*.png"
+MOTION = (ROBOT, METRICS, PLANNED, coefficients.NAME, FIGURES)
+
+
+@dataclass(frozen=True)
+class _Platform:
+    """The platform's coordinates as the joints of a serial arm, whose motion is searched for."""
+
+    name: str
+    joint_names: tuple[str, ...]
+
+    @property
+    def n(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        return tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in self.joint_names)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlatformBox(BoxLimit):
+    """Limits of the platform's coordinates under their names."""
+
+    names: tuple[str, ...] = ()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"platform {self.names[j]} {side}" for side in ("upper", "lower") for j in self.joints)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +75,14 @@ class _ActuatorLimit:
     """|τ| ≤ τ_max, or |q̇| ≤ v_max, of each actuator; a `trajectories.constraints.MotionConstraint`.
 
     Attributes:
-        of: platform coordinates x, v, a (N, r) -> (N, n).
-        gradient: (x, v, a, G (N, n)) -> slopes of Σ G · of by x, v, a.
+        plan: takes platform coordinates to the robot's motion.
+        of: the motion of N samples -> (N, n), what is limited.
         names: of the n actuators; limits (n,), finite.
         name, unit: of the limit.
     """
 
-    of: Callable[..., np.ndarray]
-    gradient: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
+    plan: PlatformRegressor
+    of: Callable[[LoopMotion], np.ndarray]
     names: tuple[str, ...]
     limits: np.ndarray
     name: str = "torque"
@@ -73,208 +101,93 @@ class _ActuatorLimit:
         return np.tile(np.arange(len(self.limits)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
-        own = self.of(motion.q, motion.v, motion.a)
+        own = self.of(self.plan.motion(motion.q, motion.v, motion.a))
         return np.concatenate([own - self.limits, -own - self.limits], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k, result = len(self.limits), np.zeros((4, *motion.q.shape))
-        result[:3] = self.gradient(motion.q, motion.v, motion.a, weights[:, :k] - weights[:, k:])
+        result[:3] = self.plan.slopes(motion.q, motion.v, motion.a, self.of, weights[:, :k] - weights[:, k:])
         return result
 
 
-@dataclass(frozen=True, eq=False)
-class ParallelDesign:
-    """An exciting motion of a parallel robot with its proof.
-
-    Attributes:
-        robot: regressor and torques along platform coordinates.
-        base: base parameters it is to identify.
-        family, found: the Fourier series of the platform's coordinates; proof: margins, checked independently.
-        condition: of the observation matrix over `INSTANTS` samples: raw, and with columns of unit norm.
-        peak: (n,) largest torque of each actuator [N m or N]; fastest: (r,) largest acceleration of each coordinate.
-        bounds: what limits its actuators, and where that is stated.
-    """
-
-    robot: PlatformRegressor
-    base: Base
-    family: Fourier
-    found: SearchResult
-    proof: Verification
-    condition: dict[str, float]
-    peak: np.ndarray | None
-    fastest: np.ndarray
-    bounds: MotionBounds
-
-    def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s]; it repeats with its period."""
-        motion = dense_motion(self.family, self.found.x, np.mod(times, self.family.period))
-        return motion.q, motion.v, motion.a
-
-    def along(self, times: np.ndarray) -> LoopMotion:
-        """Return the whole robot's motion at times (N,)."""
-        return along(self.robot.model.known, *self.orders(times))
-
-
-def design_parallel(
-    model: ParallelModel,
-    settings: ExcitationSettings,
-    *,
-    values: np.ndarray | None = None,
-    acceleration: np.ndarray | None = None,
-    margin: float = 0.0,
-    preload: float = 0.0,
-    index: Index = "cond",
-    map: Callable = map,
-    report: Callable[[int, int, str], None] | None = None,
-) -> ParallelDesign:
-    """Design a motion of the platform that excites the base parameters of a robot.
-
-    Args:
-        model: of the robot, with what it carries.
-        settings: period, harmonics, starts, evaluations, seed, rate.
-        values: (p,) parameters that predict the actuators' torques; None: they are not known.
-        acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
-        margin: share of the torque limits that stays free.
-        preload: overconstraint of redundant actuators [N m or N].
-        index: what is optimised of the observation matrix, rows in units of what equal noise of all torques makes of
-            them at home: ``cond`` (both condition numbers), or ``logdet``, which makes the motion large besides.
-
-    Raises:
-        UsageError: where nothing limits an actuator's speed or torque.
-        NothingFeasible: naming the limit that stands in the way.
-    """
-    robot = model.known.robot
-    bounds = actuator_bounds(model.known, values is not None)
-    exciting = ParallelModel(model.known, model.terms, rows_named(model.known), ())
-    base = bases.find(exciting)
-    plan = PlatformRegressor(model, _columns(model, base), values, preload)
-    constraints: list[MotionConstraint] = [BoxLimit(0, robot.lower, robot.upper)]
-    if acceleration is not None:
-        constraints.append(BoxLimit(2, -np.asarray(acceleration), np.asarray(acceleration)))
-    names = robot.joint_names
-    torque = (1.0 - margin) * bounds.torque
-    constraints.append(_ActuatorLimit(plan.torques, plan.torques_gradient, names, torque))
-    constraints.append(_ActuatorLimit(plan.speeds, plan.speeds_gradient, names, bounds.velocity, "velocity", "rad/s"))
-    family = fourier_family(settings.harmonics or COARSE, settings.period, robot.r, rate=settings.rate)
-    problem = ExcitationProblem(
-        family, plan.regressor,
-        plan.regressor_gradient, _objectives(plan, index),
-        tuple(constraints), samples=SAMPLES,
-    )  # fmt: skip
-    found = design(
-        problem, starts=settings.starts, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report
-    )
-    found, proof = ensured(problem, found, tuple(constraints), instants=INSTANTS)
-    times = settings.period / INSTANTS * np.arange(INSTANTS)
-    motion = dense_motion(family, found.x, times)
-    condition = condition_numbers(plan.regressor(motion.q, motion.v, motion.a), _sigmas(plan))
-    peak = None if values is None else np.abs(plan.torques(motion.q, motion.v, motion.a)).max(axis=0)
-    return ParallelDesign(plan, base, family, found, proof, condition, peak, np.abs(motion.a).max(axis=0), bounds)
-
-
-def actuator_bounds(known: ClosedRobot, predicted: bool) -> MotionBounds:
-    """Return what limits the actuators: speeds of the robot's file and, where a model predicts torques, its efforts.
-
-    Raises:
-        UsageError: where nothing limits one.
-    """
-    joints = known.robot.joints
-    velocity, effort = (np.array([getattr(joint, key) for joint in joints]) for key in ("velocity", "effort"))
-    free = np.full(len(joints), np.inf)
-    torque = effort if predicted else free
-    origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
-    place = "in the robot's file: velocity and effort of the actuated joints, and inertias"
-    return MotionBounds(known.robot.name, joints, velocity, free, torque, origin, place)
-
-
-def _sigmas(plan: PlatformRegressor) -> np.ndarray:
-    """Return what equal noise of all torques makes of the rows at home (r,)."""
-    known = plan.model.known
-    return np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
-
-
-def _objectives(plan: PlatformRegressor, index: Index) -> tuple[tuple[Excitation, float], ...]:
-    sigmas = _sigmas(plan)
-    if index != "cond":
-        return ((Excitation(index, sigmas=sigmas), 1.0),)
-    return tuple((Excitation("cond", scaling=one, sigmas=sigmas), 0.5) for one in SCALINGS)
-
-
-def _columns(model: ParallelModel, base: Base) -> np.ndarray:
-    """Return where the base columns of the empty robot stand in a model with payloads."""
-    index = {name: k for k, name in enumerate(model.names)}
-    return np.array([index[base.standard[k]] for k in base.kept])
-
-
-DRIVES = ("Ia", "Fv", "Fc", "off")
-GUARD = 0.2  # share of the torque limits kept free, where friction is not known (our choice)
-READ = ("period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook")  # of the settings
-EXACT = 1e-8  # by which the series of the actuators may leave the motion [rad or m]
-HARMONIC_SAMPLES = 2048  # over the period, of which the actuators' series are made
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class ParallelExcitation(ParallelResult):
-    """An exciting motion of a parallel robot: what `calib.design_excitation` returns of one.
+class ParallelExcitation(ExcitationDesign):
+    """An exciting motion of a parallel robot; `designed` holds that of its platform's coordinates.
 
     Attributes:
         robot: with its file.
-        designed: the motion and its proof.
-        rate: of the controller [Hz].
+        plan: takes platform coordinates to the robot's motion and torques.
     """
 
     robot: ParallelMechanism
-    designed: ParallelDesign
-    rate: float
-    folder: ClassVar = ResultFolder((PLANNED, coefficients.NAME), (PLANNED,), "motion")
+    plan: PlatformRegressor
 
-    def write(self, folder: Path, plots: bool) -> None:
-        """Write one period at the controller's rate, and the actuators' series."""
-        design, own = self.designed, self.robot.known.robot.actuated
-        t = np.arange(round(design.family.period * self.rate) + 1) / self.rate
-        orders, motion = design.orders(t), design.along(t)
-        tau = None if design.robot.values is None else design.robot.torques(*orders)
-        track = Setpoints(self.rate, motion.posture.q[:, own], motion.v[:, own], motion.a[:, own], tau)
-        write_motion(self.robot, design.bounds, track, orders[0], folder)
-        series = coefficients.table(_actuators_series(design, self.rate), ROBOT, design.bounds.lines())
-        files.write(folder / coefficients.NAME, dumps(series))
+    def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s]; the motion repeats."""
+        family = self.designed.family
+        motion = dense_motion(family, self.designed.found.x, np.mod(times, family.period))
+        return motion.q, motion.v, motion.a
+
+    def sampled(self, rate: float | None = None) -> Sampled:
+        """Return t (N,) [s] and q, v, a (N, n) of the actuators over one period at `rate` [Hz], ends included."""
+        track = self._actuators(folder.one_period(self.designed, rate))
+        return track.times, track.q, track.v, track.a
+
+    def _actuators(self, track: Setpoints) -> Setpoints:
+        """Return the actuators' motion and torques of one of the platform's coordinates."""
+        motion = self.plan.motion(track.q, track.v, track.a)
+        own = self.robot.chain.actuated
+        return Setpoints(
+            track.rate, motion.posture.q[:, own], motion.v[:, own], motion.a[:, own], self.plan.torques(motion)
+        )
+
+    @property
+    def peaks(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) largest torque of each actuator [N m or N], (r,) largest acceleration of each coordinate."""
+        orders = self.orders(self.designed.period / INSTANTS * np.arange(INSTANTS))
+        return np.abs(self.plan.torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that the command writes: one period at the controller's rate, and the actuators' series."""
+        from calib.procedure.report import motion_figures
+
+        one, bounds = folder.one_period(self.designed), self.designed.inputs.limits.bounds
+
+        def more(place: Path) -> None:
+            series = coefficients.table(self._series(), ROBOT, bounds.lines())
+            files.write(place / coefficients.NAME, dumps(series))
+            if plots:
+                motion_figures.write_design(self.designed, place)
+
+        return write_motion(self.robot, Path(out), self._actuators(one), one.q, bounds, self.to_dict(), more)
+
+    def _series(self, max_error: float = 1e-8, samples: int = 2048) -> coefficients.Periodic:
+        """Return the periodic motion of the actuators as Fourier series.
+
+        Args:
+            max_error: by which the series may leave the motion [rad or m].
+            samples: over the period, of which the series are made.
+        """
+        x, _, _ = self.orders(self.designed.period / samples * np.arange(samples))
+        lines = np.fft.rfft(self.robot.known.place(x).q[:, self.robot.chain.actuated], axis=0) / samples
+        above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
+        last = 1 + max(1, int((above[1:] > max_error).sum()))
+        own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T)
+        names, rate = self.robot.chain.joint_names, self.designed.settings.rate
+        return coefficients.Periodic(names, self.designed.period, rate, 1, "fourier", own)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        design = self.designed
-        return {
-            "robot": self.robot.known.robot.name,
-            "period": design.family.period,
-            "parameters": list(design.base.names),
-            "condition_number": {key: float(value) for key, value in design.condition.items()},
-            "peak_torque": None if design.peak is None else design.peak.tolist(),
-            "peak_acceleration": design.fastest.tolist(),
-            "margins": [
-                {"limit": one.name, "of": one.label, "margin": float(one.margin), "unit": one.unit}
-                for one in design.proof.margins
-            ],
-            "limits": design.bounds.lines(),
-        }
-
-    def lines(self) -> list[str]:
-        """Return what the command prints."""
-        design, robot = self.designed, self.robot.known.robot
-        lines = [
-            f"{robot.name}: {design.family.period:g} s, condition number {design.condition['raw']:.4g}, with columns "
-            f"of unit norm {design.condition['normalised']:.4g}, of {len(design.base.names)} base parameters"
-        ]
-        if design.peak is not None:
-            pairs = zip(robot.joint_names, design.peak)
-            lines.append("peak torques: " + ", ".join(f"{name} {peak:.3g}" for name, peak in pairs))
-        worst = min(design.proof.margins, key=lambda one: one.share)
-        label = worst.label
-        for k, name in enumerate(robot.freedom if worst.name in ("position", "acceleration") else ()):
-            label = label.replace(f"joint {k + 1} ", f"platform {name} ")
-        closest = f"closest limit: {worst.name} of {label}, {worst.margin:.3g} {worst.unit} left"
-        return [*lines, closest, *design.bounds.lines()]
+        torque, acceleration = self.peaks
+        own = {"robot": self.robot.chain.name, "peak_torque": torque, "peak_acceleration": acceleration}
+        return super().to_dict() | {key: own[key] if key == "robot" else own[key].tolist() for key in own}
 
     def __repr__(self) -> str:
-        return f"<ParallelExcitation for {self.robot.known.robot.name}: {self.designed.family.period:g} s>"
+        return f"<ParallelExcitation for {self.robot.chain.name}: {self.designed.period:g} s>"
+
+    def __str__(self) -> str:
+        peaks = (f"{name} {peak:.3g}" for name, peak in zip(self.robot.chain.joint_names, self.peaks[0]))
+        return f"{super().__str__()}\npeak torques: {', '.join(peaks)}"
 
 
 def excite_parallel(
@@ -291,7 +204,7 @@ def excite_parallel(
     Args:
         settings: period, harmonics, drives, starts, evaluations, seed, rate; the others are for serial arms.
         model: folder of an identification of the same robot, which predicts the torques and whose drive terms are to
-            be told; None: the file's inertias.
+            be identified; None: the file's inertias.
 
     Raises:
         UsageError: for options that only serial arms know.
@@ -299,25 +212,93 @@ def excite_parallel(
     refuse_unread(settings, DEFAULT_DESIGN, READ)
     if limits is not None:
         raise UsageError("limits are for serial arms yet; a parallel robot's are in its own file: effort, lower, upper")
-    say = progress or (lambda words: None)
-    if model is None:
-        made = make_parallel_model(robot.known, (settings.drives,), v0=0.05)
-        values = _values(made)
-    else:
-        made, values = read_model(robot, model)
-    designed = design_parallel(
-        made, settings, values=values, margin=GUARD, index="logdet", map=map,
-        report=lambda done, total, what: say(f"{what} ({done} of {total})"),
+    made, values = read_model(robot, model, settings.drives)
+    return design_parallel(robot, made, values, settings, map=map, progress=progress)
+
+
+def design_parallel(
+    robot: ParallelMechanism,
+    model: ParallelModel,
+    values: np.ndarray,
+    settings: ExcitationSettings,
+    *,
+    acceleration: np.ndarray | None = None,
+    preload: float = 0.0,
+    map: Callable = map,
+    progress: Callable[[str], None] | None = None,
+) -> ParallelExcitation:
+    """Design a motion of the platform that excites the base parameters of a robot.
+
+    The determinant of the information is optimised, rows in units of what equal noise of all torques makes of them at
+    home; `GUARD` of the torque limits stays free.
+
+    Args:
+        model: of the robot, with what it carries.
+        values: (p,) parameters that predict the actuators' torques.
+        settings: period, harmonics, starts, evaluations, seed, rate.
+        acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
+        preload: overconstraint of redundant actuators [N m or N].
+
+    Raises:
+        UsageError: where nothing limits an actuator's speed or torque.
+        NothingFeasible: naming the limit that stands in the way.
+    """
+    known, own = model.known, model.known.robot
+    bounds = actuator_bounds(known)
+    base = bases.find(ParallelModel(known, model.terms, rows_named(known), ()))
+    columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
+    plan: Any = PlatformRegressor(model, columns, values, preload)
+    constraints: list[MotionConstraint] = [_PlatformBox(0, own.lower, own.upper, names=own.freedom)]
+    if acceleration is not None:
+        constraints.append(_PlatformBox(2, -acceleration, acceleration, names=own.freedom))
+    constraints += [
+        _ActuatorLimit(plan, plan.torques, own.joint_names, (1.0 - GUARD) * bounds.torque),
+        _ActuatorLimit(plan, plan.speeds, own.joint_names, bounds.velocity, "velocity", "rad/s"),
+    ]
+    free = np.full(own.r, np.inf)
+    sigmas = np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
+    given = ExcitationInputs(
+        cast(Any, _Platform(own.name, own.freedom)),
+        MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
+        ExcitedModel(plan, plan, None, None, False), {}, IdentifiableColumns(None, sigmas, base.names), None,
     )  # fmt: skip
-    return ParallelExcitation(robot, designed, settings.rate)
+    asked = replace(settings, goals=("logdet",), harmonics=settings.harmonics or COARSE, samples=SAMPLES)
+    return ParallelExcitation(search_motion(given, asked, map, progress), robot, plan)
 
 
-def read_model(robot: ParallelMechanism, folder: Path) -> tuple[ParallelModel, np.ndarray]:
-    """Return the model that an identification left in `folder`, on the robot's loops, with its values (p,).
+def actuator_bounds(known: ClosedRobot) -> MotionBounds:
+    """Return what limits the actuators: speeds and efforts of the robot's file.
+
+    Raises:
+        UsageError: where nothing limits one.
+    """
+    joints = known.robot.joints
+    velocity, effort = (np.array([getattr(joint, key) for joint in joints]) for key in ("velocity", "effort"))
+    free = np.full(len(joints), np.inf)
+    origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
+    place = "in the robot's file: velocity and effort of the actuated joints"
+    return MotionBounds(known.robot.name, joints, velocity, free, effort, origin, place)
+
+
+def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") -> tuple[ParallelModel, np.ndarray]:
+    """Return a model of a robot with its values (p,): identified, or the file's inertias without friction.
+
+    Args:
+        folder: of an identification; None: the robot's file, with the terms `drives` of each actuator.
 
     Raises:
         RobotError: where the folder holds no model, or one of other bodies.
+        UsageError: where the robot's file has no inertias.
     """
+    if folder is None:
+        model = make_parallel_model(robot.known, (drives,), v0=0.05)
+        bodies = model.known_parameters()
+        if bodies is None:
+            raise UsageError(
+                f"{robot.source} has no inertias, so that efforts limit no acceleration; state them there, or name an "
+                "identified model (--model)"
+            )
+        return model, np.append(bodies, np.zeros(len(model.terms)))
     path, tree = folder / MODEL, robot.known.robot
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -337,17 +318,31 @@ def read_model(robot: ParallelMechanism, folder: Path) -> tuple[ParallelModel, n
     return model, np.array([known.get(name, 0.0) for name in model.names])
 
 
-def _values(model: ParallelModel) -> np.ndarray | None:
-    bodies = model.known_parameters()
-    return None if bodies is None else np.concatenate([bodies, np.zeros(model.p - model.inertial)])
+def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that is not for a motion, or that holds one of its inputs."""
+    check_target(out, MOTION, (METRICS, PLANNED), "motion", inputs)
 
 
-def _actuators_series(design: ParallelDesign, rate: float) -> coefficients.Periodic:
-    """Return the periodic motion of the actuators as Fourier series, long enough to be exact within `EXACT`."""
-    known, period = design.robot.model.known, design.family.period
-    times = period / HARMONIC_SAMPLES * np.arange(HARMONIC_SAMPLES)
-    lines = np.fft.rfft(design.along(times).posture.q[:, known.robot.actuated], axis=0) / HARMONIC_SAMPLES
-    above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
-    last = 1 + max(1, int((above[1:] > EXACT).sum()))
-    own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T)
-    return coefficients.Periodic(known.robot.joint_names, period, rate, 1, "fourier", own)
+def write_motion(
+    robot: ParallelMechanism, out: Path, track: Setpoints, coordinates: np.ndarray, bounds: MotionBounds,
+    metrics: dict[str, Any], more: Callable[[Path], None],
+) -> Path:  # fmt: skip
+    """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `more` adds.
+
+    Args:
+        track: of the actuators; coordinates: (N, r) of the platform; both stand in ``motion.csv``.
+        bounds: which the motion keeps; they stand at the head of the file.
+    """
+    parts = {"q": track.q, "v": track.v, "tau": track.tau}
+    names = (f"{what}_{name}" for what in parts for name in robot.chain.joint_names)
+    table = np.hstack([track.times[:, None], coordinates, *parts.values()])
+
+    def write(folder: Path) -> None:
+        robot.write(folder)
+        bounds.check(track)
+        files.write_numbers(folder / PLANNED, ["t [s]", *robot.chain.freedom, *names], table, notes=bounds.lines())
+        more(folder)
+        files.write_json(folder / METRICS, metrics)
+
+    check_motion_target(out, [robot.source])
+    return write_staged(out, MOTION, write)

@@ -14,21 +14,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib.api.rendering import as_text, data_frame
+from calib import files
+from calib.api.rendering import Judged, data_frame
+from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
-from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, refuse_data, refuse_option, suggestion
+from calib.errors import (
+    CalibError,
+    MeasurementError,
+    NoPosture,
+    UsageError,
+    finding,
+    refuse_data,
+    refuse_option,
+    suggestion,
+)
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
-from calib.procedure.findings import Verdict, limit
+from calib.folders import METRICS, check_target, write_staged
+from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
+from calib.rooms.parallel.mechanism import parallel_files
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.geometric_fit import (
     LoopFit,
@@ -38,10 +52,14 @@ from calib.rooms.parallel.mechanism.geometric_fit import (
     platform_errors,
 )
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, ParallelRobot
-from calib.rooms.parallel.results import ParallelResult, ResultFolder, finite
 from calib.rooms.parallel.robots import ParallelMechanism
 
+if TYPE_CHECKING:
+    from calib.procedure.report.page import Section
+
 READ = ("holdout", "tolerance", "seed")  # of the settings
+FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE)
+HEADER = ("name", "unit", "value", "sigma")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +78,7 @@ class _Rows:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ParallelFit(ParallelResult):
+class ParallelFit(Judged):
     """A geometric calibration and its files.
 
     Attributes:
@@ -71,7 +89,6 @@ class ParallelFit(ParallelResult):
         own: errors on the fitted rows, nominal and calibrated (2, m, k): platform coordinates; or what encoders
             contradict each other by.
         unseen: the same of unseen rows, by name.
-        verdict: pass, marginal or fail, with its reason.
         settings: what was asked for.
     """
 
@@ -81,9 +98,7 @@ class ParallelFit(ParallelResult):
     found: LoopFit
     own: np.ndarray
     unseen: Mapping[str, np.ndarray]
-    verdict: Verdict
     settings: FitSettings
-    folder: ClassVar = ResultFolder((ESTIMATE, COVARIANCE), (ROBOT,), "fit")
 
     @property
     def robot(self) -> ParallelMechanism:
@@ -96,22 +111,33 @@ class ParallelFit(ParallelResult):
         return self.found.estimate
 
     @property
-    def origin(self) -> tuple[str, dict[str, Any]]:
-        """Where the calibrated robot is from, and which files it was fitted to."""
-        return f"calibrated from {self.nominal.source}", {"files": [str(each) for each in self.files]}
-
-    def write(self, folder: Path, plots: bool) -> None:
-        """Write the estimate."""
-        found = self.estimate
-        rows = zip(found.names, found.units, found.values.tolist(), map(finite, found.sigma))
-        write_estimate(folder, ("name", "unit", "value", "sigma"), list(map(list, rows)))
-        write_covariance(folder / COVARIANCE, found.names, found.covariance)
+    def verdict(self) -> Verdict:
+        """Pass, marginal or fail, with the reason: by the rules of the module, whose limits are the catalogue's."""
+        kinds = {"contradictions": (np.ones(self.own.shape[2], dtype=bool), "mrad (or mm)")}
+        figures, rules = [], [finding("readings-alone")]
+        if self.rows.coordinates is not None:
+            places = _positions(self.nominal.chain)
+            kinds, rules = {"position": (places, "mm"), "orientation": (~places, "mrad")}, []
+        for (where, errors), (kind, (columns, unit)) in product(self.unseen.items(), kinds.items()):
+            if not columns.any():
+                continue
+            before, after = (_rms(one[:, columns]) for one in errors)
+            figures.append(f"{kind} {1e3 * after:.3g} {unit} rms on {where} rows (nominal {1e3 * before:.3g})")
+            if (tolerance := self.settings.tolerance) is not None and kind == "position":
+                rules.append(finding("above-tolerance", tolerance=tolerance, times=after / tolerance))
+                figures[-1] += f", tolerance {1e3 * tolerance:g} mm"
+            left, times = after / max(before, 1e-300), after / max(_rms(self.own[1][:, columns]), 1e-300)
+            rules += [
+                finding("worse-than-nominal", times=left), finding("no-transfer", times=times, remedy=""),
+                finding("small-gain", left=left),
+            ]  # fmt: skip
+        return Verdict.of("; ".join(figures), rules if figures else [finding("no-unseen-poses")])
 
     @property
     def columns(self) -> tuple[str, ...]:
         """What the errors are of."""
         if self.rows.coordinates is not None:
-            return self.nominal.known.robot.freedom
+            return self.nominal.chain.freedom
         return tuple(f"contradiction {k + 1}" for k in range(self.own.shape[2]))
 
     @property
@@ -119,29 +145,32 @@ class ParallelFit(ParallelResult):
         """Errors of unseen rows, by name; of the fitted ones where there are none."""
         return self.unseen or {"fitted": self.own}
 
+    @checked
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that the command writes, all files or none."""
+        found = self.estimate
+
+        def write(folder: Path) -> None:
+            words, read = f"calibrated from {self.nominal.source}", {"files": [str(each) for each in self.files]}
+            parallel_files.write(folder / ROBOT, self.robot.chain, words, read)
+            write_estimate(folder, HEADER, list(self._table()))
+            write_covariance(folder / COVARIANCE, found.names, found.covariance)
+            files.write_json(folder / METRICS, self.to_dict())
+
+        check_fit_target(Path(out), [self.nominal.source])
+        return write_staged(Path(out), FIT, write)
+
+    def _table(self) -> Iterator[tuple[str, str, float, float]]:
+        found = self.estimate
+        return zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
+
     def to_dataframe(self) -> Any:
         """Return the estimate as a pandas DataFrame: name, unit, value, sigma."""
-        found = self.estimate
-        rows = zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
-        return data_frame(rows, ["name", "unit", "value", "sigma"])
-
-    def renderables(self) -> Iterator[Any]:
-        """Yield what ``print`` shows, for a rich console."""
-        from calib.procedure.report.console import section
-        from calib.procedure.report.page import Section
-
-        yield from self.lines()
-        yield from section(Section("", (), self.verdict.level, self.verdict.reason))
-
-    def __repr__(self) -> str:
-        return f"<ParallelFit of {self.robot.known.robot.name}: {self.verdict.level}>"
-
-    def __str__(self) -> str:
-        return as_text(self.renderables())
+        return data_frame(self._table(), list(HEADER))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""
-        robot, found = self.nominal.known.robot, self.found
+        found, verdict = self.found, self.verdict
         both = np.concatenate(list(self.judged.values()), axis=1)
         errors = {
             key: dict(zip(self.columns, row.tolist()))
@@ -149,42 +178,44 @@ class ParallelFit(ParallelResult):
         }
         platform = self.rows.coordinates is not None
         return {
-            "robot": robot.name, "parameters": len(found.parameters), "not_told": list(found.vague),
+            "robot": self.nominal.chain.name, "parameters": len(found.parameters), "not_told": list(found.vague),
             "reading_rms": {"nominal": found.before, "calibrated": found.after},
             "platform_rms": errors if platform else None, "contradiction_rms": None if platform else errors,
             "judged_on": ", ".join(self.judged), "iterations": found.iterations,
-            "verdict": {"level": self.verdict.level, "reason": self.verdict.reason},
+            "verdict": {"level": verdict.level, "reason": verdict.reason},
         }  # fmt: skip
 
-    def lines(self) -> list[str]:
-        """Return what the command prints."""
-        robot, found = self.nominal.known.robot, self.found
-        told = len(found.parameters) - len(found.vague)
+    def section(self) -> Section:
+        """Return errors on unseen rows and the verdict as a section of a report."""
+        from calib.procedure.report.page import Section, Text
+
+        found, verdict = self.found, self.verdict
+        identified = len(found.parameters) - len(found.vague)
         lines = [
-            f"{robot.name}: {len(found.parameters)} constants of the loops, {told} identified; encoders off by "
-            f"{found.before:.3g}, calibrated by {found.after:.3g} (rms, rad or m)"
+            f"{self.nominal.chain.name}: {identified} of {len(found.parameters)} constants of the loops identified; "
+            f"encoders off by {found.before:.3g}, calibrated by {found.after:.3g} (rms, rad or m)"
         ]
         for where, errors in self.judged.items():
             for name, (before, after) in zip(self.columns, 1e3 * np.sqrt(np.mean(errors**2, axis=1)).T):
-                what = f"platform {name}" if name in robot.freedom else name
                 unit = "mm" if name in COORDINATES[:3] else "mrad" if name in COORDINATES else "mrad (or mm)"
-                lines.append(f"  {what} on {where} rows: {before:.3g} -> {after:.3g} {unit} rms")
-        if self.rows.coordinates is None:
-            lines.append(
-                "from readings alone: scale and place of the whole robot are the nominal ones; what encoders "
-                "contradict each other by is mended"
-            )
-        return lines
+                lines.append(f"  {name} on {where} rows: {before:.3g} -> {after:.3g} {unit} rms")
+        return Section("", (Text("", lines),), verdict.level, verdict.reason)
+
+    def __repr__(self) -> str:
+        return f"<ParallelFit of {self.nominal.chain.name}: {self.verdict.level}>"
 
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
         """Return a fit judged anew on more unseen files beside those of before; nothing is fitted again."""
-        known, validate = self.nominal.known, _paths(unseen)
-        more = {f"{path.name}, unseen": read_rows(path, known.robot) for path in validate}
-        _check_alike(self.rows, more)
+        validate = _paths(unseen)
         proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
-        proofs |= {name: _errors(known, self.found.known, own) for name, own in more.items()}
-        verdict = _judge(known.robot, self.rows, self.own, proofs, self.settings.tolerance)
-        return replace(self, unseen=proofs, verdict=verdict, files=(*self.files, *validate))
+        for name, rows in _read_unseen(self.nominal.chain, self.rows, validate).items():
+            proofs[name] = _errors(self.nominal.known, self.found.known, rows)
+        return replace(self, unseen=proofs, files=(*self.files, *validate))
+
+
+def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that is not for a fit, or that holds one of its inputs."""
+    check_target(out, FIT, (METRICS, ROBOT), "fit", inputs)
 
 
 def fit_parallel(
@@ -214,8 +245,7 @@ def fit_parallel(
     measured, validate = _paths(measured), _paths(validate)
     held = _held(known, settings, options or FitOptions())
     rows = _stacked([read_rows(path, known.robot) for path in measured], measured)
-    unseen = {f"{path.name}, unseen": read_rows(path, known.robot) for path in validate}
-    _check_alike(rows, unseen)
+    unseen = _read_unseen(known.robot, rows, validate)
     if settings.tolerance is not None and (rows.coordinates is None or not _positions(known.robot).any()):
         raise UsageError("a tolerance is of the platform's position, and none was measured")
     if settings.holdout:
@@ -232,8 +262,7 @@ def fit_parallel(
         raise MeasurementError(f"{error}", measured[0]) from error
     if not proofs:
         proofs = _cross_validated(known, rows, held, settings.seed)
-    verdict = _judge(known.robot, rows, own, proofs, settings.tolerance)
-    return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, verdict, settings)
+    return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, settings)
 
 
 def _paths(measured: Sequence[object]) -> tuple[Path, ...]:
@@ -302,10 +331,13 @@ def _stacked(parts: Sequence[_Rows], paths: Sequence[Path]) -> _Rows:
     return _Rows(readings, np.concatenate(coordinates) if coordinates else None)
 
 
-def _check_alike(rows: _Rows, unseen: Mapping[str, _Rows]) -> None:
+def _read_unseen(robot: ParallelRobot, rows: _Rows, paths: Sequence[Path]) -> dict[str, _Rows]:
+    """Return the rows of unseen files by name, of the same columns as those that are fitted."""
+    unseen = {f"{path.name}, unseen": read_rows(path, robot) for path in paths}
     for name, own in unseen.items():
         if (own.coordinates is None) != (rows.coordinates is None):
             refuse_option(name, "platform coordinates are in it or in the fitted files, not in both")
+    return unseen
 
 
 def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: _Rows) -> np.ndarray:
@@ -332,43 +364,6 @@ def _cross_validated(known: ClosedRobot, rows: _Rows, held: Sequence[str], seed:
 
 def _positions(robot: ParallelRobot) -> np.ndarray:
     return robot.selected < 3
-
-
-def _judge(
-    robot: ParallelRobot, rows: _Rows, own: np.ndarray, proofs: Mapping[str, np.ndarray], tolerance: float | None
-) -> Verdict:
-    """Return the verdict by the rules of the module."""
-    kinds = {"": (np.ones(own.shape[2], dtype=bool), 1e3, "mrad (or mm)")}
-    if rows.coordinates is not None:
-        turns = ~_positions(robot)
-        kinds = {"position ": (~turns, 1e3, "mm"), "orientation ": (turns, 1e3, "mrad")}
-    told, small, far = [], [], []
-    for where, errors in proofs.items():
-        for kind, (columns, factor, unit) in kinds.items():
-            if not columns.any():
-                continue
-            before, after = (_rms(one[:, columns]) for one in errors)
-            both = f"{kind}rms on {where} rows: {factor * before:.3g} {unit} nominal, {factor * after:.3g} calibrated"
-            if tolerance is not None and kind == "position " and after > tolerance:
-                return Verdict("fail", f"{both}, above the tolerance of {1e3 * tolerance:g} mm")
-            if after > limit("worse-than-nominal", "times") * before:
-                return Verdict("fail", f"the calibrated robot is worse than the nominal one: {both}")
-            told.append(both)
-            small += [both] if after > limit("small-gain", "left", "marginal") * before else []
-            fitted = _rms(own[1][:, columns])
-            far += (
-                [f"{both}, {after / fitted:.1f} times the fit's own"]
-                if after > limit("no-transfer", "times", "marginal") * fitted
-                else []
-            )
-    if not told:
-        return Verdict("marginal", "there are no unseen rows, and too few to leave some out: measure more poses")
-    if rows.coordinates is None:
-        return Verdict("marginal", f"{told[0]}; readings alone give neither scale nor place: measure platform poses")
-    if far or small:
-        return Verdict("marginal", far[0] if far else f"the gain is small: {small[0]}; it may be calibrated already")
-    kept = "" if tolerance is None else f", within the tolerance of {1e3 * tolerance:g} mm"
-    return Verdict("pass", f"{'; '.join(told)}{kept}")
 
 
 def _rms(errors: np.ndarray) -> float:

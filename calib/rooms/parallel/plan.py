@@ -9,31 +9,30 @@ coordinates (a straight line between each two, where asked for); its timing is t
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, cast
 
 import numpy as np
 
+from calib.api.motions import MotionPlan
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
-from calib.procedure.excitation import coefficients
-from calib.procedure.excitation.coefficients import PLANNED
-from calib.procedure.excitation.motion_bounds import MotionBounds
+from calib.procedure.excitation.planning import Planned
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.robot_kinds import refuse_unread
-from calib.rooms.parallel.excite import actuator_bounds, read_model
+from calib.rooms.parallel.excite import actuator_bounds, read_model, write_motion
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, coordinates_of
-from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model
+from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 from calib.rooms.parallel.mechanism.velocities import distributed
-from calib.rooms.parallel.results import ParallelResult, ResultFolder, write_motion
 from calib.rooms.parallel.robots import ParallelMechanism
-from trajectories.setpoints import Setpoints, joined
+from trajectories.setpoints import joined
 from trajectories.timing.limits import TimingLimits
 from trajectories.timing.path import Path as JointPath
 from trajectories.timing.path import check_within, spline, through
 from trajectories.timing.profile import track
-from trajectories.timing.time_scaling import Timing, time_optimal
+from trajectories.timing.time_scaling import time_optimal
 
+FRICTIONLESS = "friction not known (no model): planned without, a real robot needs more torque"
 READ = ("payloads", "lines", "rate")  # of the settings
 
 
@@ -78,63 +77,35 @@ class _PlatformDynamics:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ParallelPlan(ParallelResult):
-    """A planned motion of a parallel robot.
+class ParallelPlan(MotionPlan):
+    """A planned motion of a parallel robot; `planned` holds that of its actuators.
 
     Attributes:
         robot: with its file.
-        bounds: what limits its actuators, and where that is stated.
-        timings: one for all waypoints, or one per straight line.
-        track: of the actuators at the controller's rate, with torques where a model is known.
         coordinates: (N, r) of the platform along it [m, rad].
-        notes: what a user should know.
     """
 
     robot: ParallelMechanism
-    bounds: MotionBounds
-    timings: tuple[Timing, ...]
-    track: Setpoints
     coordinates: np.ndarray
-    notes: tuple[str, ...]
-    folder: ClassVar = ResultFolder((PLANNED, coefficients.NAME), (PLANNED,), "motion")
 
-    @property
-    def duration(self) -> float:
-        """How long the motion takes [s]."""
-        return self.track.duration
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that the command writes."""
+        from calib.procedure.report import motion_figures
 
-    def write(self, folder: Path, plots: bool) -> None:
-        """Write the motion at the controller's rate."""
-        write_motion(self.robot, self.bounds, self.track, self.coordinates, folder)
+        def more(place: Path) -> None:
+            if plots:
+                motion_figures.write_plan(self.planned, place)
+
+        own = self.planned
+        return write_motion(self.robot, Path(out), own.track, self.coordinates, own.bounds, self.to_dict(), more)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        tau, margins = self.track.tau, [one.margins for one in self.timings]
-        return {
-            "robot": self.robot.known.robot.name,
-            "duration": self.duration,
-            "paths": [one.duration for one in self.timings],
-            "margins": {kind: np.min([own[kind] for own in margins], axis=0).tolist() for kind in margins[0]},
-            "peak_torque": None if tau is None else np.abs(tau).max(axis=0).tolist(),
-            "peak_speed": np.abs(self.track.v).max(axis=0).tolist(),
-            "limits": self.bounds.lines(),
-            "notes": list(self.notes),
+        track: Any = self.planned.track
+        peaks = {
+            f"peak_{key}": np.abs(x).max(axis=0).tolist() for key, x in (("torque", track.tau), ("speed", track.v))
         }
-
-    def lines(self) -> list[str]:
-        """Return what the command prints."""
-        robot = self.robot.known.robot
-        lines = [f"{robot.name}: {self.duration:.4g} s through the waypoints, {len(self.track)} samples"]
-        for kind, unit in (("velocity", "of the speed limits"), ("torque", "of the torque limits")):
-            used = [one.margins[kind] for one in self.timings if kind in one.margins]
-            if used:
-                share = 1.0 - np.min(used, axis=0)
-                named = ", ".join(f"{name} {100 * x:.0f} %" for name, x in zip(robot.joint_names, share))
-                lines.append(f"most {unit} in use: {named}")
-        return [*lines, *self.bounds.lines(), *self.notes]
-
-    def __repr__(self) -> str:
-        return f"<ParallelPlan for {self.robot.known.robot.name}: {self.duration:g} s>"
+        return super().to_dict() | {"robot": self.robot.chain.name} | peaks
 
 
 def plan_parallel(
@@ -161,8 +132,8 @@ def plan_parallel(
     refuse_unread(settings, DEFAULT_PLAN, READ)
     if limits is not None or drives is not None:
         raise UsageError("limits and drives are in a parallel robot's own file (velocity, effort) and in its model")
-    law, notes = _law(robot, model, settings)
-    bounds = actuator_bounds(known, law is not None)
+    law = _law(robot, model, settings.payloads)
+    bounds = actuator_bounds(known)
     kept = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)
     points = _read_waypoints(waypoints, known)
     say("the path")
@@ -172,9 +143,12 @@ def plan_parallel(
     own = [_of_actuators(known, path) for path in paths]
     say("timing")
     timings = tuple(time_optimal(path, kept, law, rate=settings.rate) for path in own)
-    torque = None if law is None else law.torque
-    motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
-    return ParallelPlan(robot, bounds, timings, motion, coordinates_of(known, known.locate(motion.q)), notes)
+    motion = joined([track(one.path, one.profile, settings.rate, law.torque) for one in timings])
+    planned = Planned(
+        chain=cast(Any, known.robot), bounds=bounds, limits=kept, lower=robot.joints.lower, upper=robot.joints.upper,
+        timings=timings, track=motion, notes=() if model else (FRICTIONLESS,),
+    )  # fmt: skip
+    return ParallelPlan(planned, robot, coordinates_of(known, known.locate(motion.q)))
 
 
 def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
@@ -195,28 +169,18 @@ def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
         raise MeasurementError(f"waypoint out of reach: {error}", path) from error
 
 
-def _law(
-    robot: ParallelMechanism, folder: Path | None, settings: PlanSettings
-) -> tuple[_PlatformDynamics | None, tuple[str, ...]]:
-    """Return the dynamics: identified, or the file's inertias; None without any."""
-    if folder is None:
-        if settings.payloads:
-            raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
-        model = make_parallel_model(robot.known, ("",))
-        values = model.known_parameters()
-        if values is None:
-            return None, ()
-        return _PlatformDynamics(model, values), (
-            "friction not known (no model): planned without, a real robot needs more torque",
-        )
+def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...]) -> _PlatformDynamics:
+    """Return the dynamics, identified or of the file's inertias, with the payloads on board."""
+    if folder is None and payloads:
+        raise UsageError(f"payloads {', '.join(payloads)}: they are identified ones: name the model")
     model, values = read_model(robot, folder)
-    if unknown := sorted(set(settings.payloads) - set(model.payloads)):
+    if unknown := sorted(set(payloads) - set(model.payloads)):
         refuse_option(
             folder, f"no payload '{unknown[0]}' was identified; it knows {', '.join(model.payloads) or 'none'}"
         )
     smoothing = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
     terms = tuple(replace(one, settings=(smoothing,)) if one.shape == "sign" else one for one in model.terms)
-    return _PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()
+    return _PlatformDynamics(replace(model, terms=terms), values, payloads)
 
 
 def _paths(known: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0.1) -> list[JointPath]:

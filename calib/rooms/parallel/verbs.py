@@ -1,17 +1,24 @@
-"""The verbs of parallel robots, as `calib.procedure.robot_kinds.stage_of` finds them."""
+"""The verbs of parallel robots, as `calib.procedure.robot_kinds.stage_of` finds them, and what they leave in a folder.
+
+``robot.toml`` comes first: each folder is a robot to the next command. identify: ``dynamics.json`` (values of all
+parameters, base expressions); the others are those of a serial arm (``calib formats identified``). fit:
+``estimate.csv`` (changes of the loops' constants), ``covariance.csv``, ``metrics.json``. excite: ``motion.csv`` (time,
+platform coordinates, and position, speed, torque of each actuator), ``trajectory.toml`` (the actuators' positions as
+Fourier series, for `calib recall`), ``metrics.json`` and figures. plan: the same without series.
+"""
 
 from calib.procedure.dynamic_stage.folder import check_identification_target
 from calib.procedure.robot_kinds import Stage
-from calib.rooms.parallel.excite import ParallelExcitation, excite_parallel
+from calib.rooms.parallel.excite import check_motion_target, excite_parallel
 from calib.rooms.parallel.identification import assess, identify_parallel
-from calib.rooms.parallel.loop_fit import ParallelFit, fit_parallel
-from calib.rooms.parallel.plan import ParallelPlan, plan_parallel
+from calib.rooms.parallel.loop_fit import check_fit_target, fit_parallel
+from calib.rooms.parallel.plan import plan_parallel
 
 STAGES = {
     "parallel robot": {
-        "fit": Stage(fit_parallel, ParallelFit.folder.check),
+        "fit": Stage(fit_parallel, check_fit_target),
         "identify": Stage(identify_parallel, check_identification_target, assess),
-        "excite": Stage(excite_parallel, ParallelExcitation.folder.check),
-        "plan": Stage(plan_parallel, ParallelPlan.folder.check),
+        "excite": Stage(excite_parallel, check_motion_target),
+        "plan": Stage(plan_parallel, check_motion_target),
     }
 }

@@ -63,37 +63,28 @@ class PlatformRegressor:
     preload: float = 0.0
     carried: Collection[str] | None = None
 
+    def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+        """Return the robot's motion along x, v, a (N, r), brought back to the robot's box where a search left it."""
+        return along(self.model.known, self._reachable(x), v, a)
+
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the columns that count."""
-        return self._columns(along(self.model.known, self._reachable(x), v, a))
+        return self._columns(self.motion(x, v, a))
 
     def regressor_gradient(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the slopes of Σ weights · W (N, r, b) by x, v, a, each (N, r)."""
-        return self._slopes(x, v, a, lambda motion: np.einsum("nrb,nrb->n", self._columns(motion), weights))
+        return self.slopes(x, v, a, self._columns, weights)
 
-    def torques(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the actuators' torques (N, n) by the model."""
-        return self._torques(along(self.model.known, self._reachable(x), v, a))
+    def torques(self, motion: LoopMotion) -> np.ndarray:
+        """Return the actuators' torques (N, n) of a motion, by the model's `values`."""
+        assert self.values is not None
+        forces = self.model.platform_force(self.values, motion, self.carried)
+        return distributed(self.model.known, motion.jacobians, forces, self.preload)
 
-    def torques_gradient(
-        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · torques (N, n) by x, v, a, each (N, r)."""
-        return self._slopes(x, v, a, lambda motion: np.einsum("na,na->n", self._torques(motion), weights))
-
-    def speeds(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the actuators' speeds (N, n)."""
-        return self._speeds(along(self.model.known, self._reachable(x), v, a))
-
-    def speeds_gradient(
-        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · speeds (N, n) by x, v, a, each (N, r)."""
-        return self._slopes(x, v, a, lambda motion: np.einsum("na,na->n", self._speeds(motion), weights))
-
-    def _speeds(self, motion: LoopMotion) -> np.ndarray:
+    def speeds(self, motion: LoopMotion) -> np.ndarray:
+        """Return the actuators' speeds (N, n) of a motion."""
         return motion.v[:, self.model.known.robot.actuated]
 
     def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
@@ -108,16 +99,14 @@ class PlatformRegressor:
     def _columns(self, motion: LoopMotion) -> np.ndarray:
         return self.model.platform_regressor(motion, self.carried).transpose(2, 1, 0)[self.columns].transpose(2, 1, 0)
 
-    def _torques(self, motion: LoopMotion) -> np.ndarray:
-        if self.values is None:
-            raise ValueError("no parameters to predict torques with")
-        forces = self.model.platform_force(self.values, motion, self.carried)
-        return distributed(self.model.known, motion.jacobians, forces, self.preload)
-
-    def _slopes(
-        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray]
+    def slopes(
+        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray], weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of a value per sample; central differences, exact but for rounding by v and a."""
+        """Return the slopes of Σ weights · of(motion) by x, v, a; central differences, exact but for rounding by v, a.
+
+        Args:
+            of: the motion of N samples -> values (N, ...); weights: of the same shape.
+        """
         known, (count, r) = self.model.known, x.shape
         within = self._reachable(x)
         near, inside = known.place(within), within == x
@@ -132,5 +121,5 @@ class PlatformRegressor:
                     posture = known.place(moved[0], near) if order == 0 else near
                     twist = _twist_of(known, *moved)
                     ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
-                result[order, :, j] = (ends[0] - ends[1]) / (2.0 * step)
+                result[order, :, j] = ((ends[0] - ends[1]) * weights).reshape(count, -1).sum(axis=1) / (2.0 * step)
         return result[0] * inside, result[1], result[2]
