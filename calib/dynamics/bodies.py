@@ -91,7 +91,6 @@ def bodies_of(chain: Chain) -> Bodies:
     Body j is numbered like its joint, from 1; a follower of joint 2 is ``2b``, the next one ``2c``.
     """
     first = set(chain.moving.tolist())
-    order = [k for k, element in enumerate(chain.elements) if element.joint is not None]
     pending, placements = np.eye(4), []
     labels: list[str] = []
     for k, element in enumerate(chain.elements):
@@ -103,10 +102,10 @@ def bodies_of(chain: Chain) -> Bodies:
             number = str(element.joint + 1)
             taken = sum(label.rstrip("bcdefgh") == number for label in labels)
             labels.append(number if k in first else number + "abcdefgh"[taken])
-    moved = [chain.elements[k] for k in order]
+    moved = [chain.elements[k] for k in chain.driven]
     return _assemble(
         labels,
-        range(-1, len(order) - 1),
+        range(-1, len(moved) - 1),
         [REVOLUTE if element.axis[0] == "r" else PRISMATIC for element in moved],
         [AXES.index(element.axis) % 3 for element in moved],
         [element.sign * element.ratio for element in moved],

@@ -28,7 +28,7 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
     """
     if chain.inertias is None:
         raise RobotError(f"robot '{chain.name}': gravity torques need the masses of its bodies")
-    if sum(element.joint is not None for element in chain.elements) != chain.n:
+    if len(chain.driven) != chain.n:
         raise RobotError(f"robot '{chain.name}': gravity torques of mimic joints are not implemented")
     frames = joint_frames(chain, q)
     mass, first = chain.inertias[:, 9], chain.inertias[:, 6:9]

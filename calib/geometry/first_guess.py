@@ -27,8 +27,8 @@ from calib.extensions import needed
 from calib.geometry.images.hand_eye import average_pose, chordal_turns, place_pose
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion, invert, pose
 from calib.units import DEG

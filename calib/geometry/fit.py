@@ -18,8 +18,8 @@ from calib.geometry.observation import Block, observe, prepare, stack
 from calib.geometry.parameters import layout, parameter_values, step
 from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings, Weigher
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
-from calib.robot.deflection import Deflection
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
 CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)

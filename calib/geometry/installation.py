@@ -8,8 +8,8 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.geometry.images.optics import Optics, View
+from calib.robot.calibrated import Deflection, extra_displacements
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection, extra_displacements
 from calib.robot.kinematics import Sweep, sweep
 
 FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")

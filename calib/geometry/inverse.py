@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.installation import Installation, Seen, see
-from calib.robot.deflection import evaluate
+from calib.robot.calibrated import evaluate
 from calib.robot.kinematics import joint_jacobian
 
 DONE = 1e-10  # error [m] below which a target is met

@@ -12,7 +12,7 @@ from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout_counts
 from calib.geometry.pixel_residuals import view_of
 from calib.geometry.residuals import Part, parts
-from calib.robot import deflection
+from calib.robot import calibrated
 from calib.robot.kinematics import element_jacobian
 
 
@@ -50,9 +50,9 @@ def prepare(
         torque = torques[number] if torques is not None else None
         station = _index(cell.station_names, block.station, "station") if block.has_instrument else -1
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
-        bases = deflection.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
-        known = deflection.evaluate(cell.known, block.q, torque) if cell.known.terms else None
-        given = deflection.extra_displacements(cell.chain, cell.known, block.q, known)
+        bases = calibrated.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
+        known = calibrated.evaluate(cell.known, block.q, torque) if cell.known.terms else None
+        given = calibrated.extra_displacements(cell.chain, cell.known, block.q, known)
         blocks.append(Block(block, station, tools[block.tool], torque, bases, given))
     return blocks
 
@@ -100,7 +100,7 @@ def target_jacobian(
     if len(in_terms):
         assert bases is not None
         numbers = free[in_terms] - arm - stations - tools - optics
-        targets = deflection.target_elements(cell.chain, cell.deflection)[numbers]
+        targets = calibrated.target_elements(cell.chain, cell.deflection)[numbers]
         unique, inverse = np.unique(targets, return_inverse=True)
         moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)
         jacobian[in_terms] = moved[inverse] * bases[numbers][:, None, :]

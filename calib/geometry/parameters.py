@@ -11,7 +11,7 @@ import numpy as np
 from calib.data.poses.fit_options import FitOptions
 from calib.errors import UsageError, require
 from calib.geometry.installation import FRAME_AXES, Installation
-from calib.robot import deflection
+from calib.robot import calibrated
 from calib.transforms import displace
 
 
@@ -94,7 +94,7 @@ def layout(cell: Installation) -> ParameterLayout:
     )  # fmt: skip
 
 
-def _unit(units: dict[str, str], term: deflection.Term) -> str:
+def _unit(units: dict[str, str], term: calibrated.Term) -> str:
     return units[term.element] + {"torque": "/(N m)", "joint": "/rad"}.get(term.basis, "")
 
 

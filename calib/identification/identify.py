@@ -6,7 +6,7 @@ from typing import Generic, TypeGuard, cast
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator, design_decimator
+from calib.data.signals.filtering import Decimator, design_decimator
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.bodies import standard_parameters

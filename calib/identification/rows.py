@@ -9,8 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator, decimate, decimate_blocks, kept
-from calib.data.signals.filtering import slope
+from calib.data.signals.filtering import Decimator, decimate, decimate_blocks, kept, slope
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.arrays import shaped
 from calib.robot.chain import AXES, Chain, random_joints
-from calib.robot.kinematics import Sweep, sweep
+from calib.robot.kinematics import sweep
 from calib.robot.obstacles import (
     SAMPLES,
     Obstacle,
@@ -102,7 +102,7 @@ class Capsules:
         count = len(self.own)
         slope = self._closing(lines, normal, two, self._second)
         slope[:, :count] -= self._closing(lines, normal[:, :count], one[:, :count], self.bodies[self.own[:, 0]])
-        return slope @ self._rates
+        return slope
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
@@ -163,14 +163,11 @@ class Capsules:
         seen = first + along[..., None] * (last - first)
         link = lines.start[:, others] + place[..., None] * (lines.end - lines.start)[:, others]
         distance, normal = _apart(seen, link)
-        gradient = self._closing(lines, normal, link, self.bodies[others]) @ self._rates
-        gradient = gradient - (1.0 - along)[..., None] * (normal @ slope)
+        gradient = self._closing(lines, normal, link, self.bodies[others]) - (1.0 - along)[..., None] * (normal @ slope)
         return distance - self.radii[others], gradient
 
     def _lines(self, q: np.ndarray) -> _Lines:
-        q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
-        walked = sweep(self.chain, q)
-        return _lines_of(self.chain, walked, q, self.targets)
+        return _lines_of(self.chain, q, self.targets)
 
     def _measured(self, lines: _Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
@@ -209,25 +206,24 @@ class Capsules:
     def _second(self) -> np.ndarray:
         return np.concatenate([self.bodies[self.own[:, 1]], self.bodies[self.world[:, 0]]])
 
-    @cached_property
-    def _moving(self) -> tuple[np.ndarray, np.ndarray]:
-        """Whether each moving element turns, and the joint with its ratio as a matrix (K, n)."""
-        moving = [element for element in self.chain.elements if element.joint is not None]
-        rates = np.zeros((len(moving), self.chain.n))
-        for k, element in enumerate(moving):
-            rates[k, element.joint] = element.ratio
-        return np.array([element.axis[0] == "r" for element in moving]), rates
-
-    @property
-    def _rates(self) -> np.ndarray:
-        return self._moving[1]
-
     def _closing(self, lines: _Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-        """Return normal · velocity (m, P, K) of points (m, P, 3) on bodies (P,), per unit of each moving element."""
-        z, o = lines.axes.transpose(0, 2, 1), np.cross(lines.axes, lines.places).transpose(0, 2, 1)
-        turned = np.cross(point, normal) @ z - normal @ o  # u · (z × (p - o))
-        speed = np.where(self._moving[0], turned, normal @ z)
-        return speed * (np.arange(z.shape[2]) < bodies[:, None])
+        return closing(self.chain, lines.axes, lines.places, normal, point, bodies)
+
+
+def closing(
+    chain: Chain, axes: np.ndarray, places: np.ndarray, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray
+) -> np.ndarray:
+    """Return normal · velocity (m, P, n) of points (m, P, 3) on bodies (P,), per unit of each joint.
+
+    Args:
+        axes, places: (m, K, 3) of the K moving elements: direction, and where they stand.
+        bodies: how many moving elements stand before each point.
+    """
+    z, o = axes.transpose(0, 2, 1), np.cross(axes, places).transpose(0, 2, 1)
+    turned = np.cross(point, normal) @ z - normal @ o  # u · (z × (p - o))
+    turns = np.array([chain.elements[k].axis[0] == "r" for k in chain.driven])
+    speed = np.where(turns, turned, normal @ z)
+    return speed * (np.arange(z.shape[2]) < bodies[:, None]) @ chain.rates
 
 
 def from_chain(
@@ -260,10 +256,9 @@ def from_chain(
     size = usual_radius(chain) if radius is None else radius
     places = np.asarray(targets, dtype=float).reshape(-1, 3)
     places = places[np.linalg.norm(places, axis=1) > 1e-6]
-    walked = sweep(chain, np.zeros((1, chain.n)))
-    lines = _lines_of(chain, walked, np.zeros((1, chain.n)), places)
+    lines = _lines_of(chain, np.zeros((1, chain.n)), places)
     length = np.linalg.norm(lines.end - lines.start, axis=2)[0]
-    moving = [element for element in chain.elements if element.joint is not None]
+    moving = [chain.elements[k] for k in chain.driven]
     first = {element.joint: k for k, element in reversed(list(enumerate(moving)))}
     named = {
         k: chain.links[j] if chain.links else f"{chain.joint_names[j]}_link" for j, k in first.items() if j is not None
@@ -290,13 +285,12 @@ def from_chain(
     return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
 
 
-def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -> _Lines:
+def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray) -> _Lines:
     """Return the lines of base (from what it stands on), moving bodies and targets."""
-    moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
-    axes, places = (part[moving].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
+    walked = sweep(chain, q)
+    axes, places = (part[chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
     begins = places.copy()
-    for k, index in enumerate(moving):
-        element = chain.elements[index]
+    for k, element in enumerate(chain.elements[index] for index in chain.driven):
         if element.axis[0] == "t":
             begins[:, k] += axes[:, k] * (element.value + element.ratio * q[:, element.joint])[:, None]
     m, tip = len(q), walked.position.T[:, None]

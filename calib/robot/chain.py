@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -176,14 +177,24 @@ class Chain:
     def upper(self) -> np.ndarray:
         return np.array([joint.upper for joint in self.joints])
 
-    @property
+    @cached_property
+    def driven(self) -> np.ndarray:
+        """Index of each element that a joint moves, followers of mimic joints included."""
+        return np.array([k for k, element in enumerate(self.elements) if element.joint is not None], dtype=int)
+
+    @cached_property
     def moving(self) -> np.ndarray:
         """(n,) index of the element that each joint moves first (a mimic joint's follower comes later)."""
-        index = np.full(self.n, -1)
-        for k in reversed(range(len(self.elements))):
-            if (joint := self.elements[k].joint) is not None:
-                index[joint] = k
-        return index
+        first = {self.elements[k].joint: k for k in reversed(self.driven.tolist())}
+        return np.array([first[joint] for joint in range(self.n)], dtype=int)
+
+    @cached_property
+    def rates(self) -> np.ndarray:
+        """How far each of the elements `driven` goes per unit of each joint (driven, n)."""
+        rates = np.zeros((len(self.driven), self.n))
+        for row, k in zip(rates, self.driven):
+            row[self.elements[k].joint] = self.elements[k].ratio
+        return rates
 
     def with_values(self, values: np.ndarray | Mapping[str, float]) -> Chain:
         """Return the same chain with other element values: all K of them, or some by name."""

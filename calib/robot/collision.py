@@ -8,35 +8,28 @@ posture parts (`calib.robot.obstacles.inseparable`); the last are listed in `Col
 that a link never leaves is refused (`calib.robot.obstacles.check_reachable`).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import shaped
+from calib.arrays import frozen, shaped
 from calib.errors import refuse_robot
-from calib.robot.capsules import TARGET_RADIUS
+from calib.robot.capsules import TARGET_RADIUS, closing
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.markup import Node, parse, text
-from calib.robot.formats.urdf_tree import origin
+from calib.robot.formats.readback import configurations, driven_joints
+from calib.robot.formats.urdf_tree import numbers, origin
+from calib.robot.kinematics import sweep
 from calib.robot.obstacles import SAMPLES, Obstacle, Wall, check_reachable, inseparable
 from calib.transforms import pose
 
-
-@dataclass(frozen=True)
-class _Column:
-    """Where value + ratio · q of a joint goes in Pinocchio's configuration, and its rate in the velocity."""
-
-    place: int
-    joint: int
-    ratio: float
-    offset: float
-    circular: bool
-    speed: int
+DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +48,12 @@ class Collision:
     _model: Any
     _geometry: Any
     _chain: Chain
-    _columns: tuple[_Column, ...]
     _links: int
 
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the distances (m, pairs) [m] at joint values q (m, n); negative is the depth of a penetration."""
-        pin, _ = _libraries()
-        q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
-        data, measured = self._model.createData(), self._geometry.createData()
-        result = np.empty((len(q), len(self.pairs)))
-        for row, configuration in zip(result, _configurations(self._model, self._columns, q), strict=True):
-            pin.computeDistances(self._model, data, self._geometry, measured, configuration)
-            row[:] = [found.min_distance for found in measured.distanceResults]
-        return result
+        found = [[one.min_distance for one in measured] for measured in self._measured(q)]
+        return np.array(found).reshape(len(q), len(self.pairs))
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
         """Return the derivatives (m, pairs, n) of `distances` with respect to q (m, n).
@@ -75,34 +61,15 @@ class Collision:
         With the normal u from the first shape's nearest point to the second's: d' = u · (velocity of the second point -
         velocity of the first), the shapes' curvature being of second order. One-sided where nearest points jump.
         """
-        pin, _ = _libraries()
-        q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
-        data, measured = self._model.createData(), self._geometry.createData()
-        shapes, world = self._geometry.geometryObjects, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        ends = np.array([(shapes[pair.first].parentJoint, shapes[pair.second].parentJoint)
-                         for pair in self._geometry.collisionPairs], dtype=int).reshape(-1, 2)  # fmt: skip
-        normals, points = np.empty((len(q), len(ends), 1, 3)), np.empty((len(q), len(ends), 2, 3))
-        stands = np.empty((len(q), self._model.njoints, 3))
-        moved = np.zeros((len(q), self._model.njoints, 6, self._model.nv))
-        for i, configuration in enumerate(_configurations(self._model, self._columns, q)):
-            pin.computeDistances(self._model, data, self._geometry, measured, configuration)
-            pin.computeJointJacobians(self._model, data, configuration)
-            for joint in range(1, self._model.njoints):
-                moved[i, joint] = pin.getJointJacobian(self._model, data, joint, world)
-            stands[i] = [placement.translation for placement in data.oMi]
-            for k, found in enumerate(measured.distanceResults):
-                normals[i, k, 0], points[i, k] = found.normal, (found.getNearestPoint1(), found.getNearestPoint2())
-        wrench = np.concatenate(np.broadcast_arrays(normals, np.cross(points - stands[:, ends], normals)), axis=-1)
-        wrench[:, :, 0] *= -1.0
-        return np.einsum("mkew,mkewv->mkv", wrench, moved[:, ends], optimize=True) @ self._rates
-
-    @property
-    def _rates(self) -> np.ndarray:
-        """(nv, n) Pinocchio's velocities per joint's."""
-        rates = np.zeros((self._model.nv, self._chain.n))
-        for column in self._columns:
-            rates[column.speed, column.joint] += column.ratio
-        return rates
+        found = np.empty((3, len(q), len(self.pairs), 3))
+        for row, measured in enumerate(self._measured(q)):
+            for k, one in enumerate(measured):
+                found[:, row, k] = one.normal, one.getNearestPoint1(), one.getNearestPoint2()
+        turn, foot = self._stand.rotation, self._stand.translation
+        normal, first, second = found[0] @ turn, (found[1] - foot) @ turn, (found[2] - foot) @ turn
+        pairs = self._geometry.collisionPairs
+        slope = self._closing(q, normal, second, [pair.second for pair in pairs])
+        return slope - self._closing(q, normal, first, [pair.first for pair in pairs])
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Measure the links against lines of sight; see `calib.robot.capsules.Capsules.beam`."""
@@ -111,30 +78,49 @@ class Collision:
         tip = self._model.frames[self._model.getFrameId(self._chain.tip)].parentJoint
         shapes = self._geometry.geometryObjects
         links = [k for k in range(self._links) if shapes[k].parentJoint != tip]
-        distances, gradients = np.empty((len(q), len(links))), np.empty((len(q), len(links), self._chain.n))
-        asked, world = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess), pin.LOCAL_WORLD_ALIGNED
-        ends = np.broadcast_to(end, start.shape)
-        for i, configuration in enumerate(_configurations(self._model, self._columns, q)):
-            pin.computeJointJacobians(self._model, data, configuration)
+        distances, shares = np.empty((2, len(q), len(links)))
+        normals, points = np.empty((2, len(q), len(links), 3))
+        asked, ends = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess), np.broadcast_to(end, start.shape)
+        for i, configuration in enumerate(configurations(self._model, self._chain, q)):
             pin.updateGeometryPlacements(self._model, data, self._geometry, placed, configuration)
             away = ends[i] - start[i]
             length = float(np.linalg.norm(away))
             turned = Rotation.align_vectors(away[None] / length, [[0.0, 0.0, 1.0]])[0].as_matrix()
             ray, middle = coal.Capsule(1e-4, length), coal.Transform3s(turned, start[i] + away / 2)
             for column, k in enumerate(links):
-                found = coal.DistanceResult()
-                there = coal.Transform3s(placed.oMg[k].rotation, placed.oMg[k].translation)
+                found, there = coal.DistanceResult(), self._stand.actInv(placed.oMg[k])
+                there = coal.Transform3s(there.rotation, there.translation)
                 distances[i, column] = coal.distance(ray, middle, shapes[k].geometry, there, asked, found)
-                seen, point, normal = found.getNearestPoint1(), found.getNearestPoint2(), found.normal
-                share = float(np.clip((seen - start[i]) @ away / length**2, 0.0, 1.0))
-                joint = shapes[k].parentJoint
-                moved = (
-                    pin.getJointJacobian(self._model, data, joint, world) if joint else np.zeros((6, self._model.nv))
-                )
-                lever = np.cross(point - data.oMi[joint].translation, normal)
-                gradients[i, column] = (normal @ moved[:3] + lever @ moved[3:]) @ self._rates
-                gradients[i, column] -= (1.0 - share) * normal @ slope[i]
-        return distances, gradients
+                normals[i, column], points[i, column] = found.normal, found.getNearestPoint2()
+                shares[i, column] = np.clip((found.getNearestPoint1() - start[i]) @ away / length**2, 0.0, 1.0)
+        return distances, self._closing(q, normals, points, links) - (1.0 - shares)[..., None] * (normals @ slope)
+
+    def _measured(self, q: np.ndarray) -> Iterator[Any]:
+        """Yield what coal finds for all pairs at each of the joint values q (m, n)."""
+        pin, _ = _libraries()
+        data, measured = self._model.createData(), self._geometry.createData()
+        q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
+        for configuration in configurations(self._model, self._chain, q):
+            pin.computeDistances(self._model, data, self._geometry, measured, configuration)
+            yield measured.distanceResults
+
+    def _closing(self, q: np.ndarray, normal: np.ndarray, point: np.ndarray, shapes: list[int]) -> np.ndarray:
+        """Return normal · velocity (m, P, n) of points (m, P, 3) on shapes (P,), all in the base frame."""
+        walked = sweep(self._chain, q)
+        axes, places = (part[self._chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
+        return closing(self._chain, axes, places, normal, point, self._bodies[shapes])
+
+    @cached_property
+    def _stand(self) -> Any:
+        """Where the base is in Pinocchio's world."""
+        return _stand(self._model, self._chain.base)
+
+    @cached_property
+    def _bodies(self) -> np.ndarray:
+        """How many of the chain's moving elements stand before each shape."""
+        driven = {joint.id for joint in driven_joints(self._model, self._chain)}
+        carriers = [self._model.supports[shape.parentJoint] for shape in self._geometry.geometryObjects]
+        return np.array([sum(joint in driven for joint in above) for above in carriers], dtype=int)
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
@@ -189,8 +175,17 @@ def from_urdf(
         lost = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
         refuse_robot(path, f"no usable <collision> shape{lost}; give mesh_folders, or use capsules")
     _add_targets(model, geometry, chain, targets)
+    own = geometry.ngeoms
     planes = [*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls]
-    return _finish(model, geometry, chain, planes, obstacles, missing, margin, within, seed)
+    _surround(model, geometry, chain.base, planes, obstacles)
+    carriers = [shape.parentJoint for shape in geometry.geometryObjects]
+    for one in range(own):
+        for two in range(one + 1, len(carriers)):
+            i, j = sorted((carriers[one], carriers[two]))
+            if i != j and (two >= own or (within and model.parents[j] != i)):
+                geometry.addCollisionPair(pin.CollisionPair(one, two))
+    found = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, own)
+    return _without_inseparable(found, margin, seed) if found.pairs else found
 
 
 def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]) -> None:
@@ -203,39 +198,17 @@ def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | 
             _attach(model, geometry, chain.tip, name, pose(along, place / 2), coal.Capsule(TARGET_RADIUS, length))
 
 
-def _finish(
-    model: Any,
-    geometry: Any,
-    chain: Chain,
-    walls: Sequence[Wall],
-    obstacles: Sequence[Obstacle],
-    missing: list[str],
-    margin: float,
-    within: bool,
-    seed: int,
-) -> Collision:
-    """Add floor and obstacles, choose the pairs, and drop those that no posture parts."""
-    pin, _ = _libraries()
-    own = geometry.ngeoms
-    _surround(model, geometry, chain.base, walls, obstacles)
-    carriers = [shape.parentJoint for shape in geometry.geometryObjects]
-    for one in range(own):
-        for two in range(one + 1, len(carriers)):
-            i, j = sorted((carriers[one], carriers[two]))
-            if i != j and (two >= own or (within and model.parents[j] != i)):
-                geometry.addCollisionPair(pin.CollisionPair(one, two))
-    columns = _columns(model, chain)
-    kept = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, columns, own)
-    if not kept.pairs:
-        return kept
-    fixed = np.array([pair.second >= own for pair in geometry.collisionPairs])
-    distances = kept.distances(random_joints(chain, SAMPLES, seed))
-    check_reachable(kept.pairs, distances, fixed)
+def _without_inseparable(found: Collision, margin: float, seed: int) -> Collision:
+    """Drop the pairs that no posture parts."""
+    geometry = found._geometry
+    fixed = np.array([pair.second >= found._links for pair in geometry.collisionPairs])
+    distances = found.distances(random_joints(found._chain, SAMPLES, seed))
+    check_reachable(found.pairs, distances, fixed)
     gone = inseparable(distances, fixed, margin)
-    excluded = tuple(pair for pair, out in zip(kept.pairs, gone, strict=True) if out)
+    excluded = tuple(pair for pair, out in zip(found.pairs, gone, strict=True) if out)
     for index in np.flatnonzero(gone)[::-1]:
         geometry.removeCollisionPair(geometry.collisionPairs[int(index)])
-    return Collision(_names(geometry), excluded, tuple(missing), model, geometry, chain, columns, own)
+    return replace(found, pairs=_names(geometry), excluded=excluded)
 
 
 def _names(geometry: Any) -> tuple[tuple[str, str], ...]:
@@ -255,9 +228,7 @@ def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray,
 def _surround(model: Any, geometry: Any, base: str, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
     """Add walls and obstacles to the fixed world, which is where the base is at zero joints."""
     pin, coal = _libraries()
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, pin.neutral(model))
-    stand = data.oMf[model.getFrameId(base)]
+    stand = _stand(model, base)
     things: list[Any] = [(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4)) for wall in walls]
     things += [(obstacle.name, _solid(obstacle), obstacle.placement) for obstacle in obstacles]
     for name, shape, placed in things:
@@ -271,28 +242,12 @@ def _solid(obstacle: Obstacle) -> Any:
     return makers[obstacle.kind](*map(float, obstacle.size))
 
 
-def _columns(model: Any, chain: Chain) -> tuple[_Column, ...]:
-    """Return how q fills Pinocchio's configuration; continuous joints have cosine and sine there."""
-    columns = []
-    for element in chain.elements:
-        if element.joint is not None:
-            joint = model.joints[model.getJointId(element.name.removesuffix(".offset"))]
-            columns.append(
-                _Column(joint.idx_q, element.joint, element.ratio, element.value, joint.nq == 2, joint.idx_v)
-            )
-    return tuple(columns)
-
-
-def _configurations(model: Any, columns: Sequence[_Column], q: np.ndarray) -> np.ndarray:
-    """Return Pinocchio's configurations (m, nq)."""
+def _stand(model: Any, base: str) -> Any:
+    """Return where the base is in Pinocchio's world, at zero joints."""
     pin, _ = _libraries()
-    result = np.tile(pin.neutral(model), (len(q), 1))
-    for column in columns:
-        value = column.ratio * q[:, column.joint] + column.offset
-        result[:, column.place] = np.cos(value) if column.circular else value
-        if column.circular:
-            result[:, column.place + 1] = np.sin(value)
-    return result
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    return data.oMf[model.getFrameId(base)].copy()
 
 
 def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
@@ -303,25 +258,15 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place
         refuse_robot(place, "<collision> without a shape")
     match kind.tag:
         case "box":
-            return coal.Box(*_numbers(kind, "size", 3, place))
+            return coal.Box(*numbers(kind, "size", place))
         case "sphere":
-            return coal.Sphere(*_numbers(kind, "radius", 1, place))
+            return coal.Sphere(*numbers(kind, "radius", place, count=1))
         case "cylinder" | "capsule":
             maker = coal.Cylinder if kind.tag == "cylinder" else coal.Capsule
-            return maker(*_numbers(kind, "radius", 1, place), *_numbers(kind, "length", 1, place))
+            return maker(*numbers(kind, "radius", place, count=1), *numbers(kind, "length", place, count=1))
         case "mesh":
             return _hull(kind, folders, missing, place)
     refuse_robot(place, f"<{kind.tag}> is none of box, sphere, cylinder, capsule, mesh")
-
-
-def _numbers(node: Node, key: str, count: int, place: str) -> list[float]:
-    try:
-        values = [float(word) for word in node.attributes.get(key, "").split()]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        refuse_robot(place, f"<{node.tag}> in line {node.line} needs {key} with {count} finite number(s)")
-    return values
 
 
 def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
@@ -332,7 +277,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
     if path is None:
         missing.append(name)
         return None
-    scale = np.array(_numbers(node, "scale", 3, place) if "scale" in node.attributes else [1.0, 1.0, 1.0])
+    scale = numbers(node, "scale", place, "1 1 1")
     try:
         mesh = coal.MeshLoader().load(str(path), scale)
         mesh.buildConvexHull(True, "Qt")
@@ -362,15 +307,50 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
     if path.suffix != ".urdf":
         return {}
     folders, found = list(path.resolve().parents), dict[str, Path | str]()
-    for link in parse(text(path)[0], str(path)).all("link"):
-        for node in link.all("collision"):
-            kinds = [each for shape in node.all("geometry") for each in shape.all("mesh")]
-            for name in (each.attributes.get("filename", "") for each in kinds):
-                inner = name.removeprefix("package://")
-                mesh = find_mesh(name, folders)
-                if mesh is not None and not inner.startswith(("/", "file:")) and ".." not in Path(inner).parts:
-                    found[f"1-robot/{inner}"] = mesh
+    for _, _, node in _meshes(path, "collision"):
+        name = node.attributes.get("filename", "")
+        inner, mesh = name.removeprefix("package://"), find_mesh(name, folders)
+        if mesh is not None and not inner.startswith(("/", "file:")) and ".." not in Path(inner).parts:
+            found[f"1-robot/{inner}"] = mesh
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """A mesh file that moves with a link: its placement (4, 4) in the link's frame, its scale (3,)."""
+
+    link: str
+    file: Path
+    placement: np.ndarray
+    scale: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "placement", frozen(self.placement))
+        object.__setattr__(self, "scale", frozen(self.scale))
+
+
+def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
+    """Return the meshes of a URDF's ``<visual>`` elements, and the names of those that were not found.
+
+    Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse
+    the whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
+    """
+    places, found, missing = list(Path(path).resolve().parents), [], []
+    for link, visual, mesh in _meshes(path, "visual"):
+        name = mesh.attributes.get("filename", "")
+        file = find_mesh(name, places)
+        if file is None or file.suffix.lower() not in DRAWABLE:
+            missing.append(name)
+            continue
+        scale = numbers(mesh, "scale", str(path), "1 1 1")
+        found.append(Visual(link.attributes.get("name", ""), file, origin(visual, str(path)), scale))
+    return found, missing
+
+
+def _meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
+    """Return each mesh of a URDF's ``<visual>`` or ``<collision>`` elements, with its link and its element."""
+    shapes = [(link, node) for link in parse(text(path)[0], str(path)).all("link") for node in link.all(tag)]
+    return [(*own, mesh) for own in shapes for shape in own[1].all("geometry") for mesh in shape.all("mesh")]
 
 
 def _libraries() -> tuple[Any, Any]:

@@ -4,12 +4,14 @@ The sample axis runs last inside (structure of arrays), so that each elementary 
 operations over all poses, and so that a stacked observation matrix is column-major without a copy.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.arrays import shaped
-from calib.robot.chain import AXES, Chain
+from calib.robot.chain import AXES, Chain, Element
+from calib.transforms import pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,20 +32,35 @@ class Sweep:
 
     def poses(self) -> np.ndarray:
         """Return the flange poses (m, 4, 4)."""
-        result = np.zeros((self.position.shape[1], 4, 4))
-        result[:, :3, :3] = self.rotation.transpose(2, 1, 0)
-        result[:, :3, 3] = self.position.T
-        result[:, 3, 3] = 1.0
-        return result
+        return pose(self.rotation.transpose(2, 1, 0), self.position.T)
 
 
-def _displacements(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return value + ratio · q for every element: (K, m) [m or rad]."""
-    values = np.repeat(chain.values[:, None], len(q), axis=1)
+def _walk(
+    chain: Chain, q: np.ndarray, start: tuple[np.ndarray, np.ndarray], extra: np.ndarray | None = None
+) -> Iterator[tuple[Element, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield each element, where its frame stands (3, m) [m], and the rotation and the position behind it.
+
+    Args:
+        start: rotation and position of the base (`_start`).
+        extra: as of `sweep`.
+    """
+    rotation, position = start
     for k, element in enumerate(chain.elements):
+        if element.placement is not None:
+            rotation, position = _place(rotation, position, element.placement)
+        origin, amount = position, element.value
         if element.joint is not None:
-            values[k] += element.ratio * q[:, element.joint]
-    return values
+            amount = amount + element.ratio * q[:, element.joint]
+        if extra is not None:
+            amount = amount + extra[k]
+        axis = AXES.index(element.axis) % 3
+        if isinstance(amount, float) and amount == 0.0:
+            pass
+        elif element.axis[0] == "r":
+            rotation = _rotate(rotation, axis, element.sign * amount)
+        else:
+            position = position + rotation[axis] * (element.sign * amount)
+        yield element, origin, rotation, position
 
 
 def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np.ndarray | None = None) -> Sweep:
@@ -56,27 +73,13 @@ def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np
         extra: (K, m) added to the elements' displacements (deflections) [m or rad].
     """
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
-    m, count = len(q), len(chain.elements)
-    motion = _displacements(chain, q)
-    if extra is not None:
-        motion = motion + extra
-    rotation, position = _start(base, m)
-    directions, origins = np.empty((count, 3, m)), np.empty((count, 3, m))
-    for k, element in enumerate(chain.elements):
-        if element.placement is not None:
-            rotation, position = _place(rotation, position, element.placement)
-        axis, angular = AXES.index(element.axis) % 3, element.axis[0] == "r"
-        directions[k] = rotation[axis] if element.sign > 0 else -rotation[axis]
-        origins[k] = position
-        constant = extra is None and element.joint is None
-        amount = element.sign * (element.value if constant else motion[k])
-        if constant and amount == 0.0:
-            continue
-        if angular:
-            rotation = _rotate(rotation, axis, amount)
-        else:
-            position = position + rotation[axis] * amount
-    rotation, position = _place(rotation, position, chain.tail)
+    shape = (len(chain.elements), 3, len(q))
+    directions, origins = np.empty(shape), np.empty(shape)
+    behind = start = _start(base, len(q))
+    for k, (element, origin, *behind) in enumerate(_walk(chain, q, start, extra)):
+        axis = behind[0][AXES.index(element.axis) % 3]  # its own motion does not change it
+        directions[k], origins[k] = (axis if element.sign > 0 else -axis), origin
+    rotation, position = _place(behind[0], behind[1], chain.tail)
     return Sweep(directions, origins, rotation, position)
 
 
@@ -148,22 +151,18 @@ def twist_product(
     Returns:
         (n, m).
     """
-    moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
+    moving = chain.driven
     v, w = columns[:, :3], columns[:, 3:]
     turned = _cross(v, G[:, :3]) + _cross(w, G[:, 3:])
     moved = _cross(G[:, :3], w)
-    behind = (places > np.array(moving)[:, None]).astype(float)
+    behind = (places > moving[:, None]).astype(float)
     shape = (len(moving), 3, G.shape[2])
     about = (behind @ turned.reshape(len(G), -1)).reshape(shape)
     along = ((1.0 - behind) @ moved.reshape(len(G), -1)).reshape(shape)
     slopes = np.einsum("kim,kim->km", elements[moving, 3:], about) + np.einsum(
         "kim,kim->km", elements[moving, :3], along
     )
-    result = np.zeros((chain.n, G.shape[2]))
-    for k, slope in zip(moving, slopes, strict=True):
-        element = chain.elements[k]
-        result[element.joint] += element.ratio * slope
-    return result
+    return chain.rates.T @ slopes
 
 
 def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int | None = None) -> np.ndarray:
@@ -177,12 +176,9 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
     Returns:
         (m, 6, n): linear velocity of the point, then angular velocity, both in the reference frame.
     """
-    moving = np.array([k for k, e in enumerate(chain.elements[:before]) if e.joint is not None], dtype=int)
-    result = np.zeros((chain.n, 6, point.shape[1]))
-    for k, column in zip(moving, element_jacobian(chain, walked, point, moving), strict=True):
-        element = chain.elements[k]
-        result[element.joint] += element.ratio * column
-    return result.transpose(2, 1, 0)
+    moving = chain.driven if before is None else chain.driven[chain.driven < before]
+    columns = element_jacobian(chain, walked, point, moving)
+    return np.tensordot(chain.rates[: len(moving)].T, columns, 1).transpose(2, 1, 0)
 
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -191,26 +187,16 @@ def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
     return joint_jacobian(chain, walked, walked.position)
 
 
+def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the frames behind every element that a joint moves, followers included: (moving, m, 4, 4)."""
+    q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
+    passed = _walk(chain, q, _start(None, len(q)))
+    return np.array([pose(r.transpose(2, 1, 0), p.T) for element, _, r, p in passed if element.joint is not None])
+
+
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames right after each joint's moving element, (n, m, 4, 4): where `Chain.inertias` are given."""
-    m = len(q)
-    motion = _displacements(chain, shaped(q, (None, chain.n), "joint values"))
-    rotation, position = _start(None, m)
-    frames = np.zeros((chain.n, m, 4, 4))
-    frames[..., 3, 3] = 1.0
-    first = {int(k): j for j, k in enumerate(chain.moving)}
-    for k, element in enumerate(chain.elements):
-        if element.placement is not None:
-            rotation, position = _place(rotation, position, element.placement)
-        axis, amount = AXES.index(element.axis) % 3, element.sign * motion[k]
-        if element.axis[0] == "r":
-            rotation = _rotate(rotation, axis, amount)
-        else:
-            position = position + rotation[axis] * amount
-        if k in first:
-            frames[first[k], :, :3, :3] = rotation.transpose(2, 1, 0)
-            frames[first[k], :, :3, 3] = position.T
-    return frames
+    return moving_frames(chain, q)[np.searchsorted(chain.driven, chain.moving)]
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ import study_tables
 
 from calib import files
 from calib.data.recordings.recording import Recording
-from calib.data.signals.decimation import decimate
+from calib.data.signals.filtering import decimate
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.torque_rows import torque_rows

@@ -23,7 +23,7 @@ from calib.geometry.installation import see
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout, step
 from calib.geometry.weighing import Settings
-from calib.robot.deflection import Deflection
+from calib.robot.calibrated import Deflection
 from calib.robot.load import load
 from calib.rooms.camera.board_pose import board_poses
 from calib.rooms.camera.camera_guess import complete_camera

@@ -15,7 +15,7 @@ from calib.errors import UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see
 from calib.geometry.model_choice.ladder import select_model
-from calib.robot.deflection import Deflection, Term, evaluate
+from calib.robot.calibrated import Deflection, Term, evaluate
 
 SIGMA = 4e-5
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.model_choice.ladder import EFFECTS
 from calib.geometry.observation import observe, predict, prepare, target_jacobian
 from calib.geometry.parameters import layout, step
-from calib.robot.deflection import Deflection, Term
+from calib.robot.calibrated import Deflection, Term
 from calib.transforms import pose
 
 CHAINS = {"lwr4plus": lambda: load("lwr4plus"), "ur5": lambda: load("ur5"), "mixed": motley_with_follower}

@@ -15,7 +15,7 @@ from calib.geometry.checks.unidentified import PLACES, unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
-from calib.robot.deflection import Deflection, Term
+from calib.robot.calibrated import Deflection, Term
 
 SIGMA = 5e-5
 

@@ -9,7 +9,7 @@ import planted_motion as planted
 import pytest
 
 from calib.arrays import frozen
-from calib.data.signals.decimation import design_decimator
+from calib.data.signals.filtering import design_decimator
 from calib.dynamics import drives
 from calib.dynamics.shapes import Joined
 from calib.identification.cases import Case

@@ -14,7 +14,7 @@ import pytest
 
 from calib import cli, files
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.signals.decimation import decimate, design_decimator, spread
+from calib.data.signals.filtering import decimate, design_decimator, spread
 from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of

@@ -258,7 +258,7 @@ def test_continuous_and_mimic_joints_move_the_shapes(tmp_path):
     [
         ("", r"no usable <collision> shape; give mesh_folders, or use capsules"),
         (shape('<mesh filename="absent.stl"/>'), r"no usable .* \(1 meshes were not found, e\.g\. absent\.stl\)"),
-        (shape('<box size="1 1"/>'), r"link 'one': <box> in line \d+ needs size with 3 finite number"),
+        (shape('<box size="1 1"/>'), r"link 'one': size=\"1 1\" of <box> in line \d+ is not 3 finite numbers"),
         (shape('<torus radius="1"/>'), r"<torus> is none of box, sphere"),
         (shape(""), r"<collision> without a shape"),
     ],

@@ -9,7 +9,7 @@ import pytest
 
 from calib.errors import RobotError
 from calib.robot.chain import Joint
-from calib.robot.description_checks import impossible_bodies, remarks
+from calib.robot.description import impossible_bodies, remarks
 from calib.robot.load import load
 
 

@@ -67,9 +67,9 @@ def measure(
     tool = np.resize(np.array(tools), count)
     if kind in ("sockets", "plane"):
         return _touched(truth, kind, q, tool, sigma, stated, file, rng)
-    from calib.robot import deflection
+    from calib.robot import calibrated
 
-    bases = deflection.evaluate(truth.deflection, q, torque(q) if torque else None)
+    bases = calibrated.evaluate(truth.deflection, q, torque(q) if torque else None)
     seen = see(truth, q, station, tool, bases)
     point = seen.point.T
     common: dict[str, Any] = dict(

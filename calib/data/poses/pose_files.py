@@ -17,24 +17,190 @@ tool                ``tool``: label of the reflector that a row saw
 ==================  ===================================================================================================
 
 All other columns are ignored and listed. Other forms: `calib.data.poses.robodk`.
+
+A frame on the robot's base measured beside the target: what is relative to it does not care for the instrument.
+
+The study (Kolyubin et al. 2019, section 3.5) marks the base with LEDs of its own, so that the camera may be moved
+between series. Both measurements are noisy, and the base's orientation noise acts over the distance to the target.
+
+Rows that belong together: sockets, planes, pairs and bars.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from calib.data.csv_table import read_header, read_table
+from calib.data.csv_table import Table, read_header, read_table
 from calib.data.poses import plausible, robodk
-from calib.data.poses.base_frame import relative_to_base
-from calib.data.poses.columns import OURS, POSITION, SIGMA, SIGMA_ROTATION, SUFFIXES, Layout, Sheet, find_layout
+from calib.data.poses.columns import (
+    DISTANCE,
+    OURS,
+    POSITION,
+    SIGMA,
+    SIGMA_DISTANCE,
+    SIGMA_ROTATION,
+    SUFFIXES,
+    Layout,
+    Sheet,
+    find_layout,
+)
 from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.grouped import labels, read_groups
-from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
+from calib.data.poses.measurements import (
+    Bars,
+    Distances,
+    GroupedMeasurements,
+    Planes,
+    PoseMeasurements,
+    Poses,
+    Positions,
+    Sockets,
+)
 from calib.data.poses.plausible import Limits
 from calib.data.schema import refuse
+
+
+def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
+    """Return the rows of a table, with joint values q (m, n), as groups."""
+    table, options = sheet.table, sheet.options
+    names, group = labels(table, layout.group)
+    tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), np.zeros(len(q), dtype=int))
+    single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
+    common: dict[str, Any] = {
+        "group": group, "group_names": names, "tool": tool, "tool_names": tool_names, "file": table.file,
+        "rows": table.rows,
+        "notes": (f"one row alone determines nothing: {layout.kind} {', '.join(single[:5])}",) if single else (),
+    }  # fmt: skip
+    stated = None if options.sigma.position is None else np.tile(options.sigma.position, (len(q), 1))
+    if layout.kind == Sockets.kind:
+        return Sockets(q, layout.joints, sigma=stated, links=_links(sheet, layout, group), **common)
+    along = None if stated is None else stated[:, 0]
+    if layout.kind == Planes.kind:
+        return Planes(q, layout.joints, sigma=along, **common)
+    distance, sigma = _read_distance(sheet, layout)
+    sigma = along if sigma is None else sigma
+    if layout.kind == Bars.kind:
+        return Bars(q, layout.joints, distance, sigma=sigma, **common)
+    _check_pairs(table, layout, group, names, distance)
+    return Distances(q, layout.joints, distance, sigma=sigma, **common)
+
+
+def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return the distinct labels in order of appearance, joined by ``/``, and each row's index (m,) among them."""
+    texts = np.column_stack([np.array(table.texts(name), dtype=object) for name in columns])
+    empty = (texts == "") | (texts == "nan")
+    refuse(table, empty, columns, lambda row, k: "found an empty cell where a label is needed")
+    joined = ["/".join(parts) for parts in texts]
+    place = {name: i for i, name in enumerate(dict.fromkeys(joined))}
+    return tuple(place), np.array([place[name] for name in joined])
+
+
+def _read_distance(sheet: Sheet, layout: Layout) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return distances (m,) and their sigmas (m,) [m], None where not stated."""
+    value = sheet.numbers(layout.distance[:1], DISTANCE)[:, 0]
+    stated = sheet.options.sigma
+    if len(layout.distance) == 1:
+        return value, None if stated.distance is None else np.full(len(value), stated.distance)
+    sigma = sheet.numbers(layout.distance[1:], replace(SIGMA_DISTANCE, positive=""))
+    sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, stated.floor))
+    return value, SIGMA_DISTANCE.check(sigma, sheet.table, layout.distance[1:])[:, 0]
+
+
+def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequence[str], distance: np.ndarray) -> None:
+    for number, name in enumerate(names):
+        members = np.flatnonzero(group == number)
+        first, last = members[0], members[-1]
+        if len(members) != 2:
+            message = f"pair '{name}' has {len(members)} rows; a distance joins two"
+            table.fail(message, layout.group[-1], last)
+        if abs(distance[first] - distance[last]) > 1e-9:
+            message = (
+                f"pair '{name}' has {distance[last]:g} m here and {distance[first]:g} m in row {table.rows[first]}"
+            )
+            table.fail(message, layout.distance[0], last)
+
+
+def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:
+    """Return the pairs of groups that share all labels but the socket's, with the known distance [m]."""
+    table, options = sheet.table, sheet.options
+    if options.socket_distance is None:
+        return ()
+    texts = [table.texts(name) for name in layout.group]
+    fixtures: dict[tuple[str, ...], dict[str, int]] = {}
+    for parts, number in zip(zip(*texts), group):
+        fixtures.setdefault(parts[:-1], {})[parts[-1]] = int(number)
+    links = []
+    for place, sockets in fixtures.items():
+        if len(sockets) > 2 and not options.socket_pairs:
+            sheet.fail(
+                f"{'/'.join(place) or 'the fixture'} has {len(sockets)} sockets ({', '.join(sockets)}): say which of "
+                "them are socket_distance apart (socket_pairs = [['0', '1']] in the options)",
+                layout.group[-1],
+            )
+        for a, b in options.socket_pairs or combinations(sockets, 2):
+            if a in sockets and b in sockets:
+                links.append((sockets[a], sockets[b], options.socket_distance))
+    if not links:
+        wanted = ", ".join(f"{a} and {b}" for a, b in options.socket_pairs) or "two sockets"
+        found = ", ".join(dict.fromkeys(texts[-1]))
+        message = f"no fixture position has {wanted}, so that socket_distance joins nothing; found {found}"
+        sheet.fail(message, layout.group[-1])
+    return tuple(links)
+
+
+def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndarray) -> Positions:
+    """Return the block as seen from the base frame that was measured with every row.
+
+        p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
+        Σ_p = R_bᵀ (Σ_t + Σ_b + [l]× Σ_rb [l]×ᵀ) R_b,  l = p_t - p_b;   Σ_r = R_bᵀ (Σ_rt + Σ_rb) R_b
+
+    The base is taken to be measured as well as the target: the same sigmas. Of the covariances the diagonals are kept.
+
+    Args:
+        block: positions or poses, in the instrument's frame.
+        position: (m, 3) of the base frame [m].
+        quaternion: (m, 4) of the base frame, x y z w, unit norm.
+    """
+    base = Rotation.from_quat(quaternion)
+    lever = block.position - position
+    turn = base.inv().as_matrix()
+    changes: dict[str, np.ndarray] = {"position": base.inv().apply(lever)}
+    stated = block.sigma_rotation if isinstance(block, Poses) else None
+    if isinstance(block, Poses):
+        changes["quaternion"] = (base.inv() * Rotation.from_quat(block.quaternion)).as_quat(canonical=True)
+    if stated is not None:
+        changes["sigma_rotation"] = _turned(turn, 2.0 * _diagonal(stated))
+    if block.sigma is not None:
+        covariance = 2.0 * _diagonal(block.sigma)
+        if stated is not None:
+            cross = _cross(lever)
+            covariance = covariance + cross @ _diagonal(stated) @ np.swapaxes(cross, 1, 2)
+        changes["sigma"] = _turned(turn, covariance)
+    note = (
+        "positions are relative to the base frame measured with each row; its noise is counted as large as the target's"
+    )
+    return replace(block, notes=(*block.notes, note), **changes)
+
+
+def _diagonal(sigma: np.ndarray) -> np.ndarray:
+    return np.einsum("mi,ij->mij", sigma**2, np.eye(3))
+
+
+def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (m, 3) of covariances (m, 3, 3) in turned axes."""
+    return np.sqrt(np.einsum("mij,mjk,mik->mi", turn, covariance, turn))
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """Return [l]× (m, 3, 3) of vectors (m, 3)."""
+    result = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -z, y, -x
+    return result - np.swapaxes(result, 1, 2)
 
 
 def read_measurements(

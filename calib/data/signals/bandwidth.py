@@ -12,8 +12,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from calib.arrays import frozen
-from calib.data.signals.decimation import factor_for
-from calib.data.signals.filtering import hann
+from calib.data.signals.filtering import factor_for, hann
 from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
 

@@ -2,7 +2,7 @@
 
 `Motion` is the only type that carries accelerations, so an unfiltered log cannot reach a regressor. Its torques are as
 recorded (on the even grid): what filters them is the parallel decimation, which filters every column of W alike
-(`calib.data.signals.decimation`).
+(`calib.data.signals.filtering`).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,9 +18,20 @@ from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.clock import CLOCKS
 from calib.data.recordings.recording import Recording, read_only
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
-from calib.data.signals.decimation import KINDS as DECIMATORS
-from calib.data.signals.decimation import Decimator, decimate, design_decimator, factor_for, kept, too_short
-from calib.data.signals.filtering import ORDER, border, curvature, low_pass, slope
+from calib.data.signals.filtering import KINDS as DECIMATORS
+from calib.data.signals.filtering import (
+    ORDER,
+    Decimator,
+    border,
+    curvature,
+    decimate,
+    design_decimator,
+    factor_for,
+    kept,
+    low_pass,
+    slope,
+    too_short,
+)
 from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resample
 from calib.errors import UsageError, refuse_data
 

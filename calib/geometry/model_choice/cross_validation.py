@@ -22,8 +22,8 @@ from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.result import GeometricFit
+from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection, Term
 
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 

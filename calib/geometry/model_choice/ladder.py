@@ -26,8 +26,8 @@ from calib.geometry.observation import prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings
+from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection, Term
 
 
 def _stiffness(chain: Chain, known: bool) -> list[Term]:
@@ -260,10 +260,9 @@ class _Climber:
         """Try frames, joint offsets and the full geometry."""
         table = layout(self.nominal.cell)
         chain = self.nominal.cell.chain
-        offsets = [k for k, e in enumerate(chain.elements) if e.joint is not None]
         choices = {
             "frames": table.frame_index,
-            "offsets": np.concatenate([offsets, table.frame_index]).astype(int),
+            "offsets": np.concatenate([chain.driven, table.frame_index]),
             "geometry": np.concatenate([table.arm_index, table.frame_index]),
         }
         error = np.inf

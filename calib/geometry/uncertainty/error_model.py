@@ -29,8 +29,8 @@ from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.left_out import LeftOut, Profile, unevenness
 from calib.geometry.uncertainty.spread import pose_sigmas
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 
 END_SHARE = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)

@@ -5,7 +5,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, target_jacobian
-from calib.robot.deflection import evaluate, extra_displacements
+from calib.robot.calibrated import evaluate, extra_displacements
 
 
 def pose_sigmas(

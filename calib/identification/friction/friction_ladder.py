@@ -21,7 +21,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator, kept
+from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import STEPS, JointRange

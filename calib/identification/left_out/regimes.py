@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator, kept
+from calib.data.signals.filtering import Decimator, kept
 from calib.identification.cases import Case
 from calib.identification.rows import ObservationRows
 

@@ -13,8 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from calib.arrays import frozen
 from calib.data.signals.bandwidth import USABLE
-from calib.data.signals.decimation import Decimator
-from calib.data.signals.filtering import border, low_pass
+from calib.data.signals.filtering import Decimator, border, low_pass
 from calib.data.signals.motion import ROWS, Motion
 from calib.dynamics.bodies import Bodies
 from calib.errors import NotConverged, UsageError, refuse_data

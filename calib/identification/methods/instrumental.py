@@ -21,8 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.data.signals.decimation import Decimator
-from calib.data.signals.filtering import low_pass, slope
+from calib.data.signals.filtering import Decimator, low_pass, slope
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.arrays import frozen
-from calib.data.signals.decimation import Decimator
+from calib.data.signals.filtering import Decimator
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen
-from calib.data.signals.decimation import Decimator, decimate, kept, spread
+from calib.data.signals.filtering import Decimator, decimate, kept, spread
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
-from calib.data.signals.decimation import kept
+from calib.data.signals.filtering import kept
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.triangles import Triangles
 from calib.estimation.variances import variance_weights

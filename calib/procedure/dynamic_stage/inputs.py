@@ -12,7 +12,7 @@ import numpy as np
 from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.recordings.recording_files import read_recording
-from calib.data.signals.decimation import SHARE
+from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
 from calib.data.signals.reference_files import with_reference
 from calib.data.signals.resampling import Resampled
@@ -25,7 +25,7 @@ from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.procedure.robot_kinds import Mechanism
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
-from calib.robot.description_checks import remarks
+from calib.robot.description import remarks
 from calib.robot.load import load_calibrated, resolve
 from calib.units import TORQUE
 

@@ -17,7 +17,7 @@ from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import level_of, limit
 from calib.robot.chain import Chain
-from calib.robot.description_checks import impossible_bodies
+from calib.robot.description import impossible_bodies
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:

@@ -48,7 +48,7 @@ from calib.procedure.excitation.motion_bounds import (
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
 from calib.robot.chain import Chain
-from calib.robot.description_checks import impossible_bodies
+from calib.robot.description import impossible_bodies
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion

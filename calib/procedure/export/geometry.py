@@ -12,7 +12,7 @@ from calib.procedure.kinematic_stage.folder import OURS, FitFolder
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
-from calib.robot.formats import ur, urdf, urdf_write
+from calib.robot.formats import origin_files, urdf, urdf_write
 from calib.robot.formats.markup import text
 from calib.robot.formats.readback import link_poses, tip_poses
 from calib.robot.formats.urdf_tree import read as read_tree
@@ -107,7 +107,7 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
 
 
 def ur_kinematics(robot: CalibratedChain) -> str:
-    """Return the kinematics YAML of ur_description (see `calib.robot.formats.ur.kinematics`).
+    """Return the kinematics YAML of ur_description (see `calib.robot.formats.origin_files.kinematics`).
 
     ur_description puts its tool0 where wrist_3 is: fixed joints of the robot's file behind it (a flange, a tool) are
     not part of it, see `flange_note`.
@@ -116,7 +116,7 @@ def ur_kinematics(robot: CalibratedChain) -> str:
         NoSuchArm: for an arm that has not UR's axes.
     """
     with refused_as(NoSuchArm, RobotError, f"'{robot.chain.name}' has not the axes of a UR arm: {{}}"):
-        return ur.kinematics(nominal_of(robot), robot.chain)
+        return origin_files.kinematics(nominal_of(robot), robot.chain)
 
 
 def flange_note(robot: CalibratedChain) -> str:
@@ -124,9 +124,9 @@ def flange_note(robot: CalibratedChain) -> str:
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
-    if np.abs(behind - np.eye(4)).max() < ur.ON_AXIS:
+    if np.abs(behind - np.eye(4)).max() < origin_files.ON_AXIS:
         return ""
     away = f"{nominal.tip}, {1e3 * float(np.linalg.norm(behind[:3, 3])):.4g} mm behind the last joint's frame"
-    if ur.wrist_offset(nominal) > ur.ON_AXIS:
+    if origin_files.wrist_offset(nominal) > origin_files.ON_AXIS:
         return f"wrist_3 is the last joint's frame, as UR's tool0 is; the fixed joint to {away}, is not in it"
     return f"wrist_3 reaches to {away}: this file holds UR's d6 there; it has to be UR's own flange, without a tool"

@@ -19,7 +19,7 @@ from calib.procedure.export import geometry
 from calib.procedure.findings import lines_of
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain
-from calib.robot.description_checks import impossible_bodies
+from calib.robot.description import impossible_bodies
 
 MAX_MASS_RATIO = 3.0  # times a body's mass in the description from which on it is named (our choice)
 

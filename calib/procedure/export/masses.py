@@ -11,10 +11,11 @@ from calib.procedure.export import geometry
 from calib.procedure.export.geometry import MAX_DIFFERENCE
 from calib.procedure.export.identified import IdentifiedRobot
 from calib.robot.chain import Chain, random_joints
-from calib.robot.formats import mjcf, urdf, urdf_inertials, urdf_write
+from calib.robot.formats import mjcf, urdf, urdf_write
 from calib.robot.formats.readback import motion_torques
 from calib.robot.formats.urdf_tree import UrdfTree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.kinematics import moving_frames
 from calib.transforms import invert
 
 
@@ -48,7 +49,7 @@ def as_urdf(given: IdentifiedRobot, content: str, where: str, nominal: Chain) ->
     links, notes = _link_bodies(given, tree, own)
     names = own.joint_names
     friction = {name: (float(row[1]), float(row[2])) for name, row in zip(names, given.drives.values)}
-    edited = urdf_inertials.put(calibrated_text, where, links, friction)
+    edited = urdf_write.put(calibrated_text, where, links, friction)
     geometry.check_readback(edited, where, chain)
     _check(given, edited, own, where)
     return edited, notes
@@ -66,14 +67,14 @@ def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[di
     """Return the inertials to write by link, about the links' frames, and notes."""
     path = [joint for joint in tree.path(own.base, own.tip) if joint.moves]
     zero = np.zeros((1, own.n))
-    between = invert(urdf_write.moving_frames(own, zero)[:, 0]) @ urdf_write.moving_frames(given.chain, zero)[:, 0]
+    between = invert(moving_frames(own, zero)[:, 0]) @ moving_frames(given.chain, zero)[:, 0]
     links: dict[str, np.ndarray] = {}
     notes: list[str] = []
     for joint, turn, body in zip(path, between, given.bodies):
         if not body.any():
             continue
         whole = transform_body(body, urdf.align(joint.axis) @ turn)
-        fixed, loose = urdf_inertials.hanging(tree, tree.path(own.base, own.tip), joint.child)
+        fixed, loose = urdf_write.hanging(tree, tree.path(own.base, own.tip), joint.child)
         others = {
             name: placed for name, placed in fixed.items() if name != joint.child and tree.bodies[name] is not None
         }
@@ -109,7 +110,7 @@ def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
     wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a)
     if mjcf:
         wanted = wanted + given.drives.values[:, 0] * a
-        away = float(np.abs(frames - urdf_write.moving_frames(given.chain, q)).max())
+        away = float(np.abs(frames - moving_frames(given.chain, q)).max())
         if away > MAX_DIFFERENCE:
             raise RobotError(f"{where}: Pinocchio reads other poses, by {away:.2g}; nothing was written")
     off = float(np.abs(torques - wanted).max()) / max(1.0, float(np.abs(wanted).max()))

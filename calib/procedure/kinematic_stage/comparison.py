@@ -208,7 +208,7 @@ def interval_cells(found: Comparison, count: int) -> list[tuple[float | None, fl
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
     """Return gravity torques (m, n) [N m] of a block; None where the robot's masses are not known."""
-    if chain.inertias is None or sum(element.joint is not None for element in chain.elements) != chain.n:
+    if chain.inertias is None or len(chain.driven) != chain.n:
         return None
     from calib.dynamics.gravity import gravity_torques
 

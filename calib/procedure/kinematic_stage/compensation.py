@@ -34,8 +34,8 @@ from calib.geometry.uncertainty.error_model import Discrepancy, ErrorModel, outs
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows

@@ -18,10 +18,9 @@ from calib.geometry.checks.repeatability import repeated, repeated_rows
 from calib.geometry.first_guess import check_scale
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import CalibratedChain, Deflection
 from calib.robot.chain import Chain, joint_kinds
-from calib.robot.deflection import Deflection
-from calib.robot.description_checks import remarks
+from calib.robot.description import remarks
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.load import load, resolve

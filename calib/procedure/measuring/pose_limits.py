@@ -32,7 +32,7 @@ from calib.procedure.measuring.constraints_file import (
     rising,
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
-from calib.robot.description_checks import TURNS, remarks
+from calib.robot.description import TURNS, remarks
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import placement

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.robot.chain import AXES, Chain, Element
-from calib.robot.formats.urdf_inertials import centred
-from calib.robot.formats.urdf_write import moving_frames
+from calib.robot.formats.urdf_write import centred
+from calib.robot.kinematics import moving_frames
 from calib.transforms import invert
 
 
@@ -30,10 +30,10 @@ def text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: np.nda
         "  <worldbody>",
     ]
     first, depth, ties = set(chain.moving.tolist()), 2, []
-    moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
-    placed = [_placement(chain, k) for k in moving]
-    ends = [one[:3, 3] for one in placed[1:]] + [np.asarray(chain.tail)[:3, 3]]
-    for number, k in enumerate(moving):
+    frames = moving_frames(chain, np.zeros((1, chain.n)))[:, 0]
+    placed = [frames[0], *(invert(frames[:-1]) @ frames[1:])]  # each in the frame of the body before
+    ends = [one[:3, 3] for one in (*placed[1:], chain.tail)]
+    for number, k in enumerate(chain.driven.tolist()):
         element, main = chain.elements[k], k in first
         blank = "  " * depth
         name = joint_name(chain, k)
@@ -49,7 +49,7 @@ def text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: np.nda
                 f'    <joint joint1={quoteattr(name)} joint2={quoteattr(leader)} polycoef="0 {element.ratio!r} 0 0 0"/>'
             )
         depth += 1
-    lines.append("  " * depth + f"<site name={quoteattr(chain.tip + '_tip')} {_placed(np.asarray(chain.tail))}/>")
+    lines.append("  " * depth + f"<site name={quoteattr(chain.tip + '_tip')} {_placed(chain.tail)}/>")
     lines += ["  " * level + "</body>" for level in range(depth - 1, 1, -1)]
     lines.append("  </worldbody>")
     if ties:
@@ -62,13 +62,6 @@ def joint_name(chain: Chain, k: int) -> str:
     element = chain.elements[k]
     main = k in chain.moving.tolist()
     return chain.joints[element.joint or 0].name if main else element.name.removesuffix(".offset")
-
-
-def _placement(chain: Chain, k: int) -> np.ndarray:
-    """Return the frame (4, 4) behind moving element k at q = 0, in that behind the moving element before."""
-    frames = moving_frames(chain, np.zeros((1, chain.n)))[:, 0]
-    number = sum(element.joint is not None for element in chain.elements[:k])
-    return frames[0] if number == 0 else invert(frames[number - 1]) @ frames[number]
 
 
 def _inertial(body: np.ndarray) -> list[str]:

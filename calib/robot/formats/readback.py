@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.errors import RobotError, refused_as
 from calib.robot.chain import Chain
+from calib.robot.formats.mjcf import joint_name
 
 
 def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -32,21 +33,33 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     data = model.createData()
     base, tip = model.getFrameId(chain.base), model.getFrameId(chain.tip)
     result = np.empty((len(q), 4, 4))
-    for pose, row in zip(result, q, strict=True):
-        pin.framesForwardKinematics(model, data, _configuration(model, pin.neutral(model), chain, row))
+    for pose, configuration in zip(result, configurations(model, chain, q), strict=True):
+        pin.framesForwardKinematics(model, data, configuration)
         pose[:] = (data.oMf[base].inverse() * data.oMf[tip]).homogeneous
     return result
 
 
-def _configuration(model: Any, neutral: np.ndarray, chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return Pinocchio's configuration; a continuous joint is there by cosine and sine, a follower by its own value."""
-    for element in chain.elements:
-        if element.joint is None:
-            continue
-        joint = model.joints[model.getJointId(element.name.removesuffix(".offset"))]
-        value = element.value + element.ratio * q[element.joint]
-        neutral[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-    return neutral
+def driven_joints(model: Any, chain: Chain) -> list[Any]:
+    """Return Pinocchio's joints of the elements that a chain's joints move, followers included."""
+    return [model.joints[model.getJointId(joint_name(chain, k))] for k in chain.driven.tolist()]
+
+
+def configurations(model: Any, chain: Chain, q: np.ndarray, from_zero: bool = False) -> np.ndarray:
+    """Return Pinocchio's configurations (m, nq) at joint values q (m, n): a continuous joint has cosine and sine there.
+
+    Args:
+        from_zero: whether the model's frames at zero hold the chain's constant values.
+    """
+    import pinocchio
+
+    pin: Any = pinocchio
+    result = np.tile(pin.neutral(model), (len(q), 1))
+    for k, joint in zip(chain.driven, driven_joints(model, chain)):
+        element = chain.elements[k]
+        value = element.ratio * q[:, element.joint] + (0.0 if from_zero else element.value)
+        values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+        result[:, joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=1)
+    return result
 
 
 def motion_torques(
@@ -69,8 +82,6 @@ def motion_torques(
     """
     import pinocchio
 
-    from calib.robot.formats.mjcf import joint_name
-
     pin: Any = pinocchio
     try:
         model: Any = _from_mjcf(pin, source) if mjcf else pin.buildModelFromXML(source)
@@ -78,28 +89,16 @@ def motion_torques(
         raise RobotError(f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {error}") from error
     data = model.createData()
     model.gravity = pin.Motion(np.array(chain.gravity), np.zeros(3))
-    moved = [(k, one) for k, one in enumerate(chain.elements) if one.joint is not None]
-    joints = [model.joints[model.getJointId(joint_name(chain, k))] for k, _ in moved]
-    torques, frames = np.zeros(q.shape), np.empty((len(moved), len(q), 4, 4))
-    for row in range(len(q)):
-        state = [pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)]
-        for (_, element), joint in zip(moved, joints):
-            amount = element.ratio * q[row, element.joint] + (0.0 if mjcf else element.value)
-            state[0][joint.idx_q : joint.idx_q + joint.nq] = (
-                [amount] if joint.nq == 1 else [np.cos(amount), np.sin(amount)]
-            )
-            state[1][joint.idx_v] = element.ratio * v[row, element.joint]
-            state[2][joint.idx_v] = element.ratio * a[row, element.joint]
-        pin.forwardKinematics(model, data, state[0])
-        tau = pin.rnea(model, data, *state)
-        for number, ((_, element), joint) in enumerate(zip(moved, joints)):
-            torques[row, element.joint] += element.ratio * tau[joint.idx_v]
-            frames[number, row] = data.oMi[joint.id].homogeneous
-    main = [joints[number].idx_v for number, (k, _) in enumerate(moved) if k in chain.moving]
-    order = [element.joint for k, element in moved if k in chain.moving and element.joint is not None]
-    damping, friction = np.zeros(chain.n), np.zeros(chain.n)
-    damping[order], friction[order] = model.damping[main], model.friction[main]
-    return torques, frames, damping, friction
+    joints = driven_joints(model, chain)
+    velocity = np.zeros((model.nv, chain.n))
+    velocity[[joint.idx_v for joint in joints]] = chain.rates
+    torques, frames = np.zeros(q.shape), np.empty((len(joints), len(q), 4, 4))
+    for row, configuration in enumerate(configurations(model, chain, q, mjcf)):
+        pin.forwardKinematics(model, data, configuration)
+        torques[row] = pin.rnea(model, data, configuration, velocity @ v[row], velocity @ a[row]) @ velocity
+        frames[:, row] = [data.oMi[joint.id].homogeneous for joint in joints]
+    main = [joints[place].idx_v for place in np.searchsorted(chain.driven, chain.moving)]
+    return torques, frames, model.damping[main], model.friction[main]
 
 
 def _from_mjcf(pin: Any, source: str) -> Any:

@@ -176,7 +176,7 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
     found = []
     for joint in joints.values():
         node = joint.node.first("origin")
-        if node is not None and (np.abs(_floats(node, "rpy", "0 0 0", where)) > TURN).any():
+        if node is not None and (np.abs(numbers(node, "rpy", where, "0 0 0")) > TURN).any():
             found.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
     if len(found) > 1:
         refuse_robot(
@@ -256,15 +256,14 @@ def origin(node: Node, place: str) -> np.ndarray:
     found = node.first("origin")
     if found is None:
         return np.eye(4)
-    xyz = _floats(found, "xyz", "0 0 0", place)
-    return from_xyz_rpy(xyz, _floats(found, "rpy", "0 0 0", place))
+    return from_xyz_rpy(numbers(found, "xyz", place, "0 0 0"), numbers(found, "rpy", place, "0 0 0"))
 
 
 def _axis(node: Node, kind: str, place: str) -> np.ndarray:
     found = node.first("axis")
     if kind not in MOVING:
         return np.array([1.0, 0.0, 0.0])
-    axis = np.array([1.0, 0.0, 0.0]) if found is None else _floats(found, "xyz", "1 0 0", place)
+    axis = np.array([1.0, 0.0, 0.0]) if found is None else numbers(found, "xyz", place, "1 0 0")
     length = np.linalg.norm(axis)
     require(length > 1e-9, f'{place}: its axis is zero; give a direction such as xyz="0 0 1"', RobotError)
     return axis / length
@@ -276,7 +275,7 @@ def _mimic(node: Node, place: str) -> Mimic | None:
         return None
     if not (leader := found.attributes.get("joint")):
         refuse_robot(place, "<mimic> without a joint to follow")
-    return Mimic(leader, _float(found, "multiplier", 1.0, place), _float(found, "offset", 0.0, place))
+    return Mimic(leader, _number(found, "multiplier", 1.0, place), _number(found, "offset", 0.0, place))
 
 
 def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float, tuple[str, ...]]:
@@ -290,11 +289,11 @@ def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, flo
     unstated: list[str] = []
     if found is not None:
         if kind in ("revolute", "prismatic") and ("lower" in found.attributes or "upper" in found.attributes):
-            lower, upper = _float(found, "lower", 0.0, place), _float(found, "upper", 0.0, place)
+            lower, upper = _number(found, "lower", 0.0, place), _number(found, "upper", 0.0, place)
             if not lower < upper:
                 found_limits = f"lower limit {lower:g} is not below the upper {upper:g}"
                 refuse_robot(place, f"{found_limits}; correct them, or make the joint fixed or continuous")
-        velocity, effort = _float(found, "velocity", np.inf, place), _float(found, "effort", np.inf, place)
+        velocity, effort = _number(found, "velocity", np.inf, place), _number(found, "effort", np.inf, place)
         sizes = {"velocity": velocity, "effort": effort}
         unstated = [f"{what} {size:g}" for what, size in sizes.items() if size < MIN_LIMIT]
     lower, upper = lower if lower > -UNLIMITED else -np.inf, upper if upper < UNLIMITED else np.inf
@@ -309,42 +308,31 @@ def _body(node: Node, where: str) -> np.ndarray | None:
     if inertial is None:
         return None
     mass_node, inertia_node = inertial.first("mass"), inertial.first("inertia")
-    mass = 0.0 if mass_node is None else _float(mass_node, "value", 0.0, place)
+    mass = 0.0 if mass_node is None else _number(mass_node, "value", 0.0, place)
     moments = [0.0] * 6
     if inertia_node is not None:
-        moments = [_float(inertia_node, key, 0.0, place) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
+        moments = [_number(inertia_node, key, 0.0, place) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
     if mass == 0.0 and not any(moments):
         return None
     return transform_body(np.array([*moments, 0.0, 0.0, 0.0, mass]), origin(inertial, place))
 
 
-def _floats(node: Node, key: str, default: str, place: str) -> np.ndarray:
-    words = node.attributes.get(key, default).split()
+def numbers(node: Node, key: str, place: str, default: str = "", count: int = 3, infinite: bool = False) -> np.ndarray:
+    """Return the numbers (count,) of an attribute, finite unless they may be `infinite`; `default` where absent."""
+    found = node.attributes.get(key)
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([float(word) for word in (default if found is None else found).split()])
     except ValueError:
-        values = np.full(1, np.nan)
-    if len(values) != 3 or not np.isfinite(values).all():
-        found = node.attributes.get(key)
-        what = f'{key}="{found}" of <{node.tag}> in line {node.line}'
-        refuse_robot(place, f"{what} is not three finite numbers{_expand(found)}")
+        values = np.empty(0)
+    if len(values) != count or np.isnan(values).any() or not (infinite or np.isfinite(values).all()):
+        expected = "a number" if count == 1 else f"{count} finite numbers"
+        hint = f"; this is a xacro file, {XACRO}" if found and "${" in found else ""
+        refuse_robot(place, f'{key}="{found}" of <{node.tag}> in line {node.line} is not {expected}{hint}')
     return values
 
 
-def _float(node: Node, key: str, default: float, place: str) -> float:
-    found = node.attributes.get(key)
-    try:
-        value = default if found is None else float(found)
-    except ValueError:
-        value = np.nan
-    if np.isnan(value):
-        what = f'{key}="{found}" of <{node.tag}> in line {node.line}'
-        refuse_robot(place, f"{what} is not a number{_expand(found)}")
-    return value
-
-
-def _expand(found: str | None) -> str:
-    return f"; this is a xacro file, {XACRO}" if found and "${" in found else ""
+def _number(node: Node, key: str, default: float, place: str) -> float:
+    return float(numbers(node, key, place, str(default), 1, infinite=True)[0])
 
 
 def _check_loops(tree: UrdfTree) -> None:

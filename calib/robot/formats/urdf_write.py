@@ -11,9 +11,11 @@ L_k(q) the frame of the URDF link behind its k-th moving joint, both in the base
 Conventions (ours): the base link stays where the nominal chain has its base, so the first joint's origin takes what the
 chain says about the base; the fixed joints behind the last moving one stay as they are unless the calibrated chain has
 other elements there (owner n), which the first fixed joint towards the tip then takes up.
+
+`put` writes masses and friction into the text of a URDF; all else stays, byte for byte.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -23,12 +25,90 @@ from scipy.spatial.transform import Rotation
 from calib import files
 from calib.errors import RobotError, refuse_robot
 from calib.robot.chain import AXES, Chain, Element, Joint, random_joints
-from calib.robot.formats.markup import edited, insert_child, set_attributes, text
+from calib.robot.formats.markup import Node, edited, insert_child, parse, set_attributes, text
 from calib.robot.formats.urdf import drive, ends
 from calib.robot.formats.urdf_tree import UNLIMITED, JointTag, UrdfTree
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.kinematics import forward
+from calib.robot.kinematics import forward, moving_frames
 from calib.transforms import invert, pose, to_xyz_rpy
+
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+ZERO = "0 0 0"
+
+
+def put(
+    source: str, where: str, bodies: Mapping[str, np.ndarray], friction: Mapping[str, tuple[float, float]] | None = None
+) -> str:
+    """Return the text with new inertials of some links and new ``<dynamics>`` of some joints.
+
+    Args:
+        source: the text of a URDF.
+        where: names it in messages.
+        bodies: link name to standard parameters (10,) about the link's frame; all zero for none.
+        friction: joint name to damping [N m s/rad or N s/m] and friction [N m or N].
+    """
+    root, changes = parse(source, where), []
+    for link in root.all("link"):
+        if (body := bodies.get(link.attributes.get("name", ""))) is not None:
+            changes += _inertial(source, link, body)
+    for joint in root.all("joint"):
+        if (pair := (friction or {}).get(joint.attributes.get("name", ""))) is not None:
+            values = {"damping": repr(float(pair[0])), "friction": repr(float(pair[1]))}
+            changes += _child(source, joint, "dynamics", values)
+    return edited(source, changes)
+
+
+def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return what moves with a link of a path: links fixed to it, and links on other joints that stand at zero.
+
+    Each by name with its pose (4, 4) in the frame of `link`, which is among the first.
+    """
+    onward = {joint.name for joint in path}
+    fixed = dict(tree.rigid(link))
+    loose: dict[str, np.ndarray] = {}
+    todo = [(name, placed) for name, placed in fixed.items()]
+    while todo:
+        name, placed = todo.pop()
+        for joint in tree.below[name]:
+            if joint.name in onward or joint.child in fixed:
+                continue
+            loose[joint.child] = placed @ joint.origin
+            todo.append((joint.child, loose[joint.child]))
+    return fixed, loose
+
+
+def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass (3,) and the six moments about it of standard parameters (10,)."""
+    mass = float(body[9])
+    x, y, z = centre = body[6:9] / mass if mass else np.zeros(3)
+    steiner = mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
+    return mass, centre, body[:6] - steiner
+
+
+def _inertial(source: str, link: Node, body: np.ndarray) -> list[tuple[int, int, str]]:
+    mass, centre, moments = centred(body)
+    place = {"xyz": " ".join(repr(float(x)) for x in centre), "rpy": ZERO}
+    values: dict[str, str] = {name: repr(float(x)) for name, x in zip(MOMENTS, moments)}
+    node = link.first("inertial")
+    if node is None:
+        parts = "".join(
+            f"<{tag} " + " ".join(f'{key}="{value}"' for key, value in content.items()) + "/>"
+            for tag, content in (("origin", place), ("mass", {"value": repr(mass)}), ("inertia", values))
+        )
+        return insert_child(source, link, f"<inertial>{parts}</inertial>")
+    changes = []
+    for tag, content in (("origin", place), ("mass", {"value": repr(mass)}), ("inertia", values)):
+        changes += _child(source, node, tag, content)
+    return changes
+
+
+def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tuple[int, int, str]]:
+    """Return the changes that give a node's first child of this tag these attributes; the child is made if need be."""
+    found = node.first(tag)
+    if found is not None:
+        return set_attributes(source, found, values)
+    return insert_child(source, node, f"<{tag} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>")
+
 
 UNCHANGED = 1e-12
 
@@ -109,19 +189,6 @@ def write_new(chain: Chain) -> str:
     return "\n".join([*lines, "</robot>"]) + "\n"
 
 
-def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames behind every moving element, followers included: (moving, m, 4, 4)."""
-    frame, frames = np.eye(4), []
-    for element in chain.elements:
-        if element.placement is not None:
-            frame = frame @ element.placement
-        amount = element.value if element.joint is None else element.value + element.ratio * q[:, element.joint]
-        frame = frame @ _motion(element, amount)
-        if element.joint is not None:
-            frames.append(frame)
-    return np.array(frames)
-
-
 def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames of the links behind the moving joints of a path, (moving, m, 4, 4), in the path's first link.
 
@@ -181,16 +248,14 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
         behind = [joint.name for joint in path]
         path = path[behind.index(names[0]) :] if names[0] in behind else path
     found = tuple(joint.name for joint in path if joint.actuated)
-    moving = sum(element.joint is not None for element in nominal.elements)
-    if len(found) != nominal.n or (named and found != names) or sum(joint.moves for joint in path) != moving:
+    moving = [joint for joint in path if joint.moves]
+    if len(found) != nominal.n or (named and found != names) or len(moving) != len(nominal.driven):
         refuse_robot(
             tree.where,
             f"its joints to '{tip}' are {', '.join(found)}; the nominal robot '{nominal.name}' has "
             f"{', '.join(names)}: not the same arm",
         )
-    while not path[0].moves:
-        path = path[1:]
-    return path
+    return path[path.index(moving[0]) :]
 
 
 def _base_offset(
@@ -332,19 +397,13 @@ def _link_lines(name: str, body: np.ndarray | None) -> list[str]:
     """Return one <link>, with its inertia about the centre of mass where it is known."""
     if body is None or not body.any():
         return [f"  <link name={quoteattr(name)}/>"]
-    mass = body[9]
-    centre = body[6:9] / mass if mass else np.zeros(3)
-    x, y, z = centre
-    steiner = mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
-    moments = " ".join(
-        f'{key}="{value!r}"'
-        for key, value in zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), (body[:6] - steiner).tolist(), strict=True)
-    )
+    mass, centre, about = centred(body)
+    moments = " ".join(f'{key}="{value!r}"' for key, value in zip(MOMENTS, about.tolist(), strict=True))
     return [
         f"  <link name={quoteattr(name)}>",
         "    <inertial>",
         f'      <origin xyz="{_numbers(centre)}" rpy="0 0 0"/>',
-        f'      <mass value="{float(mass)!r}"/>',
+        f'      <mass value="{mass!r}"/>',
         f"      <inertia {moments}/>",
         "    </inertial>",
         "  </link>",

@@ -23,8 +23,8 @@ from calib.errors import CannotSimulate
 from calib.geometry.images.optics import BoardShape, Optics, shaped_points
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal, reach, seen_at
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, random_joints
-from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.transforms import invert, pose

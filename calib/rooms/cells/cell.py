@@ -18,8 +18,8 @@ from calib.arrays import shaped
 from calib.data.poses.measurements import Poses, Positions
 from calib.dynamics.gravity import gravity_torques
 from calib.geometry.installation import Installation, see
+from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain
-from calib.robot.deflection import evaluate
 from calib.rooms.cells.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 

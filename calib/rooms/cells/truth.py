@@ -15,8 +15,8 @@ from calib.estimate_files import StoredEstimate
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
+from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain, random_joints
-from calib.robot.deflection import evaluate
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.rooms.cells.unmodelled import WARM_TIME
 from calib.rooms.cells.virtual_arm import MovingArm

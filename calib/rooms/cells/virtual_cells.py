@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.installation import Installation
+from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection, Term
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.rooms.cells import lwr4plus

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import USABLE
-from calib.data.signals.decimation import design_decimator
+from calib.data.signals.filtering import design_decimator
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives

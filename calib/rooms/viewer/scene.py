@@ -25,9 +25,9 @@ from calib.procedure.measuring.run import is_run, rehearsed_samples
 from calib.records import shielded
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
+from calib.robot.collision import Visual, visuals
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.load import load, resolve
-from calib.robot.visuals import Visual, visuals
 from calib.transforms import invert
 
 FRAMES = 50.0  # positions of the arm per second of motion; our choice
@@ -261,7 +261,7 @@ def _groups(rows: list[dict[str, str]], cell: Installation) -> list[tuple[int, i
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
     """Return the tool's positions (m, 3) in the station's frame, by the arm without its deflections' torques."""
-    from calib.robot.deflection import evaluate
+    from calib.robot.calibrated import evaluate
 
     terms = cell.deflection.terms
     torque = None

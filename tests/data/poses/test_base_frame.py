@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.base_frame import relative_to_base
 from calib.data.poses.measurements import Poses
-from calib.data.poses.pose_files import read_measurements
+from calib.data.poses.pose_files import read_measurements, relative_to_base
 from calib.errors import MeasurementError
 from calib.transforms import from_quaternion, invert, to_quaternion
 

@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from calib.data.signals.decimation import (
+from calib.data.signals.filtering import (
     KINDS,
+    border,
+    curvature,
     decimate,
     decimate_blocks,
     decimate_regressor,
     design_decimator,
     factor_for,
+    hann,
     kept,
+    low_pass,
+    moving_cubics,
+    slope,
 )
-from calib.data.signals.filtering import border, curvature, hann, low_pass, moving_cubics, slope
 from calib.data.signals.persistency import count_peaks
 from calib.errors import CalibError, MeasurementError
 

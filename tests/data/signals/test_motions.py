@@ -10,7 +10,7 @@ import pytest
 from calib.data.recordings.clock import find_clock
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import propose_cutoffs, spectrum
-from calib.data.signals.decimation import decimate, decimate_regressor
+from calib.data.signals.filtering import decimate, decimate_regressor
 from calib.data.signals.motion import FilterOptions, make_motion, moving, thin
 from calib.data.signals.persistency import repeats, report_excitation
 from calib.data.signals.resampling import resample

@@ -9,7 +9,7 @@ import planted_motion as planted
 import pytest
 
 from calib.data.recordings.recording import Recording
-from calib.data.signals.decimation import decimate
+from calib.data.signals.filtering import decimate
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.torque_rows import POWER
 from calib.errors import NotConverged, UsageError

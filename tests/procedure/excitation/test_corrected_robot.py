@@ -11,8 +11,7 @@ from calib.procedure.excitation import planning
 from calib.procedure.excitation.inputs import read_inputs
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot import calibrated
-from calib.robot.calibrated import CalibratedChain, CorrectedChain
-from calib.robot.deflection import Deflection, Term
+from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, Term
 from calib.robot.load import load, resolve
 
 

@@ -12,8 +12,7 @@ import yaml
 
 from calib import export
 from calib.procedure.export.geometry import export_offsets
-from calib.robot.calibrated import CalibratedChain, CorrectedChain
-from calib.robot.deflection import Deflection, Term
+from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, Term
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward

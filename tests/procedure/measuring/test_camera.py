@@ -23,7 +23,7 @@ from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.session.commands import begin, go_on
 from calib.procedure.session.folder import open_session
-from calib.robot.deflection import Deflection
+from calib.robot.calibrated import Deflection
 from calib.robot.load import load
 from calib.rooms.camera.boards import make
 from calib.rooms.camera.corner_file import Detection, Found

@@ -14,10 +14,10 @@ import pytest
 from calib import cli
 from calib.errors import UsageError
 from calib.geometry import installation_file
+from calib.robot.collision import visuals
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.robot.visuals import visuals
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.viewer import scene as viewing

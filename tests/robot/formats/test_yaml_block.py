@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from calib.robot.formats.yaml_block import block
+from calib.robot.formats.origin_files import block
 
 yaml = pytest.importorskip("yaml")
 

@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator, kept
-from calib.data.signals.filtering import curvature, low_pass, slope
+from calib.data.signals.filtering import Decimator, curvature, kept, low_pass, slope
 from calib.data.signals.motion import Motion
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import Diverged, NotConverged, UsageError

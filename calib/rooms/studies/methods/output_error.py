@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg
 
-from calib.data.signals.decimation import decimate
+from calib.data.signals.filtering import decimate
 from calib.errors import CalibError, NotConverged, UsageError
 from calib.estimation import nonlinear
 from calib.estimation.correlated import scatter
