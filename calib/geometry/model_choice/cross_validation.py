@@ -28,6 +28,30 @@ from calib.robot.chain import Chain
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
+def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
+    """Return the ridge each term shares (E,): all harmonics of one joint on one element, all else stands alone.
+
+    With a ridge for each order the evidence switches most of them off and takes the rest too large, which rows nearby
+    do not show and rows elsewhere do; `term_sizes` says how they fall with their order.
+    """
+    keys: dict[tuple, int] = {}
+    result = []
+    for term in terms:
+        paired = term.basis in ("cos", "sin")
+        key = (term.element, "turn" if paired else term.basis, term.source, 0 if paired else term.order)
+        result.append(keys.setdefault(key, len(keys)))
+    return np.array(result, dtype=int)
+
+
+def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
+    """Return the first guess of each coefficient's size (E,); those of harmonics fall with their order.
+
+    Our choice, of one size for all orders, a fall with the root and one with the order itself: regions left out of a
+    UR5 and of a Motoman are predicted best by the last.
+    """
+    return np.array([1e-4 / term.order if term.basis in ("cos", "sin") else 1e-4 for term in terms])
+
+
 @dataclass(frozen=True, eq=False)
 class UnseenErrors:
     """Errors on held-out rows.
@@ -128,8 +152,6 @@ def fold_statistics(
     found: GeometricFit,
     measured: Sequence[PoseMeasurements],
     terms: tuple[Term, ...],
-    groups: np.ndarray,
-    sizes: np.ndarray,
     reference: Chain,
     folds: Folds,
     torques: Sequence[np.ndarray | None] | None = None,
@@ -140,40 +162,31 @@ def fold_statistics(
         found: the model, fitted to all rows.
         measured: the blocks it was fitted to.
         terms: E deflection terms on offer.
-        groups, sizes: (E,) see `calib.geometry.model_choice.ladder`.
         reference: chain on which the terms' bases are evaluated.
         folds: partition of the rows.
         torques: gravity torques per block.
     """
     cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
     free = np.concatenate([found.free, layout(cell).term_index])
-    scales, weights = found.used_sigmas(), found.row_weights()
-    noises = found.used_noises()
-    rigid = len(found.free)
-    each: list[Gram] = []
-    held_out, rows = [], []
+    rows_of = _Rows(cell, measured, free, found.used_sigmas(), found.row_weights(), found.used_noises(), torques)
+    rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
     pooled = all(block.has_instrument for block in measured)
+    each, held_out, rows = list[Gram](), list[Gram](), []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
-        seen = {block.station for block, rows in zip(measured, inside) if len(rows) < len(block)}
+        seen = {block.station for block, chosen in zip(measured, inside) if len(chosen) < len(block)}
         moved = [block.has_instrument and block.station not in seen for block in measured]
-        metric, whitened, count = _statistics(cell, measured, inside, free, scales, weights, noises, torques, moved)
+        metric, whitened, count = rows_of.statistics(inside, moved)
         held_out.append(metric)
         rows.append(count)
         if not pooled:
-            outside = [np.flatnonzero(members != fold) for members in folds.members]
-            whitened = _statistics(cell, measured, outside, free, scales, weights, noises, torques)[1]
+            whitened = rows_of.statistics([np.flatnonzero(members != fold) for members in folds.members])[1]
         each.append(whitened)
-    if pooled:
-        total = sum(each[1:], each[0])
-    else:
-        every = [np.arange(len(b)) for b in measured]
-        total = _statistics(cell, measured, every, free, scales, weights, noises, torques)[1]
+    total = sum(each[1:], each[0]) if pooled else rows_of.statistics([np.arange(len(b)) for b in measured])[1]
     families = np.concatenate([np.full(rigid, -1), groups]).astype(int)
     coordinates = condensed(total.square, families, np.concatenate([np.ones(rigid), sizes]))
-    total, each, held_out = (
-        coordinates.gram(total), [coordinates.gram(own) for own in each], [coordinates.gram(own) for own in held_out],
-    )  # fmt: skip
+    total, *each = (coordinates.gram(own) for own in (total, *each))
+    held_out = [coordinates.gram(own) for own in held_out]
     training = [total - own for own in each] if pooled else each
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
@@ -204,11 +217,12 @@ def blind_folds(
         sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
     frame_sigma = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
     known = np.where(free >= table.arm, frame_sigma, plausible_deviation(nominal.cell, free))
-    weights = nominal.row_weights()
-    each, squares, none, moved = [], [], [None] * len(measured), [True] * len(measured)
+    none = [None] * len(measured)
+    rows = _Rows(nominal.cell, measured, free, sigmas, nominal.row_weights(), none, torques)
+    each, squares = [], []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
-        held, own, count = _statistics(nominal.cell, measured, inside, free, sigmas, weights, none, torques, moved)
+        held, own, count = rows.statistics(inside, [True] * len(measured))
         each.append(own)
         squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
     total = sum(each[1:], each[0])
@@ -223,59 +237,57 @@ def blind_folds(
     return result
 
 
-def _statistics(
-    cell: Installation,
-    measured: Sequence[PoseMeasurements],
-    chosen: Sequence[np.ndarray],
-    free: np.ndarray,
-    scales: Sequence[dict[str, float]],
-    weights: Sequence[np.ndarray],
-    noises: Sequence[ImageNoise | None],
-    torques: Sequence[np.ndarray | None] | None,
-    moved: Sequence[bool] | None = None,
-) -> tuple[Gram, Gram, float]:
-    """Return the statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows.
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Measured blocks, and how their rows are weighed: rms sigma by label, robust weights, noise of images."""
 
-    Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
-    """
-    p = len(free)
-    metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
-    count = 0.0
-    chunk = 1000  # poses observed at once
-    for number, (block, rows) in enumerate(zip(measured, chosen)):
-        frames: list[tuple[np.ndarray, np.ndarray]] = []
-        pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
-        for piece in pieces:
-            if len(piece) == 0:
-                continue
-            torque = None if torques is None else torques[number]
-            part_block = take(block, piece)
-            ready = prepare(cell, [part_block], [None if torque is None else torque[piece]])
-            for part in observe(cell, ready[0], free):
-                weight = weights[number][piece][part.index]
-                if isinstance(part, PixelPart) and (noise := noises[number]) is not None:
-                    part = replace(part, noise=replace(noise, weight=np.ones(len(piece))))
-                root = 1.0 / np.sqrt(weight)
-                own = gram(*part.whitened(root * scales[number][part.label]))
-                whitened = whitened + replace(own, rows=part.value.size)
-                if part.label in METRES:
-                    bare = replace(part, noise=None) if isinstance(part, PixelPart) else part
-                    residual, matrix = bare.whitened(root * part.per_length)
-                    count += float(weight.sum())
-                    if moved is not None and moved[number]:
-                        frames.append((residual, matrix))
-                    else:
-                        metric = metric + gram(residual, matrix)
-        if frames:
-            metric = metric + _replaced(cell, frames, free)
-    return metric, whitened, count
+    cell: Installation
+    measured: Sequence[PoseMeasurements]
+    free: np.ndarray
+    scales: Sequence[dict[str, float]]
+    weights: Sequence[np.ndarray]
+    noises: Sequence[ImageNoise | None]
+    torques: Sequence[np.ndarray | None] | None
+
+    def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
+        """Return statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows.
+
+        Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
+        """
+        p, count = len(self.free), 0.0
+        metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
+        station = np.flatnonzero(np.isin(self.free, layout(self.cell).station_index))
+        chunk = 1000  # poses observed at once
+        for number, (block, rows) in enumerate(zip(self.measured, chosen)):
+            frames: list[np.ndarray] = []
+            torque = None if self.torques is None else self.torques[number]
+            pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
+            for piece in filter(len, pieces):
+                ready = prepare(self.cell, [take(block, piece)], [None if torque is None else torque[piece]])
+                for part in observe(self.cell, ready[0], self.free):
+                    weight = self.weights[number][piece][part.index]
+                    if isinstance(part, PixelPart) and (noise := self.noises[number]) is not None:
+                        part = replace(part, noise=replace(noise, weight=np.ones(len(piece))))
+                    root = 1.0 / np.sqrt(weight)
+                    own = gram(*part.whitened(root * self.scales[number][part.label]))
+                    whitened = whitened + replace(own, rows=part.value.size)
+                    if part.label in METRES:
+                        bare = replace(part, noise=None) if isinstance(part, PixelPart) else part
+                        residual, matrix = bare.whitened(root * part.per_length)
+                        count += float(weight.sum())
+                        if moved is not None and moved[number]:
+                            frames.append(np.vstack([matrix.T, residual]))
+                        else:
+                            metric = metric + gram(residual, matrix)
+            if frames:
+                columns = project_out(np.concatenate(frames, axis=1), station)
+                metric = metric + gram(columns[-1], columns[:-1].T)
+        return metric, whitened, count
 
 
-def _replaced(cell: Installation, frames: list[tuple[np.ndarray, np.ndarray]], free: np.ndarray) -> Gram:
-    """Return the statistics of one block with its station's placement projected out."""
-    residual = np.concatenate([r for r, _ in frames])
-    matrix = np.concatenate([w for _, w in frames])
-    station = np.flatnonzero(np.isin(free, layout(cell).station_index))
-    q, _ = np.linalg.qr(matrix[:, station])
-    residual = residual - q @ (q.T @ residual)
-    return gram(residual, matrix - q @ (q.T @ matrix))
+def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return columns (f, ...) with those at `frames` projected out: rows on which these placements are fitted anew."""
+    flat = columns.reshape(len(columns), -1)
+    basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+    return (flat - (flat @ basis) @ basis.T).reshape(columns.shape)

@@ -59,55 +59,27 @@ def _coupling(chain: Chain, known: bool) -> list[Term]:
 
 def _harmonics(chain: Chain, known: bool, max_order: int = 60) -> list[Term]:
     """Return sin and cos of k q_j on each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
-    return [
-        Term(chain.names[k], basis, j, order)
-        for j, k in enumerate(chain.moving)
-        if chain.joints[j].kind == "revolute"
-        for order in range(1, max_order + 1)
-        for basis in ("cos", "sin")
-    ]
+    return _turning(chain, [(chain.names[k], j) for j, k in enumerate(chain.moving)], max_order)
 
 
 def _wobble(chain: Chain, known: bool, max_order: int = 2) -> list[Term]:
     """Return low harmonics of q_j on every other element of joint j: its axis wobbles as it turns."""
     moving = set(chain.moving.tolist())
-    return [
-        Term(element.name, basis, element.owner, order)
-        for k, element in enumerate(chain.elements)
-        if k not in moving and element.owner < chain.n and chain.joints[element.owner].kind == "revolute"
-        for order in range(1, max_order + 1)
-        for basis in ("cos", "sin")
-    ]
+    places = [(e.name, e.owner) for k, e in enumerate(chain.elements) if k not in moving and e.owner < chain.n]
+    return _turning(chain, places, max_order)
+
+
+def _turning(chain: Chain, places: list[tuple[str, int]], max_order: int) -> list[Term]:
+    """Return harmonics on elements, each with the joint that turns it; none of a prismatic joint."""
+    revolute = [(name, j) for name, j in places if chain.joints[j].kind == "revolute"]
+    orders = range(1, max_order + 1)
+    return [Term(name, basis, j, order) for name, j in revolute for order in orders for basis in ("cos", "sin")]
 
 
 MODELS = CHOICES[1:]
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
 # by name: from a chain, and whether gravity torques are known, to terms
 EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
-
-
-def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
-    """Return the ridge each term shares (E,): all harmonics of one joint on one element, all else stands alone.
-
-    With a ridge for each order the evidence switches most of them off and takes the rest too large, which rows nearby
-    do not show and rows elsewhere do; `term_sizes` says how they fall with their order.
-    """
-    keys: dict[tuple, int] = {}
-    result = []
-    for term in terms:
-        paired = term.basis in ("cos", "sin")
-        key = (term.element, "turn" if paired else term.basis, term.source, 0 if paired else term.order)
-        result.append(keys.setdefault(key, len(keys)))
-    return np.array(result, dtype=int)
-
-
-def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
-    """Return the first guess of each coefficient's size (E,); those of harmonics fall with their order.
-
-    Our choice, of one size for all orders, a fall with the root and one with the order itself: regions left out of a
-    UR5 and of a Motoman are predicted best by the last.
-    """
-    return np.array([1e-4 / term.order if term.basis in ("cos", "sin") else 1e-4 for term in terms])
 
 
 MIN_GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
@@ -213,77 +185,72 @@ def select_model(
         UsageError: for a model that does not exist.
     """
     one_of(model, ("auto", *MODELS), "model", UsageError)
-    tell = progress or (lambda done, total, what: None)
-    folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
-    climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell, seed)
+    climber = _Climber(
+        cell, measured, settings or Settings(), torques, np.array([], dtype=int) if fixed is None else fixed, prior,
+        folds or transfer_folds(measured, seed), progress or (lambda done, total, what: None), seed,
+    )  # fmt: skip
     climber.rigid(model)
-    if settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
-        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell, seed)
+    if climber.settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
+        climber = replace(climber, settings=replace(climber.settings, loss="cauchy"))
         climber.rigid(model)
     if model == "auto" or model in EFFECTS:
         climber.effects(model)
     return climber.result()
 
 
+@dataclass
 class _Climber:
-    """The state of one climb: what is kept so far and the rungs tried."""
+    """The state of one climb: what is kept so far and the rungs tried; for its fields see `select_model`."""
 
-    def __init__(
-        self,
-        cell: Installation,
-        measured: Sequence[PoseMeasurements],
-        settings: Settings,
-        torques: Sequence[np.ndarray | None] | None,
-        fixed: np.ndarray | None,
-        prior: np.ndarray | None,
-        folds: Folds,
-        tell: Progress,
-        seed: int = 0,
-    ):
-        self.measured, self.settings, self.torques, self.folds, self.tell = measured, settings, torques, folds, tell
-        self.fixed, self.prior = np.array([], dtype=int) if fixed is None else fixed, prior
-        tell(0, len(MODELS), "frames")
-        self.nominal = polish_frames(cell, measured, settings, torques)
-        self.best, self.rungs, self.chosen = self.nominal, [], "frames"
-        self.stiff = self.nominal
-        if folds.kind == "stations" and not folds.blind and all(isinstance(block, Positions) for block in measured):
+    cell: Installation
+    measured: Sequence[PoseMeasurements]
+    settings: Settings
+    torques: Sequence[np.ndarray | None] | None
+    fixed: np.ndarray
+    prior: np.ndarray | None
+    asked: Folds
+    progress: Progress
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.steps, self.folds = -1, self.asked
+        self._tick("frames")
+        self.nominal = self.best = self.stiff = polish_frames(self.cell, self.measured, self.settings, self.torques)
+        self.rungs: list[ModelStep] = []
+        self.chosen, self.offered = "frames", tuple[Term, ...]()
+        positions = all(isinstance(block, Positions) for block in self.measured)
+        if self.folds.kind == "stations" and not self.folds.blind and positions:
             for scattered in (False, True):
-                blind = blind_folds(self.nominal, measured, self.folds, torques)
+                blind = blind_folds(self.nominal, self.measured, self.folds, self.torques)
                 if not blind.any():
                     break
-                self.folds = divide(self.folds, blind, measured, seed, scattered)
-        self.steps = 0
-        self.offered: tuple[Term, ...] = ()
-        self.drawn = not all(block.has_instrument for block in measured)
+                self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
 
     def rigid(self, model: str) -> None:
         """Try frames, joint offsets and the full geometry."""
-        table = layout(self.nominal.cell)
-        chain = self.nominal.cell.chain
+        cell, table = self.nominal.cell, layout(self.nominal.cell)
         choices = {
             "frames": table.frame_index,
-            "offsets": np.concatenate([chain.driven, table.frame_index]),
+            "offsets": np.concatenate([cell.chain.driven, table.frame_index]),
             "geometry": np.concatenate([table.arm_index, table.frame_index]),
         }
-        error = np.inf
-        last = model if model in choices else "geometry"
+        drawn = not all(block.has_instrument for block in self.measured)
+        error, last = np.inf, model if model in choices else "geometry"
         for name, candidates in choices.items():
             self._tick(name)
-            candidates = np.setdiff1d(candidates, self.fixed)
             found = self.nominal if name == "frames" else fit(
-                self.nominal.cell, self.measured, candidates, settings=self.settings, torques=self.torques,
-                drawn=self.drawn, prior=self.prior,
+                cell, self.measured, np.setdiff1d(candidates, self.fixed), settings=self.settings,
+                torques=self.torques, drawn=drawn, prior=self.prior,
             )  # fmt: skip
             unseen = self._statistics(found, ()).error_rigid()
             better = unseen < error * (1.0 - MIN_GAIN)
-            wanted = better if model == "auto" else name == last
-            self.rungs.append(
-                ModelStep(name, len(found.free), 1e3 * unseen, wanted, "" if better else "no better on unseen rows")
-            )
+            kept = better if model == "auto" else name == last
+            note = "" if better else "no better on unseen rows"
+            self.rungs.append(ModelStep(name, len(found.free), 1e3 * unseen, kept, note))
             self.full = found if name == "geometry" else None
-            if wanted:
+            if kept:
                 self.best, self.chosen, error = found, name, unseen
-            elif model != "auto" and name != last:
+            elif model != "auto":
                 error = min(error, unseen)
             if name == last:
                 break
@@ -298,62 +265,60 @@ class _Climber:
         if self.full is None or (model != "auto" and self.chosen != "geometry"):
             return
         offered = {name: self._terms(name) for name in EFFECTS}
-        everything = tuple(term for terms in offered.values() for term in terms)
+        every = tuple(term for terms in offered.values() for term in terms)
         self._tick("observation matrix")
-        statistics = self._statistics(self.full, everything)
-        place = _places(offered)
-        before = self.chosen, self.best, tuple(self.rungs)
-        names = list(EFFECTS)
+        statistics = self._statistics(self.full, every)
+        edges = np.cumsum([0, *map(len, offered.values())])
+        place = {name: np.arange(*edges[k : k + 2]) for k, name in enumerate(offered)}
+        rigid, names = tuple(self.rungs), list(EFFECTS)
         if model == "auto":
-            climbed = len(self.rungs)
-            kept = self._greedy(statistics, offered, place)
+            kept = self._greedy(statistics, {name: place[name] for name in names if offered[name]})
             if kept and self.chosen != "geometry":
-                kept = self._both(kept, climbed)
+                kept = self._both(kept, len(rigid))
         else:
             kept = names[: names.index(model) + 1]
             where = np.concatenate([place[name] for name in kept])
             self._tick(model)
-            self.rungs.append(self._rung(statistics, f"+ {model}", where, True, ""))
-        if kept:
-            self._tick("final fit")
-            self.offered = tuple(term for name in kept for term in offered[name])
-            self.best = self.full
-            self.best = self._final(
-                statistics, [term for name in kept for term in offered[name]], [place[n] for n in kept]
-            )
-            self.chosen = " + ".join(["geometry", *kept])
-            last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
-            self.rungs[last] = replace(
-                self.rungs[last], parameters=len(self.best.free), corrections=len(self.best.cell.deflection.terms)
-            )
-            if model == "auto" and not (status := self.best.solution.status).good and before[1].solution.status.good:
-                note = f"did not converge ({status.name.lower()}): left out"
-                tried = [replace(rung, kept=False, note=note) for rung in self.rungs[len(before[2]) :]]
-                (self.chosen, self.best, rigid), self.offered = before, ()
-                self.rungs = [*rigid, *tried]
+            self.rungs.append(_rung(statistics, model, where, statistics.error(where).rms))
+        if not kept:
+            return
+        self._tick("final fit")
+        where = np.concatenate([place[name] for name in kept])
+        found = self._final(self.full, statistics, every, where)
+        status = found.solution.status
+        if model == "auto" and not status.good and self.best.solution.status.good:
+            note = f"did not converge ({status.name.lower()}): left out"
+            self.rungs = [*rigid, *(replace(rung, kept=False, note=note) for rung in self.rungs[len(rigid) :])]
+            return
+        self.best, self.chosen, self.offered = found, " + ".join(["geometry", *kept]), tuple(every[k] for k in where)
+        last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
+        corrections = len(found.cell.deflection.terms)
+        self.rungs[last] = replace(self.rungs[last], parameters=len(found.free), corrections=corrections)
 
-    def _greedy(
-        self, statistics: FoldStatistics, offered: dict[str, list[Term]], place: dict[str, np.ndarray]
-    ) -> list[str]:
-        """Return the effects that pay on unseen rows, in the order they were taken up: each time the best one."""
+    def _greedy(self, statistics: FoldStatistics, place: dict[str, np.ndarray]) -> list[str]:
+        """Return the effects that pay on unseen rows, in the order they were taken up: each time the best one.
+
+        Args:
+            place: where the terms of each effect stand among those of the statistics.
+        """
         kept: list[str] = []
-        error = statistics.error(np.array([], dtype=int))
-        waiting = [name for name in offered if offered[name]]
-        while waiting:
+        none = np.array([], dtype=int)
+        error = statistics.error(none)
+        while waiting := [name for name in place if name not in kept]:
             tried = {}
+            where = {name: np.concatenate([place[other] for other in [*kept, name]]) for name in waiting}
             for name in waiting:
                 self._tick(name)
-                tried[name] = statistics.error(np.concatenate([place[other] for other in [*kept, name]]))
+                tried[name] = statistics.error(where[name])
             best = min(waiting, key=lambda name: tried[name].rms)
             pays = tried[best].rms < error.rms * (1.0 - MIN_GAIN) and tried[best].wins(error)
-            for name in waiting if not pays else [best]:
-                note = "" if name == best and pays else "no better on unseen rows: left out"
-                where = np.concatenate([place[other] for other in [*kept, name]])
-                self.rungs.append(self._rung(statistics, f"+ {name}", where, not note, note, tried[name].rms))
+            note = "" if pays else "no better on unseen rows: left out"
+            self.rungs += [
+                _rung(statistics, name, where[name], tried[name].rms, note) for name in ([best] if pays else waiting)
+            ]
             if not pays:
                 break
             kept.append(best)
-            waiting.remove(best)
             error = tried[best]
         return kept
 
@@ -366,33 +331,24 @@ class _Climber:
         """
         pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - MIN_GAIN)
         note = "pays together with what follows" if pays else "no better on unseen rows than without the geometry"
-        for k in range(climbed - 1, len(self.rungs)):
-            if k < climbed or not pays:
-                self.rungs[k] = replace(self.rungs[k], kept=pays, note=note)
+        for k in range(climbed - 1, climbed if pays else len(self.rungs)):
+            self.rungs[k] = replace(self.rungs[k], kept=pays, note=note)
         return kept if pays else []
 
-    def _rung(
-        self, statistics: FoldStatistics, name: str, where: np.ndarray, kept: bool, note: str, rms: float | None = None
-    ) -> ModelStep:
-        rms = statistics.error(where).rms if rms is None else rms
-        shrunk = statistics.alive(where)
-        return ModelStep(name, statistics.rigid + shrunk, 1e3 * rms, kept, note, shrunk)
-
-    def _final(self, statistics: FoldStatistics, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
+    def _final(
+        self, rigid: GeometricFit, statistics: FoldStatistics, terms: tuple[Term, ...], where: np.ndarray
+    ) -> GeometricFit:
         """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""
-        ridge = statistics.ridges(np.concatenate(places))
-        alive = np.flatnonzero(ridge > 0.0)
-        picked = tuple(terms[k] for k in alive)
-        cell = replace(
-            self.best.cell, deflection=Deflection(picked, np.zeros(len(picked)), self.nominal.cell.chain)
+        ridge, reference = statistics.ridges(where), self.nominal.cell.chain
+        picked = tuple(terms[k] for k in where[ridge > 0.0])
+        cell = replace(rigid.cell, deflection=Deflection(picked, np.zeros(len(picked)), reference))
+        free = np.concatenate([rigid.free, layout(cell).term_index])
+        own = np.full(len(rigid.free), np.inf) if rigid.prior is None else rigid.prior
+        found = fit_with_prior(
+            cell, prepare(cell, self.measured, self.torques), free, np.concatenate([own, ridge[ridge > 0.0]]),
+            settings=self.settings, nominal=replace(cell, chain=reference),
         )  # fmt: skip
-        free = np.concatenate([self.best.free, layout(cell).term_index])
-        own = np.full(len(self.best.free), np.inf) if self.best.prior is None else self.best.prior
-        prior = np.concatenate([own, ridge[alive]])
-        blocks = prepare(cell, self.measured, self.torques)
-        nominal = replace(cell, chain=self.nominal.cell.chain)
-        found = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
-        return replace(found, start=self.best.start, split=self.best.split, candidates=self.best.candidates)
+        return replace(found, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
     def _terms(self, effect: str, poses_per_order: int = 8) -> list[Term]:
         """Return an effect's terms, harmonics only up to what so many poses can identify.
@@ -405,31 +361,22 @@ class _Climber:
         return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
 
     def _statistics(self, found: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
-        return fold_statistics(
-            found, self.measured, terms, term_groups(terms), term_sizes(terms), self.nominal.cell.chain, self.folds,
-            self.torques,
-        )  # fmt: skip
+        return fold_statistics(found, self.measured, terms, self.nominal.cell.chain, self.folds, self.torques)
 
     def _tick(self, what: str) -> None:
         self.steps += 1
-        self.tell(self.steps, 2 * len(MODELS), what)
+        self.progress(self.steps, 2 * len(MODELS), what)
 
     def result(self) -> ModelSelection:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
+        known = self.nominal.cell.known.terms
         return ModelSelection(
-            self.best,
-            self.nominal,
-            self.stiff,
-            tuple(self.rungs),
-            self.chosen,
-            self.folds,
-            loss,
-            self.offered,
-            None if self.nominal.cell.known.terms else self.error,
-        )
+            self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss, self.offered,
+            None if known else self.error,
+        )  # fmt: skip
 
 
-def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:
-    """Return where each effect's terms stand among all of them."""
-    edges = np.cumsum([0, *(len(terms) for terms in offered.values())])
-    return {name: np.arange(edges[k], edges[k + 1]) for k, name in enumerate(offered)}
+def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:
+    """Return the step of an effect, with those before it, that leaves `rms` [m] on unseen rows; kept without a note."""
+    shrunk = statistics.alive(where)
+    return ModelStep(f"+ {effect}", statistics.rigid + shrunk, 1e3 * rms, not note, note, shrunk)

@@ -23,8 +23,9 @@ from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import SETTLED, Gram, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
+from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
-from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection, term_groups, term_sizes
+from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.left_out import LeftOut, Profile, unevenness
@@ -123,7 +124,7 @@ class ErrorModel:
         columns = np.concatenate([now.frame_index, where])
         jacobian = next(part.jacobian for part in observe(cell, ready, columns) if part.label == "position")
         frames = len(now.frame_index)
-        jacobian = _placed_anew(jacobian, np.arange(frames))[frames:]
+        jacobian = project_out(jacobian, np.arange(frames))[frames:]
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(stays, stays)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         spread = (root.T @ jacobian.reshape(len(root), 3 * len(block))).reshape(len(root), 3, len(block))
@@ -342,7 +343,7 @@ class _Rows:
                     continue
                 value, jacobian = (each[..., rows] for each in self.metric[number])
                 if self.measured[number].station not in stays:
-                    both = _placed_anew(np.concatenate([jacobian, value[None]]), self.station)
+                    both = project_out(np.concatenate([jacobian, value[None]]), self.station)
                     jacobian, value = both[:-1], both[-1]
                 error = value - np.einsum("f,fim->im", found.values, jacobian)
                 own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
@@ -350,11 +351,3 @@ class _Rows:
                 size, pose = np.sum(error**2, axis=0), self.pose[number][rows]
                 result = np.stack([size, own.reshape(3, -1).sum(axis=0), *near, pose], axis=1)
                 yield result[self.counts[number][rows]]
-
-
-def _placed_anew(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return columns (f, 3, m) with those at `frames` projected out."""
-    flat = columns.reshape(len(columns), -1)
-    basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
-    basis = basis[:, size > 1e-9 * size[0]]
-    return (flat - (flat @ basis) @ basis.T).reshape(columns.shape)
