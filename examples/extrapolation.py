@@ -71,7 +71,7 @@ def identified_pair(files: Prepared, folder: Path) -> calib.DynamicsModel:
 
 def _ours(files: Prepared, folder: Path) -> tuple[list[tuple[np.ndarray, np.ndarray]], float | None]:
     """Return the toolkit's predictions of the test files, and the share of their samples inside 95 % intervals [%]."""
-    outcome = identified_pair(files, folder).outcome
+    outcome = identified_pair(files, folder)
     predicted = [(case.motion.t, np.asarray(outcome.predictions[case.name])) for case in outcome.inputs.unseen]
     found = getattr(getattr(outcome, "assessment", None), "intervals", {}).values()
     inside = [one.inside[one.known].ravel() for one in found]

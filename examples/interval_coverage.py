@@ -85,7 +85,7 @@ MOTIONS = (
 
 def row(name: str, split: str, fits: list[GeometryFit]) -> str:
     """Return a row of the table: errors and intervals of the unseen rows of some fits together."""
-    found = [each for fit in fits for each in fit.outcome.validation.values() if each.intervals is not None]
+    found = [each for fit in fits for each in fit.validation.values() if each.intervals is not None]
     sizes, radii, beyond = (
         np.concatenate([getattr(each.intervals, key) for each in found]) for key in ("size", "radius", "beyond")
     )
@@ -119,11 +119,11 @@ def ends(robot: Path, file: Path) -> Iterator[GeometryFit]:
 
 def torque_row(name: str, split: str, model: DynamicsModel) -> str:
     """Return a row of the torques' table: intervals on motion that the identification has not seen."""
-    cases = model.outcome.assessment.intervals
+    cases = model.assessment.intervals
     series = ("index", "sigma", "inside", "known")
     joined = {key: np.concatenate([getattr(one, key) for one in cases.values()]) for key in series}
     found = TorqueIntervals(**joined, extrapolated=np.concatenate([x.extrapolated for x in cases.values()], axis=1))
-    errors = [model.outcome.validation[case].raw.total for case in cases]
+    errors = [model.validation[case].raw.total for case in cases]
     joints = 100.0 * found.joints
     return (
         f"| {name} | {split} | {np.average(errors, weights=[len(x.index) for x in cases.values()]):.1f} % | "

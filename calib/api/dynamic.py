@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,7 +19,6 @@ from calib.identification.identify_options import IdentifyOptions, IdentifySetti
 from calib.identification.methods.method import MethodEntry
 from calib.identification.methods.registry import LISTING
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
-from calib.procedure.findings import Verdict
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import plain
 from calib.robot.calibrated import CalibratedChain
@@ -33,36 +32,24 @@ if TYPE_CHECKING:
 Recorded = str | Path | Recording
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class DynamicsModel(Judged):
-    """Identified dynamics and how far to trust them. ``print`` shows errors on other motion, friction and verdict.
-
-    Attributes:
-        outcome: all that the identification found.
-    """
-
-    outcome: identify.IdentificationOutcome
+class DynamicsModel(Judged, identify.IdentificationOutcome):
+    """Identified dynamics and how far to trust them. ``print`` shows errors on other motion, friction and verdict."""
 
     @property
     def robot(self) -> CalibratedChain:
         """The robot whose dynamics these are."""
-        return self.outcome.inputs.robot
-
-    @property
-    def verdict(self) -> Verdict:
-        """Pass, marginal or fail, with the reason."""
-        return self.outcome.verdict
+        return self.inputs.robot
 
     @property
     def estimate(self) -> Estimate:
         """The base parameters with their covariance, the geometry's share in it where that is known."""
-        found, carried = self.outcome.found.fitted.estimate, self.outcome.carried
+        found, carried = self.found.fitted.estimate, self.carried
         return found if carried is None else replace(found, covariance=carried.covariance)
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
-        dynamics = self.outcome.found.dynamics
+        dynamics = self.found.dynamics
         return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
     @one_blas_thread()
@@ -74,33 +61,33 @@ class DynamicsModel(Judged):
         Raises:
             UsageError: for a model of too short a recording to estimate errors from.
         """
-        expected = self.outcome.errors
+        expected = self.errors
         if expected is None:
             raise UsageError("too little was recorded to say what errors the torques have: record longer")
-        return expected.sigma(self.outcome.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
+        return expected.sigma(self.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib identify --out` writes."""
         from calib.procedure.report import dynamics_figures
 
-        return folder.write_folder(self.outcome, Path(out), dynamics_figures.write if plots else None)
+        return folder.write_folder(self, Path(out), dynamics_figures.write if plots else None)
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: measured and predicted torques, autocorrelations, friction."""
         from calib.procedure.report import charts, dynamics_figures
 
-        return charts.figures(dynamics_figures.figures(self.outcome))
+        return charts.figures(dynamics_figures.figures(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return plain(metrics.metrics(self.outcome))
+        return plain(metrics.metrics(self))
 
     def to_dataframe(self) -> Any:
         """Return the base parameters as a pandas DataFrame: name, unit, value, sigma; NaN where a constraint holds."""
-        found, held = self.estimate, metrics.on_bounds(self.outcome.found)
-        sigma = np.where(np.isin(self.outcome.found.names, held), np.nan, found.sigma)
+        found, held = self.estimate, metrics.on_bounds(self.found)
+        sigma = np.where(np.isin(self.found.names, held), np.nan, found.sigma)
         rows = zip(found.names, found.units, found.values.tolist(), sigma.tolist())
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
@@ -108,7 +95,7 @@ class DynamicsModel(Judged):
         """Return errors on other motion, friction and verdict as a section of a report."""
         from calib.procedure.report import dynamics_section
 
-        return dynamics_section.outcome_section(self.outcome)
+        return dynamics_section.outcome_section(self)
 
     def __repr__(self) -> str:
         return (
@@ -144,7 +131,7 @@ def identify_dynamics(
 
     Args:
         robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
-            the same members and an outcome of its own.
+            the same members.
         recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or what `read_recording` returned.
         settings: method, friction, drives, payloads, gains, filters, closed loop.
         validate: recordings of other motion.
@@ -172,4 +159,4 @@ def identify_dynamics(
     )  # fmt: skip
     if on_read is not None:
         on_read(given)
-    return DynamicsModel(identify.run(given, progress))
+    return DynamicsModel(**vars(identify.run(given, progress)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -19,7 +19,6 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
 from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
-from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import selection_prediction
@@ -40,20 +39,13 @@ Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class PoseSelection:
-    """Poses at which a robot's geometry shows best. ``print`` shows index, bound and what random poses reach.
-
-    Attributes:
-        chosen: the selection with its bound, baseline and history (`poses.select.Selection`).
-    """
-
-    chosen: selection.Chosen
+class PoseSelection(selection.Chosen):
+    """Poses at which a robot's geometry shows best. ``print`` shows index, bound and what random poses reach."""
 
     @property
     def q(self) -> np.ndarray:
         """(m, n) joint values [rad or m]."""
-        return np.asarray(self.chosen.selection.q)
+        return np.asarray(self.selection.q)
 
     @checked
     def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
@@ -69,13 +61,13 @@ class PoseSelection:
         with files.results(selection.targets(path, plots), overwrite=overwrite):
             for name, figure in self.plot().items() if plots else ():
                 save(figure, beside[name])
-            return selection.write(self.chosen, path)
+            return selection.write(self, path)
 
     @checked
     def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
-            return write_run(Path(path), self.chosen.run, self.chosen.chain)
+            return write_run(Path(path), self.run, self.chain)
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
@@ -86,65 +78,45 @@ class PoseSelection:
         from calib.procedure.report.charts import figure
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
-        look = self.chosen.outlook
+        look = self.outlook
         curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]
         own = (float(look.poses.poses), 1e3 * look.poses.rms)
         drawn = {
             "predicted": lambda: predicted_map(look.poses.points, look.poses.spread),
             "outlook": lambda: outlook_figure(curve, own, "poses", "σ of the tool's position [mm]"),
         }
-        return {name: figure(drawn[name]()) for name in self.chosen.figures}
+        return {name: figure(drawn[name]()) for name in self.figures}
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""
-        return selection.record(self.chosen)
+        return selection.record(self)
 
     def to_dataframe(self) -> Any:
         """Return the joint values as a pandas DataFrame, a row per pose."""
-        return data_frame(self.q.tolist(), list(self.chosen.chain.joint_names))
+        return data_frame(self.q.tolist(), list(self.chain.joint_names))
 
     def __repr__(self) -> str:
-        return f"<PoseSelection: {len(self.q)} poses of {self.chosen.chain.name}>"
+        return f"<PoseSelection: {len(self.q)} poses of {self.chain.name}>"
 
     def __str__(self) -> str:
-        lines = [f"{words:38} {number}" for words, number in selection.table(self.chosen)]
-        return "\n".join([*lines, *self.chosen.kept(), *(f"note: {note}" for note in self.chosen.notes)])
+        lines = [f"{words:38} {number}" for words, number in selection.table(self)]
+        return "\n".join([*lines, *self.kept(), *(f"note: {note}" for note in self.notes)])
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class GeometryFit(Judged):
-    """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict.
-
-    Attributes:
-        outcome: all that the fit found.
-        options, settings: what was asked for.
-    """
-
-    outcome: fit.Outcome
-    options: FitOptions
-    settings: FitSettings
-
-    @property
-    def robot(self) -> CalibratedChain:
-        """The calibrated robot with covariance and corrections: what identification, excitation and export take."""
-        return self.outcome.calibrated
-
-    @property
-    def verdict(self) -> Verdict:
-        """Pass, marginal or fail, with the reason."""
-        return self.outcome.verdict
+class GeometryFit(Judged, fit.Outcome):
+    """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict."""
 
     @property
     def estimate(self) -> Estimate:
         """The fitted parameters [m, rad] with their covariance."""
-        return self.outcome.selection.fit.estimate
+        return self.selection.fit.estimate
 
     @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error, all axes together, at any poses.
 
         Parameters' covariance and unmodelled effects, estimated on held-out rows: it grows with the distance from the
-        poses of the fit. 95 % of errors are within ``outcome.expected.discrepancy.radius`` times that.
+        poses of the fit. 95 % of errors are within ``expected.discrepancy.radius`` times that.
 
         Args:
             q: (m, n) joint values [rad or m].
@@ -155,18 +127,18 @@ class GeometryFit(Judged):
         """
         from calib.procedure.kinematic_stage.comparison import gravity_of
 
-        if self.outcome.expected is None:
+        if self.expected is None:
             raise UsageError("this fit knows no errors to expect: it takes 20 measured positions or more")
         poses = PoseMeasurements(np.atleast_2d(np.asarray(q, dtype=float)), self.robot.chain.joint_names)
-        torque = gravity_of(self.outcome.inputs.chain, poses)
-        return self.outcome.expected.position_sigma(poses.q, torque, tool=tool)
+        torque = gravity_of(self.inputs.chain, poses)
+        return self.expected.position_sigma(poses.q, torque, tool=tool)
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""
         from calib.procedure.report import certificate
 
-        return folder.write_folder(self.outcome, Path(out), partial(certificate.write_fit, plots=plots))
+        return folder.write_folder(self, Path(out), partial(certificate.write_fit, plots=plots))
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
@@ -174,60 +146,37 @@ class GeometryFit(Judged):
         from calib.procedure.report import charts, figures
         from calib.procedure.report.fit_report import collect
 
-        return {name: charts.figure(chart) for name, (chart, _) in figures.captioned(collect(self.outcome)).items()}
+        return {name: charts.figure(chart) for name, (chart, _) in figures.captioned(collect(self)).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return plain(folder.metrics(self.outcome))
+        return plain(folder.metrics(self))
 
     def to_dataframe(self) -> Any:
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
         from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
 
-        return data_frame(
-            estimate_table(self.outcome.selection.fit, self.outcome.selection.nominal.cell).rows(), list(HEADER)
-        )
+        return data_frame(estimate_table(self.selection.fit, self.selection.nominal.cell).rows(), list(HEADER))
 
     def section(self) -> Section:
         """Return errors on unseen poses, ladder and verdict as a section of a report."""
         from calib.procedure.report import geometry_section
 
-        return geometry_section.outcome_section(folder.metrics(self.outcome))
+        return geometry_section.outcome_section(folder.metrics(self))
 
     def page(self) -> Page:
         """Return the certificate of this fit, without figures."""
         from calib.procedure.report import certificate
         from calib.procedure.report.fit_report import collect
 
-        return certificate.of_fit(collect(self.outcome), {}, self.outcome.inputs)
+        return certificate.of_fit(collect(self), {}, self.inputs)
 
     def __repr__(self) -> str:
-        return f"<GeometryFit of {self.robot.chain.name}: model {self.outcome.selection.chosen}, {self.verdict.level}>"
+        return f"<GeometryFit of {self.robot.chain.name}: model {self.selection.chosen}, {self.verdict.level}>"
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class JointCommands:
-    """Joint commands that put the real tool on nominal targets. ``print`` says what is reached and how well.
-
-    Attributes:
-        commands: joint values, what they leave, their sigma, and why a target is out of reach.
-        targets: what was asked for.
-        fitted: the robot in its cell.
-    """
-
-    commands: compensation.Commands
-    targets: Targets
-    fitted: compensation.Fitted
-
-    @property
-    def q(self) -> np.ndarray:
-        """(m, n) joint values to send [rad or m]."""
-        return self.commands.q
-
-    @property
-    def nominal(self) -> np.ndarray:
-        """(m, n) joint values [rad or m] that put the nominal robot there: what would be sent without compensation."""
-        return self.commands.nominal
+class JointCommands(compensation.Commands):
+    """Joint commands that put the real tool on nominal targets. ``print`` says what is reached and how well."""
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
@@ -236,13 +185,13 @@ class JointCommands:
         A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
-            return compensation.write(self.commands, self.fitted, self.targets, Path(path), partial)
+            return compensation.write(self, Path(path), partial)
 
     def __repr__(self) -> str:
-        return f"<JointCommands: {int(self.commands.reached.sum())} of {len(self.q)} targets reached>"
+        return f"<JointCommands: {int(self.reached.sum())} of {len(self.q)} targets reached>"
 
     def __str__(self) -> str:
-        return "\n".join(compensation.lines(self.commands, self.targets, self.fitted))
+        return "\n".join(compensation.lines(self))
 
 
 @checked
@@ -284,7 +233,7 @@ def select_poses(
             robot, count, settings, constraints=optional(constraints), existing=optional(existing), base=base, tip=tip,
             map=crew.map_without(lost), progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
         )  # fmt: skip
-    return PoseSelection(replace(chosen, notes=(*chosen.notes, *map(str, lost))))
+    return PoseSelection(**vars(replace(chosen, notes=(*chosen.notes, *map(str, lost)))))
 
 
 @checked
@@ -305,7 +254,7 @@ def fit_geometry(
 
     Args:
         robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result
-            has the same members and an outcome of its own; its measurements are files.
+            has the same members; its measurements are files.
         measured: CSV files, what `read_poses` returned, or several of either.
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
         validate: unseen poses, like `measured`.
@@ -322,9 +271,7 @@ def fit_geometry(
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
     prediction = (
-        poses.chosen.prediction
-        if isinstance(poses, PoseSelection)
-        else poses and selection_prediction.read(Path(poses))
+        poses.prediction if isinstance(poses, PoseSelection) else poses and selection_prediction.read(Path(poses))
     )
     if (stage := stage_of(robot, "fit", base, tip)) is not None:
         return stage.run(
@@ -337,8 +284,7 @@ def fit_geometry(
     )
     if on_read is not None:
         on_read(given)
-    wanted = settings or FitSettings()
-    return GeometryFit(fit.run(given, chosen, wanted, progress, prediction or None), chosen, wanted)
+    return GeometryFit(**vars(fit.run(given, chosen, settings, progress, prediction or None)))
 
 
 def read_fitted(folder: str | Path) -> compensation.Fitted:
@@ -396,4 +342,4 @@ def compensate(
     commands = compensation.compensate(
         found, targets, frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed, progress=progress
     )
-    return JointCommands(commands, targets, found)
+    return JointCommands(**vars(commands))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -34,15 +34,8 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ExcitationDesign:
-    """A motion that shows a robot's dynamics, proved to keep its limits. ``print`` shows condition numbers and margins.
-
-    Attributes:
-        designed: the motion, its proof, goals and search history.
-    """
-
-    designed: design.Designed
+class ExcitationDesign(design.Designed):
+    """A motion that shows a robot's dynamics, proved to keep its limits. ``print`` shows condition numbers, margins."""
 
     def sampled(self, rate: float | None = None) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], ends included.
@@ -50,75 +43,68 @@ class ExcitationDesign:
         Without `rate` the samples are those of the controller's rate that `save` writes; at any rate they are of the
         series itself, nothing is interpolated.
         """
-        return _columns(folder.one_period(self.designed, rate))
+        return _columns(folder.one_period(self, rate))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib excite --out` writes: trajectory.csv, ROS 2 messages, metrics, figures."""
         from calib.procedure.report import motion_figures
 
-        return folder.write_design(self.designed, Path(out), motion_figures.write_design if plots else None)
+        return folder.write_design(self, Path(out), motion_figures.write_design if plots else None)
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: motion, tool path, search, front."""
         from calib.procedure.report import charts, motion_figures
 
-        return charts.figures(motion_figures.design_figures(self.designed))
+        return charts.figures(motion_figures.design_figures(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return folder.design_metrics(self.designed)
+        return folder.design_metrics(self)
 
     def __repr__(self) -> str:
-        return f"<ExcitationDesign for {self.designed.inputs.chain.name}: {self.designed.period:g} s>"
+        return f"<ExcitationDesign for {self.inputs.chain.name}: {self.period:g} s>"
 
     def __str__(self) -> str:
-        return "\n".join(folder.design_lines(self.designed))
+        return "\n".join(folder.design_lines(self))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MotionPlan:
-    """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins.
-
-    Attributes:
-        planned: track, margins, and how it was found.
-    """
-
-    planned: planning.Planned
+class MotionPlan(planning.Planned):
+    """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
 
     @property
     def duration(self) -> float:
         """How long the motion takes [s]."""
-        return self.planned.track.duration
+        return self.track.duration
 
     def sampled(self) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] at the controller's rate (`PlanSettings`)."""
-        return _columns(self.planned.track)
+        return _columns(self.track)
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib plan --out` writes."""
         from calib.procedure.report import motion_figures
 
-        return folder.write_plan(self.planned, Path(out), motion_figures.write_plan if plots else None)
+        return folder.write_plan(self, Path(out), motion_figures.write_plan if plots else None)
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: motion and speed profile."""
         from calib.procedure.report import charts, motion_figures
 
-        return charts.figures(motion_figures.plan_figures(self.planned))
+        return charts.figures(motion_figures.plan_figures(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return folder.plan_metrics(self.planned)
+        return folder.plan_metrics(self)
 
     def __repr__(self) -> str:
-        return f"<MotionPlan for {self.planned.chain.name}: {self.planned.track.duration:g} s>"
+        return f"<MotionPlan for {self.chain.name}: {self.track.duration:g} s>"
 
     def __str__(self) -> str:
-        return "\n".join(folder.plan_lines(self.planned))
+        return "\n".join(folder.plan_lines(self))
 
 
 @checked
@@ -160,7 +146,7 @@ def design_excitation(
             cast(Any, robot), settings, model=place, limits=optional(limits), base=base, tip=tip,
             map=crew.map_without(lost), progress=progress,
         )  # fmt: skip
-    return ExcitationDesign(replace(designed, notes=(*designed.notes, *map(str, lost))))
+    return ExcitationDesign(**vars(replace(designed, notes=(*designed.notes, *map(str, lost)))))
 
 
 @checked
@@ -202,4 +188,4 @@ def plan_motion(
             cast(Any, robot), Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
             base=base, tip=tip, progress=progress,
         )  # fmt: skip
-    return MotionPlan(planned)
+    return MotionPlan(**vars(planned))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from calib.procedure.report.page import Page, Section
@@ -31,6 +31,11 @@ class Judged(ABC):
     @abstractmethod
     def section(self) -> Section:
         """Return the section: verdict, figures, tables, sentences."""
+
+    @property
+    def outcome(self) -> Self:
+        """The result itself: earlier versions kept what it holds apart."""
+        return self
 
     def renderables(self) -> Iterator[Any]:
         """Yield what ``print`` shows, for a rich console."""

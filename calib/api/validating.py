@@ -1,7 +1,6 @@
 """Results held against measurements they have not seen."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, overload
 
 from calib.api.dynamic import DynamicsModel, Recorded
@@ -41,9 +40,7 @@ def validate(
     given = listed(unseen)
     require(given, "validate: unseen: nothing is given to validate on", UsageError)
     if isinstance(result, GeometryFit):
-        both = measured.with_unseen(result.outcome.inputs, given, result.options, result.settings)
-        return replace(result, outcome=arm_fit.assessed(result.outcome, both, result.options, result.settings))
+        return arm_fit.assessed(result, measured.with_unseen(result.inputs, given, result.options, result.settings))
     if not isinstance(result, DynamicsModel):
         return result.with_unseen(given)
-    more = result.outcome.inputs.with_unseen(given)
-    return replace(result, outcome=arm_identify.assessed(result.outcome, more))
+    return arm_identify.assessed(result, result.inputs.with_unseen(given))

@@ -63,5 +63,5 @@ def identify_dynamics(
     if excitation is not None:
         from calib.procedure.excitation import prediction
 
-        compared = [prediction.compared_with_identification(excitation, found.outcome)]
+        compared = [prediction.compared_with_identification(excitation, found)]
     say_written([*found.renderables(), *compared], out, found.verdict.level)

@@ -113,7 +113,7 @@ def select(
     if run:
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
-    if told := selection.beside_poses(out, plots, chosen.chosen):
+    if told := selection.beside_poses(out, plots, chosen):
         say(f"predictions: {', '.join(str(path) for path in told.values())}")
     say(f"{m} poses written to {out}")
 
@@ -227,4 +227,4 @@ def compensate(
         )  # fmt: skip
     found.save(out, partial=partial, overwrite=overwrite)
     say(str(found))
-    say(f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}")
+    say(f"{int(found.reached.sum())} of {len(found.q)} commands written to {out}")

@@ -172,7 +172,7 @@ def test_measurements_in_memory_get_the_checks_of_files(fitted, cell):
 
 def test_what_readers_return_may_stand_among_files(fitted, cell):
     both = [calib.read_poses(cell / "measured.csv", "ur5"), cell / "other.csv"]
-    assert len(calib.fit_geometry("ur5", both, calib.FitSettings(model="geometry")).outcome.inputs.fit) == 2
+    assert len(calib.fit_geometry("ur5", both, calib.FitSettings(model="geometry")).inputs.fit) == 2
     with pytest.raises(UsageError, match="nothing is given"):
         calib.validate(fitted, [])
     with pytest.raises(UsageError, match="save: out: expected a text or a path, found None"):
@@ -249,13 +249,13 @@ def test_recordings_in_memory_and_later_validation(model, logs):
     again = calib.identify_dynamics(robot, log, friction="standard")
     np.testing.assert_array_equal(again.estimate.values, model.estimate.values)
     judged = calib.validate(again, other)
-    (score,), (before,) = judged.outcome.validation.values(), model.outcome.validation.values()
+    (score,), (before,) = judged.validation.values(), model.validation.values()
     assert score.raw.total == before.raw.total
     assert judged.verdict.level == model.verdict.level
 
 
 def test_torques_have_sigmas(model):
-    motion = model.outcome.inputs.cases[0].motion
+    motion = model.inputs.cases[0].motion
     states = motion.q[:50], motion.v[:50], motion.a[:50]
     own, fast = model.torque_sigma(*states), model.torque_sigma(states[0], 3.0 * states[1], 9.0 * states[2])
     assert own.shape == model.torques(*states).shape and (own > 0.0).all()
@@ -277,7 +277,7 @@ def test_export_and_compensation_take_results_in_memory(fitted, model, cell, log
     assert run("export", "fit", "--into", "fit") == 2 and run("export", "nowhere", "--into", "out") == 2
     assert not Path("out").exists()
     commands = calib.compensate(fitted, tmp_path / "targets.csv")
-    assert commands.commands.reached.all() and "1 of 1" not in str(commands)
+    assert commands.reached.all() and "1 of 1" not in str(commands)
     assert commands.save(tmp_path / "commands.csv").is_file()
 
 

@@ -37,7 +37,7 @@ def geometry(model: str) -> kinematic.Outcome:
 @pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])
 def test_fit_and_identification_in_one_process_equal_the_way_through_files(model, tmp_path):
     outcome = geometry(model)
-    robot = outcome.calibrated
+    robot = outcome.robot
     log = planted.write(tmp_path, "log.npz", 0)
     given = gather(robot, [str(log)])
     found = identify(robot, given.cases, given.options.settings)
@@ -60,7 +60,7 @@ def test_fit_and_identification_in_one_process_equal_the_way_through_files(model
 
 
 def test_a_calibrated_robot_reads_back_as_it_was_written(tmp_path):
-    robot = geometry("harmonics").calibrated
+    robot = geometry("harmonics").robot
     assert robot.corrections is not None and robot.nominal is not None and robot.moved
     calibrated.write(tmp_path, robot)
     again = load_calibrated(tmp_path)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -116,7 +117,10 @@ def judged(
     return IdentificationOutcome(inputs, found, findings, result, carried, geometries, errors, found.settings.seed)
 
 
-def assessed(outcome: IdentificationOutcome, inputs: IdentificationInputs) -> IdentificationOutcome:
+T = TypeVar("T", bound=IdentificationOutcome)
+
+
+def assessed(outcome: T, inputs: IdentificationInputs) -> T:
     """Return an outcome judged anew on the unseen recordings of `inputs`; nothing is identified."""
     if (stage := stage_of(inputs.robot, "identify")) is not None and stage.judge is not None:
         result = stage.judge(inputs, outcome.found, outcome.findings)

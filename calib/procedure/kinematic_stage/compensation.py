@@ -76,6 +76,7 @@ class Commands:
     """What to send for m targets.
 
     Attributes:
+        targets, fitted: what was asked for, of which robot in its cell.
         q: (m, n) joint values [rad or m]; for a target that is not reached, as near as the arm came.
         nominal: (m, n) those of the nominal robot.
         reached: (m,).
@@ -92,6 +93,8 @@ class Commands:
             ``before`` is that, or where nobody knows.
     """
 
+    targets: Targets
+    fitted: Fitted
     q: np.ndarray
     nominal: np.ndarray
     reached: np.ndarray
@@ -260,7 +263,7 @@ def compensate(
         held = np.clip(q0, lower, upper)
         goal = Goal(real, count, lower, upper, torques_of(fitted))
         own = _sizes(inverse.differences(goal, held, see(placed, held).poses()))
-    return Commands(q, q0, reached, reason, left, missed, sigma, expected, beyond, count, words, own)
+    return Commands(targets, fitted, q, q0, reached, reason, left, missed, sigma, expected, beyond, count, words, own)
 
 
 def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, tuple[str, ...]]:
@@ -412,12 +415,13 @@ def _header(names: Sequence[str]) -> list[str]:
     return ["row", *names, "status", *COLUMNS, "reason"]
 
 
-def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, partial: bool = False) -> Path:
+def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     """Write COMMANDS.csv, see `calib.data.poses.target_files`.
 
     Raises:
         UsageError: where targets are not reached and `partial` does not allow that; nothing is written.
     """
+    fitted, targets = commands.fitted, commands.targets
     lost = np.flatnonzero(~commands.reached)
     if len(lost) and (not partial or len(lost) == len(commands.q)):
         shown = [f"  target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]]
@@ -440,9 +444,9 @@ def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, parti
     return files.write_table(out, _header(names), rows)
 
 
-def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:
+def lines(commands: Commands) -> list[str]:
     """Return what a person should know of the commands."""
-    good = commands.reached
+    good, targets = commands.reached, commands.targets
     result = [*commands.notes, *targets.notes]
     result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []
     result += [f"not reached: target {k + 1}: {commands.reason[k]}" for k in np.flatnonzero(~good)[:SHOWN]]
@@ -457,14 +461,14 @@ def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:
         f"by the calibrated model, rms over {int(good.sum())} targets: {before} without compensation{apart}, "
         f"{left} with it; sigma of the model {sigma}"
     ]
-    result += [_expectation(commands, fitted), *_extrapolation(commands, fitted)]
+    result += [_expectation(commands), *_extrapolation(commands)]
     most = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
     return [*result, f"joints move by {1e3 * most:.3g} mrad (mm) at most"]
 
 
-def _expectation(commands: Commands, fitted: Fitted) -> str:
+def _expectation(commands: Commands) -> str:
     """Say what to expect of the real arm at these targets, by the error model where there is one."""
-    good = commands.reached
+    good, fitted = commands.reached, commands.fitted
     apart = "" if fitted.unseen is None else f"; {1e3 * fitted.unseen:.3g} mm rms were found on poses not fitted"
     if commands.expected is not None:
         rms = np.sqrt(np.mean(commands.expected[good, 0] ** 2))
@@ -480,12 +484,12 @@ def _expectation(commands: Commands, fitted: Fitted) -> str:
     return f"{why}: nothing says what to expect of the real arm{apart}"
 
 
-def _extrapolation(commands: Commands, fitted: Fitted) -> list[str]:
+def _extrapolation(commands: Commands) -> list[str]:
     """Say how many targets extrapolate, and which joints."""
     out = commands.beyond & commands.reached[:, None]
     if not out.any():
         return []
-    names = ", ".join(fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1]).tolist())
+    names = ", ".join(commands.fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1]).tolist())
     return [
         f"EXTRAPOLATED: {int(out.any(axis=1).sum())} of {int(commands.reached.sum())} targets have joints outside the "
         f"range that was measured ({names}): no measurement proves the arm there; measure poses like them"

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class Outcome:
         unclear: what is not identifiable from the poses.
         findings: what the fit says of itself.
         assessment: both arms on fitted and on unseen rows, and the verdict.
-        wanted: how it was fitted and judged.
+        settings, options: how it was fitted and judged.
         expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
     """
 
@@ -61,12 +62,13 @@ class Outcome:
     unclear: tuple[Finding, ...]
     findings: Findings
     assessment: Assessment
-    wanted: FitSettings = field(default_factory=FitSettings)
+    settings: FitSettings = field(default_factory=FitSettings)
+    options: FitOptions = field(default_factory=FitOptions)
     expected: ErrorModel | None = None
 
     @property
-    def calibrated(self) -> CalibratedChain:
-        """The calibrated robot, for all that goes on from here."""
+    def robot(self) -> CalibratedChain:
+        """The calibrated robot with covariance and corrections: what identification, excitation and export take."""
         found = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
         return replace(found, source=str(self.inputs.source))
 
@@ -89,6 +91,9 @@ class Outcome:
     def verdict(self) -> Verdict:
         """Pass, marginal or fail, with its reason."""
         return self.assessment.verdict
+
+
+T = TypeVar("T", bound=Outcome)
 
 
 def run(
@@ -158,13 +163,14 @@ def run(
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
     result = assess(arms, inputs, findings, settings, replace(wanted, model=asked))
-    return Outcome(inputs, found, rigid, named, tuple(unidentified(found.fit)), findings, result, wanted, expected)
+    unclear = tuple(unidentified(found.fit))
+    return Outcome(inputs, found, rigid, named, unclear, findings, result, wanted, options, expected)
 
 
-def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:
+def assessed(outcome: T, inputs: Inputs) -> T:
     """Return an outcome judged anew on the unseen rows of `inputs`; nothing is fitted."""
+    wanted, options, fits = outcome.settings, outcome.options, outcome.selection
     settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
-    fits = outcome.selection
     arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
     result = assess(arms, inputs, outcome.findings, settings, replace(wanted, model=wanted.model or options.model))
     return replace(outcome, inputs=inputs, assessment=result)

@@ -220,7 +220,7 @@ def write_folder(
 
 def _write_all(outcome: Outcome, folder: Path) -> None:
     fit, chain = outcome.selection.fit, outcome.inputs.chain
-    robot, origin = outcome.calibrated, f"calibrated from {outcome.inputs.source}"
+    robot, origin = outcome.robot, f"calibrated from {outcome.inputs.source}"
     calibrated.write(folder, robot, installation_file.frame_tables(fit.cell), _record(outcome), origin)
     urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
@@ -240,13 +240,13 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
 
 def metrics(outcome: Outcome) -> FitMetrics:
     """Return the content of ``metrics.json``."""
-    tolerance = outcome.wanted.tolerance
+    tolerance = outcome.settings.tolerance
     return FitMetrics(
         **vars(outcome.assessment.record),
         fit=outcome.fit.record(len(outcome.selection.fit.free)),
         model=outcome.selection.chosen,
         ladder=outcome.selection.rungs,
-        seed=outcome.wanted.seed,
+        seed=outcome.settings.seed,
         status=outcome.selection.fit.solution.status.name.lower(),
         tolerance_mm=None if tolerance is None else 1e3 * tolerance,
         not_identifiable=tuple(lines_of(outcome.unclear)),
@@ -264,7 +264,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],
         "model": outcome.selection.chosen,
-        "seed": outcome.wanted.seed,
+        "seed": outcome.settings.seed,
         **({"verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}"} if outcome.verdict.level else {}),
         "covariance": COVARIANCE,
     }

@@ -20,7 +20,6 @@ from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
-from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
 from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, repeated_motion
@@ -57,7 +56,7 @@ class ParallelDynamics(DynamicsModel):
         Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
         their power [W]: as the model was identified.
         """
-        dynamics: Any = self.outcome.found.dynamics
+        dynamics: Any = self.found.dynamics
         return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)), ())
 
 
@@ -101,8 +100,7 @@ def identify_parallel(
     found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
     notes = (*parameter_warnings(found), *_payload_notes(model, found, inputs.cases), *_redundancy_notes(model))
     findings = ModelFindings(resting_parameters(found), notes)
-    assessment = assess(inputs, found, findings)
-    return ParallelDynamics(IdentificationOutcome(inputs, found, findings, assessment, seed=settings.seed))
+    return ParallelDynamics(inputs, found, findings, assess(inputs, found, findings), seed=settings.seed)
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:

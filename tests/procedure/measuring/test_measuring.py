@@ -196,7 +196,7 @@ def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
         "NOT checked: walls",
     ):
         assert words in told
-    outlook = chosen.chosen.outlook
+    outlook = chosen.outlook
     assert outlook.blind is not None and outlook.blind[0] > outlook.comparable
     with pytest.raises(calib.CalibError, match="of random postures keep: line of sight 0 %"):
         (tmp_path / "d.toml").write_text(CELL.replace("30 deg", "0.1 deg"))
