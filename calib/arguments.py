@@ -47,7 +47,7 @@ def _read_by_type(kind: Any) -> Any:
 
         with quiet():
             bound = _bound(signature(init), kind.__name__, (self, *args), kwargs)
-            given = {key: _plain(value) for key, value in bound.items() if key != "self"}
+            given = {key: plain_values(value) for key, value in bound.items() if key != "self"}
             vars(self).update(vars(parse(kind, given, kind.__name__)) if given else {})
             if not given:
                 init(self)
@@ -55,13 +55,13 @@ def _read_by_type(kind: Any) -> Any:
     return call
 
 
-def _plain(value: Any) -> Any:
-    """Return numpy's numbers and arrays, and tuples, as the numbers and lists of a file."""
+def plain_values(value: Any) -> Any:
+    """Return a value whose numbers and arrays of numpy, and tuples, are numbers and lists as a file holds them."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+        return {key: plain_values(one) for key, one in value.items()}
+    return [plain_values(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
 def _bound(wanted: Signature, name: str, args: tuple, kwargs: dict[str, Any]) -> dict[str, Any]:

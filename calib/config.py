@@ -16,10 +16,12 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from calib.arguments import plain_values
 from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
 
 T = TypeVar("T")
+Tables = str | Path | Mapping[str, Any]  # a TOML file, or what stands in one
 MAX_LEVELS = 32
 _PLAIN = {  # pydantic's words
     "float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false", "tuple": "a list",
@@ -88,6 +90,19 @@ def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = Usage
         return _adapter(kind).validate_python(found)
     except ValidationError as wrong:
         raise error(_complaint(wrong.errors(include_url=False), kind, place)) from None
+
+
+def read(kind: type[T], given: Tables | None, name: str, others: Collection[str] = ()) -> tuple[T, str]:
+    """Return what a TOML file, or its tables in memory, state, and what messages call it.
+
+    Args:
+        name: in place of a file's; others: tables that another reader takes.
+    """
+    if given is None or isinstance(given, Mapping):
+        table, place = plain_values(given or {}), name
+    else:
+        table, place = read_toml(given), str(given)
+    return parse(kind, {key: value for key, value in table.items() if key not in others}, place), place
 
 
 def strict(kind: type[T]) -> type[T]:

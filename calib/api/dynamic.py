@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from calib.api.given import listed, optional
+from calib.api.given import listed, optional, progress_shown
 from calib.api.rendering import Judged, data_frame
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
@@ -146,6 +146,7 @@ def identify_dynamics(
         Unidentifiable: where the motion identifies no parameter.
     """
     require(settings is None or options is None, "settings and options say the same: give one of them", UsageError)
+    progress = progress_shown(progress)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
     chosen = chosen if settings is None else options_of(settings)
     if (stage := stage_of(robot, "identify", base, tip)) is not None:

@@ -1,6 +1,7 @@
 """What the verbs take in several forms: one or many, a file that may be missing, a result or its folder."""
 
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,9 +15,18 @@ def listed(given: object | Sequence[object]) -> list:
     return [one for each in given for one in listed(each)]
 
 
-def optional(path: str | Path | None) -> Path | None:
-    """Return a path that may be missing."""
-    return None if path is None else Path(path)
+def optional(given: Any) -> Any:
+    """Return a text as the path it is, and any other value, None included, as it is."""
+    return Path(given) if isinstance(given, str) else given
+
+
+def progress_shown(progress: Callable[[str], None] | None) -> Callable[[str], None] | None:
+    """Return what reports progress: what was given; by default, in a notebook, a line under its cell; else None."""
+    notebook = sys.modules.get("IPython")
+    if progress is not None or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
+        return progress
+    line = notebook.display.display({"text/plain": ""}, raw=True, display_id=True)
+    return lambda words: line.update({"text/plain": words}, raw=True)
 
 
 @contextmanager

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib import files
-from calib.api.given import listed, optional, saved
+from calib.api.given import listed, optional, progress_shown, saved
 from calib.api.rendering import Judged, data_frame
 from calib.arguments import checked
+from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
@@ -200,8 +201,8 @@ def select_poses(
     count: int = 30,
     settings: SelectionSettings = DEFAULT_SELECTION,
     *,
-    constraints: str | Path | None = None,
-    existing: str | Path | None = None,
+    constraints: Tables | None = None,
+    existing: str | Path | PoseMeasurements | np.ndarray | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -216,8 +217,9 @@ def select_poses(
         robot, base, tip: as of `calib.load`; or what it returned.
         count: how many poses.
         settings: what is measured, targets, index, method, sigmas, seed.
-        constraints: TOML file of where the arm may go, and where the instrument stands (``calib formats constraints``).
-        existing: CSV of poses measured before, which count.
+        constraints: TOML file of where the arm may go, and where the instrument stands (``calib formats constraints``),
+            or its tables.
+        existing: poses measured before, which count: a CSV, measurements, or joint values (m, n) [rad or m].
         workers: local processes, or the address of a Dask scheduler.
         progress: called with a few words now and then.
 
@@ -227,7 +229,7 @@ def select_poses(
     from calib.workers import workers as opened
 
     stage_of(robot, "choosing poses")
-    say, lost = progress or (lambda words: None), []
+    say, lost = progress_shown(progress) or (lambda words: None), []
     with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
             robot, count, settings, constraints=optional(constraints), existing=optional(existing), base=base, tip=tip,
@@ -269,6 +271,7 @@ def fit_geometry(
         Unidentifiable: where no parameter is identifiable.
         NotConverged: where the fit did not come to an end.
     """
+    progress = progress_shown(progress)
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
     prediction = (
         poses.prediction if isinstance(poses, PoseSelection) else poses and selection_prediction.read(Path(poses))
@@ -333,13 +336,11 @@ def compensate(
         with saved(fitted) as place:
             found = read_fitted(place)
     chain = found.nominal.chain
-    if isinstance(targets, np.ndarray):
-        poses = targets if targets.ndim == 3 else None
-        targets = Targets(targets) if poses is None else Targets(None, poses[:, :3, 3], poses[:, :3, :3])
-    if not isinstance(targets, Targets):
+    if isinstance(targets, str | Path):
         limits = (chain.lower, chain.upper)
-        targets = read_targets(Path(targets), chain.joint_names, kinds=joint_kinds(chain), limits=limits)
+        targets = read_targets(targets, chain.joint_names, kinds=joint_kinds(chain), limits=limits)
     commands = compensation.compensate(
-        found, targets, frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed, progress=progress
-    )
+        found, Targets.of(targets), frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed,
+        progress=progress_shown(progress),
+    )  # fmt: skip
     return JointCommands(**vars(commands))

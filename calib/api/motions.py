@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.given import optional, saved
+from calib.api.given import optional, progress_shown, saved
 from calib.arguments import checked
+from calib.config import Tables
+from calib.data.poses.target_files import Targets
 from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
@@ -113,7 +115,7 @@ def design_excitation(
     settings: ExcitationSettings = DEFAULT_DESIGN,
     *,
     model: DynamicsModel | MechanismResult | str | Path | None = None,
-    limits: str | Path | None = None,
+    limits: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -126,7 +128,7 @@ def design_excitation(
             the same members but ``plot``.
         settings: period, harmonics, goals, effort of the search, playback, seed.
         model: identified dynamics, in memory or in a folder: they predict the torques.
-        limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``).
+        limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``), or its tables.
         workers: local processes, or the address of a Dask scheduler.
         progress: called with a few words now and then.
 
@@ -136,6 +138,7 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
+    progress = progress_shown(progress)
     lost, stage = [], stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
@@ -152,12 +155,12 @@ def design_excitation(
 @checked
 def plan_motion(
     robot: str | Path | CalibratedChain | Mechanism,
-    waypoints: str | Path,
+    waypoints: str | Path | Targets | np.ndarray,
     settings: PlanSettings = DEFAULT_PLAN,
     *,
     model: DynamicsModel | MechanismResult | str | Path | None = None,
-    limits: str | Path | None = None,
-    drives: str | Path | None = None,
+    limits: Tables | None = None,
+    drives: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
     progress: Progress | None = None,
@@ -167,25 +170,28 @@ def plan_motion(
     Args:
         robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
             the same members but ``plot``.
-        waypoints: CSV of joint values, or of places of the tip (of the platform's coordinates).
+        waypoints: CSV of joint values, or of places of the tip (of the platform's coordinates); or arrays: joint values
+            (m, n) [rad or m], poses of the tip (m, 4, 4) [m].
         settings: payloads, straight lines, rate, shaping, approach.
         model: identified dynamics, in memory or in a folder, to plan with.
-        limits: TOML file (``calib formats limits``); drives: TOML file of Ia, Fv, Fc, off, where there is no model.
+        limits: TOML file (``calib formats limits``); drives: TOML file of Ia, Fv, Fc, off, where there is no model;
+            or the tables of either.
         progress: called with a few words now and then.
 
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
+    progress = progress_shown(progress)
     stage = stage_of(robot, "plan", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
         if stage is not None:
             return stage.run(
-                Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
+                optional(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
                 progress=progress,
             )  # fmt: skip
         planned = planning.plan(
-            cast(Any, robot), Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
-            base=base, tip=tip, progress=progress,
+            cast(Any, robot), optional(waypoints), settings, model=place, limits=optional(limits),
+            drives=optional(drives), base=base, tip=tip, progress=progress,
         )  # fmt: skip
     return MotionPlan(**vars(planned))

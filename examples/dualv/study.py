@@ -217,8 +217,8 @@ def report(designs: list[ParallelExcitation], found: list[Trial]) -> dict[str, A
         "inertial_base_parameters": found[0].inertial,
         "designs": [
             {
-                "evaluations": one.designed.found.evaluations, "merit": one.designed.found.merit,
-                "condition": one.designed.condition.table(), "peak_torque": one.peaks[0].tolist(),
+                "evaluations": one.found.evaluations, "merit": one.found.merit,
+                "condition": one.condition.table(), "peak_torque": one.peaks[0].tolist(),
                 "peak_g": (one.peaks[1][:2] / 9.81).tolist(),
             }
             for one in designs

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 import calib
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.recordings.recording import Recording
 
+OFFSETS = calib.FitSettings(model="offsets")
 Q = np.random.default_rng(0).uniform(-2.0, 2.0, (60, 6))
 
 
@@ -18,7 +23,7 @@ def test_a_fit_of_arrays_brings_back_the_robot_that_made_them():
     turns = Rotation.from_matrix(pose[:, :3, :3]).as_quat()
     block = PoseMeasurements.of(Q, pose[:, :3, 3], turns, joint_names=robot.chain.joint_names)
     assert isinstance(block, Poses) and type(PoseMeasurements.of(Q, pose[:, :3, 3])) is Positions
-    fit = calib.fit_geometry(robot, block, calib.FitSettings(model="offsets"))
+    fit = calib.fit_geometry(robot, block, OFFSETS)
     np.testing.assert_allclose(fit.robot.forward(Q[0])[0, :3, 3], pose[0, :3, 3], atol=1e-6)
     for targets in (Q[:3], pose[:3]):
         found = calib.compensate(fit, targets, frame="nominal").q
@@ -36,3 +41,45 @@ def test_the_jacobian_is_the_slope_of_the_pose():
 def test_a_recording_of_arrays_has_names():
     log = Recording.of(np.arange(60) / 100.0, Q, 0.0 * Q)
     assert log.joint_names == ("q1", "q2", "q3", "q4", "q5", "q6") and log.kind == "torque"
+
+
+def test_waypoints_limits_and_poses_in_memory_are_those_of_files(tmp_path):
+    way, limits = np.array([[0.0, -1.2, 1.2, 0.0, 0.6, 0.1], [0.8, -0.6, 0.9, 0.4, 0.2, 0.0]]), tmp_path / "l.toml"
+    limits.write_text('[velocity]\nall = "60 deg/s"\n[acceleration]\nall = 4.0\n')
+    (tmp_path / "way.csv").write_text("\n".join(["q1,q2,q3,q4,q5,q6", *(",".join(map(str, q)) for q in way)]))
+    tables = {"velocity": {"all": "60 deg/s"}, "acceleration": {"all": np.float64(4.0)}}
+    by_file = calib.plan_motion("ur5", tmp_path / "way.csv", limits=limits)
+    in_memory = calib.plan_motion("ur5", way, limits=tables)
+    np.testing.assert_array_equal(in_memory.track.q, by_file.track.q)
+    there = calib.plan_motion("ur5", calib.load("ur5").forward(way), calib.PlanSettings(start=way[0]), limits=tables)
+    np.testing.assert_allclose(there.track.q[-1], way[1], atol=1e-5)
+    with pytest.raises(calib.CalibError, match="limits: velocity: there is no key 'q9'"):
+        calib.plan_motion("ur5", way, limits={"velocity": {"q9": 1.0}})
+
+
+def test_constraints_and_poses_measured_before_are_values_too(tmp_path):
+    (tmp_path / "c.toml").write_text("[joints]\nq1 = [-1.0, 1.0]\n")
+    (tmp_path / "p.csv").write_text("\n".join(["q1,q2,q3,q4,q5,q6", *(",".join(map(str, q)) for q in Q[:20])]))
+    settings = calib.SelectionSettings(method="detmax", candidates=100, climbs=0)
+    block = PoseMeasurements.of(Q[:20], np.zeros((20, 3)))
+    by_file, *others = (
+        calib.select_poses("ur5", 6, settings, constraints=limits, existing=before).q
+        for limits, before in (
+            (tmp_path / "c.toml", tmp_path / "p.csv"),
+            ({"joints": {"q1": [-1.0, 1.0]}}, Q[:20]),
+            ({"joints": {"q1": (-1.0, 1.0)}}, block),
+        )
+    )
+    assert np.abs(by_file[:, 0]).max() <= 1.0
+    for q in others:
+        np.testing.assert_array_equal(q, by_file)
+
+
+def test_a_notebook_shows_progress_in_one_line(monkeypatch):
+    said = []
+    line = SimpleNamespace(update=lambda content, raw: said.append(content["text/plain"]))
+    display = SimpleNamespace(display=lambda content, raw, display_id: line)
+    shell = SimpleNamespace(kernel=None)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(display=display, get_ipython=lambda: shell))
+    calib.fit_geometry("ur5", PoseMeasurements.of(Q, calib.load("ur5").forward(Q)[:, :3, 3]), OFFSETS)
+    assert said[0] == "reading" and len(said) > 3

@@ -50,15 +50,21 @@ def filled_in(path: Path, joints: int) -> bool:
 
 
 def read_poses(
-    path: str | Path,
+    given: str | Path | ArrayLike | PoseMeasurements,
     joints: Sequence[str],
     options: FileOptions | None = None,
     *,
     kinds: Sequence[str] | None = None,
     limits: Limits | None = None,
 ) -> np.ndarray:
-    """Read joint values (m, n) [rad or m] in the order of `joints`; columns and checks as for measurements."""
-    sheet = Sheet(read_table(path), options or FileOptions())
+    """Return joint values (m, n) [rad or m] in the order of `joints`: of a CSV file, of measurements, or an array.
+
+    Columns and checks of a file are those of measurements.
+    """
+    if not isinstance(given, str | Path):
+        q = given.q if isinstance(given, PoseMeasurements) else given
+        return shaped(q, (None, len(joints)), "joint values")
+    sheet = Sheet(read_table(given), options or FileOptions())
     sheet.check_names(joints)
     q, columns = sheet.joints(joints)
     if len(q) > 1:

@@ -33,6 +33,8 @@ reason              why not, or what is odd
 ==================  ===================================================================================================
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +77,15 @@ class Targets:
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     file: str = ""
+
+    @staticmethod
+    def of(given: Targets | np.ndarray) -> Targets:
+        """Return targets in memory: poses (m, 4, 4) [m], or joint values (m, n) [rad or m]."""
+        if isinstance(given, Targets):
+            return given
+        if given.ndim == 3:
+            return Targets(None, given[:, :3, 3], given[:, :3, :3], file="the array")
+        return Targets(given, file="the array")
 
     def __post_init__(self) -> None:
         for name in ("q", "position", "rotation"):

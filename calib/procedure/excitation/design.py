@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.config import Tables
 from calib.errors import UsageError
 from calib.procedure.excitation.goals import SCALINGS, NamedGoal, objectives_of, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
@@ -88,7 +89,7 @@ def excite(
     settings: ExcitationSettings = DEFAULT_DESIGN,
     *,
     model: Path | None = None,
-    limits: Path | None = None,
+    limits: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
     map: Callable = map,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel, columns_at_rest, information
@@ -106,7 +107,7 @@ def read_inputs(
     robot: str | Path | CalibratedChain,
     settings: ExcitationSettings,
     model: Path | None = None,
-    limits: Path | None = None,
+    limits: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
 ) -> ExcitationInputs:

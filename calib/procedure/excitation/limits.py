@@ -33,7 +33,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.config import check_keys, parse, read_toml, strict
+from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
@@ -138,12 +138,12 @@ class MotionLimits:
 
 
 def read_motion_limits(
-    path: Path | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
+    given: Tables | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
 ) -> MotionLimits:
     """Read the limits of a motion; where nothing else is stated it keeps what poses keep (`limits_of`).
 
     Args:
-        path: the file; None for the robot's own limits and the defaults alone.
+        given: the file, or its tables; None for the robot's own limits and the defaults alone.
         source: the robot's file, for its collision shapes.
         given_way: the motion goes where its user says: what is not stated is not kept, since capsules and a floor that
             we think of should not forbid a way that somebody knows.
@@ -154,8 +154,8 @@ def read_motion_limits(
         UsageError: for an unknown key or a value that a key cannot have, and where nothing limits speeds, or
             accelerations and torques (`MotionBounds`).
     """
-    stated = LimitsFile() if path is None else parse(LimitsFile, read_toml(path), str(path))
-    where, own = str(path or "limits"), stated.torque
+    stated, where = read(LimitsFile, given, "limits")
+    own = stated.torque
     without = ()
     if given_way:
         without = ("joint-margin", "floor") if stated.collision or stated.obstacle else DEFAULTS
@@ -169,7 +169,7 @@ def read_motion_limits(
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
     counted = torque if predicted or chain.inertias is not None else np.full(chain.n, np.inf)
     sizes = velocity, acceleration, counted
-    bounds = _bounds(chain, str(source or chain.name), stated, path, sizes, default=not given_way)
+    bounds = _bounds(chain, str(source or chain.name), stated, where, sizes, default=not given_way)
     margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
@@ -184,7 +184,7 @@ def read_motion_limits(
     constraints += _places(stated, found, points)
     notes = list(found.notes)
     if found.collision is None:
-        notes.append(_unchecked(path))
+        notes.append(_unchecked(where if given else None))
     else:
         names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
         constraints.append(Clearance(found.collision.distances, found.collision.gradients, names, found.clearance))
@@ -217,7 +217,7 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
 
 
 def _bounds(
-    chain: Chain, robot: str, stated: LimitsFile, path: Path | None, sizes: Sequence[np.ndarray], default: bool
+    chain: Chain, robot: str, stated: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
 ) -> MotionBounds:
     """Return the bounds of a motion's joints; by default accelerations that nothing else limits have some.
 
@@ -227,7 +227,7 @@ def _bounds(
     velocity, acceleration, torque = sizes
     tables = {"velocity": stated.velocity, "torque": stated.torque}
     origin = {kind: f"robot description, {path}" if table else "robot description" for kind, table in tables.items()}
-    origin["acceleration"] = str(path)
+    origin["acceleration"] = path
     free = (acceleration > MAX_ACCELERATION) & (torque > MAX_TORQUE)
     if default and free.any():
         origin["acceleration"] = DEFAULT_ORIGIN if np.isinf(acceleration).all() else f"{path}, or {DEFAULT_ORIGIN}"
@@ -235,7 +235,7 @@ def _bounds(
     return MotionBounds(robot, chain.joints, velocity, acceleration, torque, origin)
 
 
-def _unchecked(path: Path | None) -> str:
+def _unchecked(path: str | None) -> str:
     """Return what nothing keeps the motion from."""
     if path is None:
         return "collisions and floor are NOT checked, the tool may pass the table: state them in a limits file"

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import numpy as np
 
-from calib.config import check_keys, parse, read_toml, strict
+from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Expect, numbers
+from calib.data.poses.target_files import Targets
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
@@ -91,12 +92,12 @@ class Planned:
 
 def plan(
     robot: str | Path | CalibratedChain,
-    waypoints: Path,
+    waypoints: Path | Targets | np.ndarray,
     settings: PlanSettings = DEFAULT_PLAN,
     *,
     model: Path | None = None,
-    limits: Path | None = None,
-    drives: Path | None = None,
+    limits: Tables | None = None,
+    drives: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
     progress: Progress | None = None,
@@ -118,7 +119,7 @@ def plan(
     _check(settings)
     if settings.payloads and model is None:
         raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
-    chain, source = load_rigid(robot, waypoints, base, tip)
+    chain, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
     known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, free = known.positions.lower, known.positions.upper, 1.0 - (known.margin or 0.0)
@@ -170,11 +171,11 @@ def _timed(
     return tuple(time_optimal(path, bounds, law, rate=rate) for path in paths), bounds, sigma
 
 
-def _read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
+def _read_drives(given: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
     """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
-    own = parse(_DrivesFile, read_toml(path), str(path)).drives
-    check_keys(own, DRIVES, f"{path}: drives")
-    return {key: np.array(numbers(value, chain.n, f"{path}: drives.{key}")) for key, value in own.items()}
+    stated, where = read(_DrivesFile, given, "drives")
+    check_keys(stated.drives, DRIVES, f"{where}: drives")
+    return {key: np.array(numbers(value, chain.n, f"{where}: drives.{key}")) for key, value in stated.drives.items()}
 
 
 def _check_places(path: JointPath, known: MotionLimits) -> None:
@@ -203,15 +204,15 @@ def _check(settings: PlanSettings) -> None:
 
 
 def _law(
-    chain: Chain, folder: Path | None, payloads: Sequence[str], drives_file: Path | None, known: MotionLimits
+    chain: Chain, folder: Path | None, payloads: Sequence[str], drives: Tables | None, known: MotionLimits
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
     """Return the dynamics: identified, or the robot's inertias with stated drives; None without any."""
     if folder is not None:
-        require(drives_file is None, "model and drives both say what the drives are; take one of them away", UsageError)
+        require(drives is None, "model and drives both say what the drives are; take one of them away", UsageError)
         law, unsure = _identified(chain, folder, payloads)
         return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
     try:
-        stated = {} if drives_file is None else _read_drives(drives_file, chain)
+        stated = _read_drives(drives, chain)
         if known.friction is not None and not stated:
             stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
         if chain.inertias is None:

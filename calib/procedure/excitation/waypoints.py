@@ -26,11 +26,16 @@ MAX_ERROR = 1e-6  # [m and rad] that may be left
 
 
 def read_waypoints(
-    path: Path, chain: Chain, lower: np.ndarray, upper: np.ndarray, start: Sequence[float] | None = None
+    given: Path | Targets | np.ndarray,
+    chain: Chain,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    start: Sequence[float] | None = None,
 ) -> np.ndarray:
     """Return waypoints (m, n) [rad or m].
 
     Args:
+        given: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
         chain: whose tip stands at the places, the best geometry there is.
         lower, upper: (n,) joint limits to stay within.
         start: (n,) where the robot stands: the first place is reached near it; else near the middle of the limits.
@@ -38,9 +43,14 @@ def read_waypoints(
     Raises:
         UsageError: for a place out of reach: which one, and how far.
     """
-    if not {"x", "x_target"} & set(read_header(path)[0]):
-        return read_poses(path, chain.joint_names, kinds=joint_kinds(chain))
-    targets = read_targets(path, chain.joint_names, kinds=joint_kinds(chain))
+    if not isinstance(given, Path):
+        targets = Targets.of(given)
+    elif {"x", "x_target"} & set(read_header(given)[0]):
+        targets = read_targets(given, chain.joint_names, kinds=joint_kinds(chain))
+    else:
+        targets = Targets.of(read_poses(given, chain.joint_names, kinds=joint_kinds(chain)))
+    if targets.position is None and targets.q is not None:
+        return read_poses(targets.q, chain.joint_names)
     goal = Goal(Installation(chain), 3 if targets.rotation is None else 6, lower, upper)
     wanted = pose(targets.rotation, targets.position)
     low, high = (np.where(np.isfinite(x), x, s * np.pi) for x, s in ((lower, -1.0), (upper, 1.0)))

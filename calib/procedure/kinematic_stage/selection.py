@@ -9,7 +9,9 @@ from typing import Any, cast
 import numpy as np
 
 from calib import files
+from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError, require
 from calib.geometry.observability import observation, targets_of
@@ -106,8 +108,8 @@ def choose(
     m: int,
     settings: SelectionSettings = DEFAULT_SELECTION,
     *,
-    constraints: Path | None = None,
-    existing: Path | None = None,
+    constraints: Tables | None = None,
+    existing: Path | PoseMeasurements | np.ndarray | None = None,
     base: str | None = None,
     tip: str | None = None,
     map: Callable = map,
@@ -119,14 +121,14 @@ def choose(
         robot: see `calib.robot.load`.
         m: how many.
         settings: what is measured, index, method, seed.
-        constraints: see `calib.procedure.measuring.constraints_file`.
-        existing: CSV of poses measured before, which count.
+        constraints: see `calib.procedure.measuring.constraints_file`; a file, or its tables.
+        existing: poses measured before, which count: a CSV, or in memory.
         base, tip: links of a URDF.
         map: where parallel work runs (`calib.workers`).
         progress: called with (done, total, what).
     """
     require(m >= 1, f"-m {m}: at least one pose has to be chosen", UsageError)
-    chain, source = load_robot(robot, existing, FitOptions(), base, tip)
+    chain, source = load_robot(robot, existing if isinstance(existing, Path) else None, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
     limits = read_limits(constraints, cell, source, settings.without)
     view, joints = limits.camera, None

@@ -52,7 +52,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.config import parse, read_toml, strict
+from calib.config import read, strict
 from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, shown
 from calib.errors import require
 from calib.procedure.measuring.camera_view import UNKNOWN, CameraTable
@@ -193,8 +193,7 @@ class ConstraintsFile:
 
 def beside(path: Path) -> dict[str, Path]:
     """Return the files that a constraints file names, by name: a camera's lens and its board."""
-    table = {key: value for key, value in read_toml(path).items() if key not in MOTION}
-    camera = parse(ConstraintsFile, table, str(path)).camera
+    camera = read(ConstraintsFile, path, "", MOTION)[0].camera
     names = () if camera is None else (camera.lens, camera.board)
     return {name: path.parent / name for name in names if name != UNKNOWN}
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.config import check_keys, parse, read_toml
+from calib.config import Tables, check_keys, read
 from calib.config_types import number
 from calib.data.poses.pixels import IN_HAND
 from calib.errors import RobotError, UsageError, require
@@ -100,12 +100,12 @@ def _closing(model: Any, q: np.ndarray) -> np.ndarray:
 
 
 def read_limits(
-    path: Path | None, cell: Installation, source: Path | None = None, without: Sequence[str] = ()
+    given: Tables | None, cell: Installation, source: Path | None = None, without: Sequence[str] = ()
 ) -> Limits:
     """Read the constraints for an arm with its targets.
 
     Args:
-        path: the file; None for the defaults alone. Tables of motions (`MOTION`) may stand in it.
+        given: the file, or its tables; None for the defaults alone. Tables of motions (`MOTION`) may stand in it.
         cell: the arm, see `calib.geometry.observability.targets_of`.
         source: the robot's file, whose collision shapes are used where it is a URDF.
         without: names of `DEFAULTS` not to keep, and of `CELL` that are not there.
@@ -115,21 +115,23 @@ def read_limits(
     """
     if unknown := sorted(set(without) - {*DEFAULTS, *CELL}):
         raise UsageError(f"without {unknown[0]}: there are {', '.join((*DEFAULTS, *CELL))}")
-    table = {} if path is None else {key: value for key, value in read_toml(path).items() if key not in MOTION}
-    stated = parse(ConstraintsFile, table, str(path or "constraints"))
-    limits = limits_of(stated, cell, source, str(path or "constraints"), without)
-    if stated.camera is None or path is None:
+    stated, where = read(ConstraintsFile, given, "constraints", MOTION)
+    limits = limits_of(stated, cell, source, where, without)
+    if stated.camera is None:
         return limits
-    return _with_camera(limits, stated.camera, cell, path, {*stated.without, *without})
+    folder = given.parent if isinstance(given, Path) else Path()
+    return _with_camera(limits, stated.camera, cell, where, folder, {*stated.without, *without})
 
 
-def _with_camera(limits: Limits, stated: CameraTable, cell: Installation, path: Path, absent: set[str]) -> Limits:
+def _with_camera(
+    limits: Limits, stated: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
+) -> Limits:
     """Return limits that keep the board in the camera's view, past the arm's own links, where enough is known of it."""
     unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     if stated.unknown:
         return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))
     try:
-        view = camera_view(stated, cell.chain, str(path), path.parent)
+        view = camera_view(stated, cell.chain, where, folder)
     except RobotError as error:
         raise UsageError(str(error)) from error
     stand = invert(view.cell.stations[0])[:3, 3]

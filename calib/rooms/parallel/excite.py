@@ -110,9 +110,9 @@ class _ActuatorLimit:
         return result
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ParallelExcitation(ExcitationDesign):
-    """An exciting motion of a parallel robot; `designed` holds that of its platform's coordinates.
+    """An exciting motion of a parallel robot; what it holds of a design is its platform's coordinates'.
 
     Attributes:
         robot: with its file.
@@ -124,13 +124,13 @@ class ParallelExcitation(ExcitationDesign):
 
     def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s]; the motion repeats."""
-        family = self.designed.family
-        motion = dense_motion(family, self.designed.found.x, np.mod(times, family.period))
+        family = self.family
+        motion = dense_motion(family, self.found.x, np.mod(times, family.period))
         return motion.q, motion.v, motion.a
 
     def sampled(self, rate: float | None = None) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) of the actuators over one period at `rate` [Hz], ends included."""
-        track = self._actuators(folder.one_period(self.designed, rate))
+        track = self._actuators(folder.one_period(self, rate))
         return track.times, track.q, track.v, track.a
 
     def _actuators(self, track: Setpoints) -> Setpoints:
@@ -144,20 +144,20 @@ class ParallelExcitation(ExcitationDesign):
     @property
     def peaks(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) largest torque of each actuator [N m or N], (r,) largest acceleration of each coordinate."""
-        orders = self.orders(self.designed.period / INSTANTS * np.arange(INSTANTS))
+        orders = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
         return np.abs(self.plan.torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that the command writes: one period at the controller's rate, and the actuators' series."""
         from calib.procedure.report import motion_figures
 
-        one, bounds = folder.one_period(self.designed), self.designed.inputs.limits.bounds
+        one, bounds = folder.one_period(self), self.inputs.limits.bounds
 
         def more(place: Path) -> None:
             series = coefficients.table(self._series(), ROBOT, bounds.lines())
             files.write(place / coefficients.NAME, dumps(series))
             if plots:
-                motion_figures.write_design(self.designed, place)
+                motion_figures.write_design(self, place)
 
         return write_motion(self.robot, Path(out), self._actuators(one), one.q, bounds, self.to_dict(), more)
 
@@ -168,13 +168,13 @@ class ParallelExcitation(ExcitationDesign):
             max_error: by which the series may leave the motion [rad or m].
             samples: over the period, of which the series are made.
         """
-        x, _, _ = self.orders(self.designed.period / samples * np.arange(samples))
+        x, _, _ = self.orders(self.period / samples * np.arange(samples))
         lines = np.fft.rfft(self.robot.known.place(x).q[:, self.robot.chain.actuated], axis=0) / samples
         above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
         last = 1 + max(1, int((above[1:] > max_error).sum()))
         own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T)
-        names, rate = self.robot.chain.joint_names, self.designed.settings.rate
-        return coefficients.Periodic(names, self.designed.period, rate, 1, "fourier", own)
+        names, rate = self.robot.chain.joint_names, self.settings.rate
+        return coefficients.Periodic(names, self.period, rate, 1, "fourier", own)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
@@ -183,7 +183,7 @@ class ParallelExcitation(ExcitationDesign):
         return super().to_dict() | {key: own[key] if key == "robot" else own[key].tolist() for key in own}
 
     def __repr__(self) -> str:
-        return f"<ParallelExcitation for {self.robot.chain.name}: {self.designed.period:g} s>"
+        return f"<ParallelExcitation for {self.robot.chain.name}: {self.period:g} s>"
 
     def __str__(self) -> str:
         peaks = (f"{name} {peak:.3g}" for name, peak in zip(self.robot.chain.joint_names, self.peaks[0]))
@@ -263,7 +263,7 @@ def design_parallel(
         ExcitedModel(plan, plan, None, None, False), {}, IdentifiableColumns(None, sigmas, base.names), None,
     )  # fmt: skip
     asked = replace(settings, goals=("logdet",), harmonics=settings.harmonics or COARSE, samples=SAMPLES)
-    return ParallelExcitation(search_motion(given, asked, map, progress), robot, plan)
+    return ParallelExcitation(**vars(search_motion(given, asked, map, progress)), robot=robot, plan=plan)
 
 
 def actuator_bounds(known: ClosedRobot) -> MotionBounds:

@@ -14,9 +14,9 @@ from typing import Any, cast
 import numpy as np
 
 from calib.api.motions import MotionPlan
+from calib.arrays import shaped
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
-from calib.procedure.excitation.planning import Planned
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.excite import actuator_bounds, read_model, write_motion
@@ -76,9 +76,9 @@ class _PlatformDynamics:
         return np.array([False] * self.model.inertial + own)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ParallelPlan(MotionPlan):
-    """A planned motion of a parallel robot; `planned` holds that of its actuators.
+    """A planned motion of a parallel robot; what it holds of a plan is its actuators'.
 
     Attributes:
         robot: with its file.
@@ -94,14 +94,13 @@ class ParallelPlan(MotionPlan):
 
         def more(place: Path) -> None:
             if plots:
-                motion_figures.write_plan(self.planned, place)
+                motion_figures.write_plan(self, place)
 
-        own = self.planned
-        return write_motion(self.robot, Path(out), own.track, self.coordinates, own.bounds, self.to_dict(), more)
+        return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, self.to_dict(), more)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        track: Any = self.planned.track
+        track: Any = self.track
         peaks = {
             f"peak_{key}": np.abs(x).max(axis=0).tolist() for key, x in (("torque", track.tau), ("speed", track.v))
         }
@@ -110,7 +109,7 @@ class ParallelPlan(MotionPlan):
 
 def plan_parallel(
     robot: ParallelMechanism,
-    waypoints: Path,
+    waypoints: Path | np.ndarray,
     settings: PlanSettings = DEFAULT_PLAN,
     *,
     model: Path | None = None,
@@ -144,19 +143,21 @@ def plan_parallel(
     say("timing")
     timings = tuple(time_optimal(path, kept, law, rate=settings.rate) for path in own)
     motion = joined([track(one.path, one.profile, settings.rate, law.torque) for one in timings])
-    planned = Planned(
+    return ParallelPlan(
         chain=cast(Any, known.robot), bounds=bounds, limits=kept, lower=robot.joints.lower, upper=robot.joints.upper,
-        timings=timings, track=motion, notes=() if model else (FRICTIONLESS,),
+        timings=timings, track=motion, notes=() if model else (FRICTIONLESS,), robot=robot,
+        coordinates=coordinates_of(known, known.locate(motion.q)),
     )  # fmt: skip
-    return ParallelPlan(planned, robot, coordinates_of(known, known.locate(motion.q)))
 
 
-def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
-    """Return the platform coordinates (m, r) of waypoints in a CSV (see the module).
+def _read_waypoints(path: Path | np.ndarray, known: ClosedRobot) -> np.ndarray:
+    """Return the platform coordinates (m, r) of waypoints: an array of them, or a CSV (see the module).
 
     Raises:
         MeasurementError: for columns that are missing, and readings that no posture has.
     """
+    if not isinstance(path, Path):
+        return shaped(path, (None, len(known.robot.freedom)), "waypoints")
     table = read_table(path)
     if any(name in table for name in known.robot.freedom):
         return read_coordinates(table, known.robot)
