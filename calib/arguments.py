@@ -42,7 +42,7 @@ def _read_by_type(kind: Any) -> Any:
 
     @wraps(init)
     def call(self: Any, *args: Any, **kwargs: Any) -> None:
-        from calib.config import parse
+        from calib.config import parse, plain_values
         from calib.errors import quiet
 
         with quiet():
@@ -53,15 +53,6 @@ def _read_by_type(kind: Any) -> Any:
                 init(self)
 
     return call
-
-
-def plain_values(value: Any) -> Any:
-    """Return a value whose numbers and arrays of numpy, and tuples, are numbers and lists as a file holds them."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {key: plain_values(one) for key, one in value.items()}
-    return [plain_values(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
 def _bound(wanted: Signature, name: str, args: tuple, kwargs: dict[str, Any]) -> dict[str, Any]:

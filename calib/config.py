@@ -16,7 +16,6 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from calib.arguments import plain_values
 from calib.config_types import UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
 
@@ -103,6 +102,15 @@ def read(kind: type[T], given: Tables | None, name: str, others: Collection[str]
     else:
         table, place = read_toml(given), str(given)
     return parse(kind, {key: value for key, value in table.items() if key not in others}, place), place
+
+
+def plain_values(value: Any) -> Any:
+    """Return a value whose numbers and arrays of numpy, and tuples, are numbers and lists as a file holds them."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: plain_values(one) for key, one in value.items()}
+    return [plain_values(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
 def strict(kind: type[T]) -> type[T]:
