@@ -30,8 +30,7 @@ from worker_tasks import (
 )
 
 from calib.errors import CalibError, MeasurementError, TaskLost, UsageError
-from calib.workers import Workers, workers
-from calib.workers.interrupts import finishing
+from calib.workers import Workers, finishing, workers
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ def excite(
     """
     from calib.api.motions import design_excitation
     from calib.cli.destination import check_destination
-    from calib.workers.interrupts import finishing
+    from calib.workers import finishing
 
     check_destination("excite", robot, out, [robot, model, limits, *settings.existing])
     with progress() as say:

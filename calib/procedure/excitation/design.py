@@ -18,7 +18,7 @@ from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
-from calib.workers.interrupts import finishing
+from calib.workers import finishing
 from trajectories.basis import Family
 from trajectories.bspline import bspline_family
 from trajectories.constraints import MotionConstraint, TorqueLimit

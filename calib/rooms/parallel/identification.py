@@ -1,6 +1,6 @@
 """Identify a parallel robot from encoders and motor torques: rows on its platform, its actuators, or their power."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import Finding, UsageError
+from calib.errors import Finding, UsageError, finding
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
@@ -32,15 +32,15 @@ from calib.procedure.dynamic_stage.verdict import (
     with_duration,
     with_prior,
 )
-from calib.procedure.findings import Verdict, lines_of
+from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.robot_kinds import refuse_unread
+from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
 OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # settings
-APART = 1e-3  # rms by which redundant encoders contradict each other from which it is said [rad or m] (our choice)
-FEW = 200  # samples of a recording at which they are asked
+MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
 DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.MIN_ENERGY_SHARE`
 
 Recorded = str | Path | Recording
@@ -98,7 +98,10 @@ def identify_parallel(
         known, settings.sets, per_joint(settings.v0, 1, "v0")[0], rows, tuple(settings.payloads), settings.passive
     )
     found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
-    notes = (*parameter_warnings(found), *_payload_notes(model, found, inputs.cases), *_redundancy_notes(model))
+    noticed = [*_payloads(model, found, inputs.cases)]
+    if known.robot.redundant:
+        noticed.append(finding("torques-projected", actuators=known.robot.n, freedoms=known.robot.r))
+    notes = (*parameter_warnings(found), *lines_of(settle(noticed)))
     findings = ModelFindings(resting_parameters(found), notes)
     return ParallelDynamics(inputs, found, findings, assess(inputs, found, findings), seed=settings.seed)
 
@@ -115,9 +118,8 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
     validation |= {name: replace(one, evidence=name in proofs) for name, one in validation.items()}
     verdict, rules = _judged(model, found, cases, fit, proofs, repeated, excitation)
     notes = (
-        *lines_of(rules), *_contradictions(model, (*cases, *unseen)),
-        *motion_warnings(validation, repeated, excitation),
-        *findings.notes, *_recording_notes(model, (*cases, *unseen)),
+        *lines_of(rules), *motion_warnings(validation, repeated, excitation), *findings.notes,
+        *lines_of(settle(_encoders(model.known, (*cases, *unseen)))),
     )  # fmt: skip
     return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, Tracking())
 
@@ -145,7 +147,7 @@ def _driven_joints(
     ]  # fmt: skip
     taken, moved = np.zeros(len(joints)), 0.0
     for case in cases:
-        every = max(1, len(case.motion) // (10 * FEW))
+        every = max(1, len(case.motion) // (10 * MAX_SAMPLES))
         q, v, a = (getattr(case.motion, key)[::every] for key in "qva")
         motion, target = model.moved(q, v, a), case.target[::every]
         if case.torque_rows.name == PLATFORM:
@@ -180,62 +182,26 @@ def _of_arms(method: Method) -> bool:
     return method.needs_simulation or method.name == "ml"
 
 
-def _recording_notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
-    """Return what the files hold that takes no part."""
-    robot, notes = model.known.robot, []
+def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
+    """Yield whether redundant encoders agree, and which columns of the files take no part."""
+    robot = known.robot
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
+        q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
+        apart = float(np.sqrt(np.mean((q - known.locate(q).q[:, robot.actuated]) ** 2))) if robot.redundant else 0.0
+        yield finding("encoders-contradict", file=case.name, count=robot.n, rms=apart)
         unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
         if named := [name for name in passive if name in unread]:
-            notes.append(
-                f"{case.name}: {', '.join(named)} are passive joints: their encoders and torques take no part, the "
-                "loops say how they move"
-            )
-    return notes
+            yield finding("passive-joints-unread", file=case.name, joints=named)
 
 
-def _contradictions(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
-    """Return whether redundant encoders agree."""
-    robot, notes = model.known.robot, []
-    for case in cases if robot.redundant else ():
-        q = case.motion.q[:: max(1, len(case.motion) // FEW)]
-        apart = float(np.sqrt(np.mean((q - model.known.locate(q).q[:, robot.actuated]) ** 2)))
-        if apart > APART:
-            notes.append(
-                f"{case.name}: the {robot.n} encoders contradict each other by {1e3 * apart:.3g} mrad (or mm) rms: "
-                "zeros or geometry are off; fit them first: calib fit on the same readings"
-            )
-    return notes
-
-
-def _payload_notes(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> list[str]:
-    """Return what recordings with and without them say of the payloads."""
-    notes, estimate = [], found.fitted.estimate
+def _payloads(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
+    """Yield what recordings with and without them say of the payloads."""
+    masses = dict(zip(found.base.names, zip(found.fitted.estimate.values, found.fitted.estimate.sigma)))
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)
-        if on == 0:
-            notes.append(f"payload '{label}' is on board of no training recording: nothing is known of it")
-        elif on == len(cases):
-            notes.append(
-                f"payload '{label}' is on board of every recording: its parameters are regrouped with the platform's; "
-                "a run without it separates them"
-            )
-        elif f"M{label}" in found.base.names:
-            k = found.base.names.index(f"M{label}")
-            mass, sigma = estimate.values[k], estimate.sigma[k]
-            if mass < 3.0 * sigma:
-                notes.append(
-                    f"payload '{label}': {mass:.3g} ± {sigma:.2g} kg: the recordings said to carry it move as if it "
-                    "were not there"
-                )
-    return notes
-
-
-def _redundancy_notes(model: ParallelModel) -> list[str]:
-    robot = model.known.robot
-    if not robot.redundant:
-        return []
-    return [
-        f"{robot.n} actuators for {robot.r} freedoms: torques were projected on the platform's coordinates, the "
-        "overconstraint takes no part"
-    ]
+        if on in (0, len(cases)):
+            yield finding("payload-always" if on else "payload-never", label=label)
+        elif f"M{label}" in masses:
+            mass, sigma = masses[f"M{label}"]
+            yield finding("payload-absent", label=label, mass=mass, sigma=sigma, sigmas=-mass / sigma)
