@@ -34,11 +34,9 @@ from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.rooms.parallel.excite import ParallelExcitation, design_parallel
-from calib.rooms.parallel.mechanism import library, parallel_files
-from calib.rooms.parallel.mechanism.closure import closed
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
-from calib.rooms.parallel.robots import ParallelMechanism
+from calib.rooms.parallel.robots import find
 
 RATE, SECONDS = 1000.0, 6.0  # of a recording: Hz, s
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}  # truth: mass as weighed, the others as the papers identify them
@@ -107,15 +105,14 @@ def designed(seed: int) -> ParallelExcitation:
     robot = Robot()
     settings = ExcitationSettings(period=0.5, harmonics=5, starts=1, evaluations=MOST, seed=seed, rate=RATE)
     limits = np.array([ACCELERATION, ACCELERATION, np.inf])
-    found = ParallelMechanism(robot.known, library.path("dualv"))
-    return design_parallel(found, robot.model, robot.values, settings, acceleration=limits, preload=PRELOAD)
+    return design_parallel(find("dualv"), robot.model, robot.values, settings, acceleration=limits, preload=PRELOAD)
 
 
 class Robot:
     """The simulated robot: library geometry, parameters of its file, friction, and a payload that may be on board."""
 
     def __init__(self) -> None:
-        self.known = closed(parallel_files.read(library.path("dualv")))
+        self.known = find("dualv").known
         self.model = make_parallel_model(self.known, ["Fv Fc"], v0=0.05, payloads=["5"])
         bodies = self.model.known_parameters()
         self.values = np.concatenate([bodies, [FRICTION[one.name[:2]] for one in self.model.terms]])

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from calib.errors import Unidentifiable
-from calib.rooms.parallel.mechanism import library, parallel_files
 from calib.rooms.parallel.mechanism.closure import closed, coordinates_of
 from calib.rooms.parallel.mechanism.geometric_fit import changed, fit_loops, loop_parameters, platform_errors
+from calib.rooms.parallel.robots import find
 
 NOISE = 1e-5  # of the encoders [rad or m]
 
 
 def planted(name: str, seed: int = 0, rows: int = 60):
     """Return nominal and true robot, and readings and platform coordinates of the true one."""
-    nominal, rng = closed(parallel_files.read(library.path(name))), np.random.default_rng(seed)
+    nominal, rng = find(name).known, np.random.default_rng(seed)
     parameters = loop_parameters(nominal)
     true = closed(changed(nominal.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
     x = 0.9 * rng.uniform(nominal.robot.lower, nominal.robot.upper, (rows, nominal.robot.r))
@@ -52,6 +52,6 @@ def test_readings_alone_tell_nothing_without_redundancy():
 
 def test_parameters_that_would_open_the_loops_are_left_out():
     """No axis of a planar robot tilts: its loops would not close; of a spatial one all may."""
-    names = [one.name for one in loop_parameters(closed(parallel_files.read(library.path("dualv"))))]
+    names = [one.name for one in loop_parameters(find("dualv").known)]
     assert "leg1.d2" in names and not any("alpha" in name or ".base.rx" in name or ".r2" in name for name in names)
-    assert any("alpha" in one.name for one in loop_parameters(closed(parallel_files.read(library.path("stewart")))))
+    assert any("alpha" in one.name for one in loop_parameters(find("stewart").known))

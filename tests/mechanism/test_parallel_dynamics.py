@@ -8,16 +8,16 @@ from closed_tree import ClosedTree
 
 from calib.dynamics import base as bases
 from calib.errors import UsageError
-from calib.rooms.parallel.mechanism import library, parallel_files
-from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
+from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import of_platform
+from calib.rooms.parallel.robots import find
 
 ROBOTS = ("dualv", "fivebar", "stewart")
 
 
 def robot(name: str) -> ClosedRobot:
-    return closed(parallel_files.read(library.path(name)))
+    return find(name).known
 
 
 def bodies(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -12,11 +12,10 @@ from calib.errors import CannotSimulate
 from calib.identification.cases import make_case
 from calib.identification.identify import identify_model
 from calib.identification.settings import IdentificationSettings
-from calib.rooms.parallel.mechanism import library, parallel_files
-from calib.rooms.parallel.mechanism.closure import closed
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
 from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
+from calib.rooms.parallel.robots import find
 
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}
 RATE = 1000.0
@@ -25,7 +24,7 @@ RATE = 1000.0
 @pytest.fixture(scope="module")
 def dualv():
     """Return the robot, its model with a payload, the true values, and runs without and with the payload."""
-    known = closed(parallel_files.read(library.path("dualv")))
+    known = find("dualv").known
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
     values = np.concatenate([model.known_parameters(), [{"Fv": 0.05, "Fc": 0.3}[one.name[:2]] for one in model.terms]])
     for name, value in PAYLOAD.items():
@@ -51,7 +50,7 @@ def run(model, values, carried, preload=10.0):
 
 def test_torques_are_shared_out_and_overconstraint_does_no_work():
     """τ = (Jᵀ)⁺ w + N c: the forces come back, c comes back, whatever c; without preload no torques are smaller."""
-    known = closed(parallel_files.read(library.path("dualv")))
+    known = find("dualv").known
     motion = along(known, *reference(0.3))
     rng = np.random.default_rng(2)
     forces, c = rng.normal(size=(len(motion.v), 3)), rng.normal(size=(len(motion.v), 1))
@@ -121,7 +120,7 @@ def test_what_cannot_be_simulated_is_said(dualv):
 @pytest.mark.parametrize("name", ["fivebar", "stewart"])
 def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
     """The five-bar's platform turns as its loop says: held torques meet those of the model as 1 / rate."""
-    known = closed(parallel_files.read(library.path(name)))
+    known = find(name).known
     model = make_parallel_model(known, ["Ia Fv Fc"], v0=0.05, passive="Fv")
     drives = {"Ia": 0.02, "Fv": 0.2, "Fc": 0.3}
     values = np.concatenate([model.known_parameters(), [drives[one.name[:2]] for one in model.terms]])
@@ -144,7 +143,7 @@ def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
 
 def test_slopes_for_the_design_are_derivatives():
     """Of Σ weights · W by x, v, a, against differences of the whole sum."""
-    known = closed(parallel_files.read(library.path("dualv")))
+    known = find("dualv").known
     model = make_parallel_model(known, ["Fv Fc"], v0=0.5)
     plan, rng = PlatformRegressor(model, np.arange(model.p)), np.random.default_rng(4)
     state = [0.5 * rng.uniform(known.robot.lower, known.robot.upper, (4, 3)), *rng.normal(size=(2, 4, 3))]

@@ -10,12 +10,12 @@ from without_figures import run
 
 import calib as api
 from calib.robot import library
-from calib.rooms.parallel.mechanism import library as parallel
 from calib.rooms.parallel.mechanism import parallel_files
 from calib.rooms.parallel.mechanism.closure import closed
 from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model
 from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
+from calib.rooms.parallel.robots import find
 
 HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
 
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
     The torques are those that the motion needs, by the model: a simulation's kernel would be compiled for 14 s.
     """
     path = tmp_path_factory.mktemp("dualv")
-    known = closed(parallel_files.read(parallel.path("dualv")))
+    known = find("dualv").known
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("M5")] = 5.37
@@ -217,4 +217,5 @@ def test_a_payload_on_board_of_every_run_is_told(folder, tmp_path, capsys):
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():
-    assert not set(parallel.names()) & set(library.names()) and "dualv" in parallel.names()
+    parallel = parallel_files.library()
+    assert not set(parallel) & set(library.names()) and "dualv" in parallel

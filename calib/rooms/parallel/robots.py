@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.data.recordings.recording import Joints
 from calib.robot.calibrated import ROBOT
-from calib.rooms.parallel.mechanism import library, parallel_files
+from calib.rooms.parallel.mechanism import parallel_files
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 
@@ -87,7 +87,7 @@ def path_of(robot: object) -> Path | None:
     path = Path(robot) / ROBOT if Path(robot).is_dir() else Path(robot)
     if path.is_file():
         return path if path.suffix == ".toml" and parallel_files.is_parallel(path) else None
-    return library.path(str(robot)) if str(robot) in library.names() else None
+    return parallel_files.library().get(str(robot))
 
 
 def find(robot: object) -> ParallelMechanism | None:

@@ -47,6 +47,11 @@ _PLATFORM = ("freedom", "lower", "upper", "home", "inertia")
 _LEG = ("name", "base", "attachment", "end", "actuated", "home", "tail", "joint")
 
 
+def library() -> dict[str, Path]:
+    """Return the files of the parallel robots that come along, by name."""
+    return {path.stem: path for path in sorted(Path(__file__).with_name("library").glob("*.toml"))}
+
+
 def is_parallel(path: str | Path) -> bool:
     """Tell whether a TOML file says of itself that it holds a parallel robot, or has the tables of one."""
     table = load(path)

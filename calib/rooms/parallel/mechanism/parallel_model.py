@@ -26,7 +26,7 @@ from calib.dynamics.torque_rows import MOTOR, POWER, Projection, TorqueRows, pro
 from calib.errors import CalibError, UsageError, require
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, FORCES
-from calib.rooms.parallel.mechanism.velocities import LoopMotion, loop_jacobians, of_platform, of_readings
+from calib.rooms.parallel.mechanism.velocities import LoopMotion, cross, loop_jacobians, of_platform, of_readings
 from calib.transforms import pose as assembled
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -45,7 +45,7 @@ def wrench_regressor(
     """
     R, lever = _frame(pose, placement)
     turn, turning = twist[:, 3:], change[:, 3:]
-    linear = change[:, :3] - gravity + _cross(turning, lever) + _cross(turn, _cross(turn, lever))
+    linear = change[:, :3] - gravity + cross(turning, lever) + cross(turn, cross(turn, lever))
     a, w, b = (np.einsum("nji,nj->ni", R, x) for x in (linear, turn, turning))
     own = np.zeros((len(R), 6, 10))
     spin = _skew(w)
@@ -64,11 +64,11 @@ def energy_columns(
     """Return kinetic and potential energy (N, 10) per unit of each standard parameter; arguments as above."""
     R, lever = _frame(pose, placement)
     turn = twist[:, 3:]
-    u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3] + _cross(turn, lever), turn))
+    u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3] + cross(turn, lever), turn))
     result = np.empty((len(R), 10))
     result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, _inertia_columns(w))
     down = np.einsum("nji,j->ni", R, gravity)
-    result[:, 6:9] = _cross(u, w) - down  # u · (w × s) = s · (u × w)
+    result[:, 6:9] = cross(u, w) - down  # u · (w × s) = s · (u × w)
     result[:, 9] = 0.5 * np.sum(u**2, axis=1) - (pose[:, :3, 3] + lever) @ gravity
     return result
 
@@ -94,10 +94,6 @@ def _inertia_columns(w: np.ndarray) -> np.ndarray:
         if i != j:
             result[:, j, k] += w[:, i]
     return result
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 RATE = 3.0  # of random states: m/s or rad/s, and per s (as `IdentificationModel.sample`)

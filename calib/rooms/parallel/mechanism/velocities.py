@@ -125,13 +125,13 @@ def _end_bias(one: LegLinks, v: np.ndarray) -> np.ndarray:
     w, result = np.zeros((len(v), 3)), np.zeros(one.full.shape[:2])
     for j in range(v.shape[1]):
         moved, turned = one.full[:, :3, j] * v[:, j : j + 1], one.full[:, 3:, j] * v[:, j : j + 1]
-        result[:, :3] += _cross(2.0 * w + turned, moved)
-        result[:, 3:] += _cross(w, turned)
+        result[:, :3] += cross(2.0 * w + turned, moved)
+        result[:, 3:] += cross(w, turned)
         w = w + turned
     return result[:, : one.gap.shape[1]]
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return a × b (N, 3); numpy's takes ten times as long for few samples."""
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
