@@ -9,7 +9,13 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
     image_folders          a module: `read_images` reads a folder of images as a block of measurements
-    camera_guess           a module: cameras and boards placed by images, lenses completed
+    camera_guess           a module: lenses of images completed, images as poses
+    optics                 of kinds of measurement that are not the core's: their instruments' parameters
+                           (`calib.geometry.installation.NoOptics`); loading it registers guesses and residuals
+    read_optics            the same from the tables of a fit's ``robot.toml``
+    camera_view            what a camera sees, of a constraints file; read_lens, read_board: its files
+    fit_notes              functions: a fit → findings on it; image_coverage, reprojection: figures of its images
+    image_words            what is said of images as they arrive
     recordings             functions: a session's folder → the name of the recording written there
 
 A room that is deleted takes its commands, methods and robots along; the rest works without.

@@ -16,9 +16,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from strategies import damaged
 
-from calib.data.camera.board import Board, read_board, write_board
-from calib.data.camera.camera_info import read_lens, write_lens
-from calib.data.camera.lens import pinhole
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.plans import read_poses
 from calib.data.poses.pose_files import read_measurements
@@ -46,11 +43,14 @@ from calib.procedure.session.settings import (
 from calib.robot import description
 from calib.robot.formats import urdf_write
 from calib.robot.load import load
-from calib.rooms.camera.board_print import raster
-from calib.rooms.camera.corner_file import Found, read_corners, write_corners
-from calib.rooms.camera.detection import detect
-from calib.rooms.camera.images import decode as read_image_of
-from calib.rooms.camera.images import read_image
+from calib.rooms.camera.board import Board, read_board, write_board
+from calib.rooms.camera.camera_info import read_lens, write_lens
+from calib.rooms.camera.lens import pinhole
+from calib.rooms.camera.pictures.board_print import raster
+from calib.rooms.camera.pictures.corner_file import Found, read_corners, write_corners
+from calib.rooms.camera.pictures.detection import detect
+from calib.rooms.camera.pictures.images import decode as read_image_of
+from calib.rooms.camera.pictures.images import read_image
 
 CHECKS = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 FEW = settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=CHECKS)

@@ -4,11 +4,10 @@ With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 
 * full pose  B_i = S A_i X: rotations by Shah (2013, "Solving the robot-world/hand-eye calibration problem using the
   Kronecker product"), then the two translations linearly; or, where poses hold nearly one orientation, which leaves
-  these open, by turns and ways together (`calib.geometry.images.hand_eye`);
+  these open, by turns and ways together (`calib.geometry.hand_eye`);
 * position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
 * sockets    R_i t + a_i constant within each group: linear in t;
-* images     the board's pose in each (PnP), and of three closed forms for B_i = S A_i X the best
-             (`calib.geometry.images.hand_eye`).
+* images     as the room for cameras registers it.
 
 Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
 """
@@ -20,13 +19,11 @@ from functools import singledispatch
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
-from calib.data.poses.pixels import Pixels
+from calib.data.poses.measurements import KINDS, PoseMeasurements, Poses, Positions, Sockets, take
 from calib.errors import refuse_data
 from calib.extensions import needed
-from calib.geometry.images.hand_eye import average_pose, chordal_turns, place_pose
-from calib.geometry.images.optics import BoardShape, Optics
-from calib.geometry.installation import Installation
+from calib.geometry.hand_eye import average_pose, chordal_turns, place_pose
+from calib.geometry.installation import Installation, NoOptics
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -57,15 +54,17 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     Raises:
         MeasurementError: too few rows to place an instrument.
     """
+    foreign = [block for block in measured if block.kind not in KINDS]
+    optics = needed("optics")(foreign) if foreign else NoOptics()  # registers guesses and residuals, too
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
-    for block in sorted(measured, key=lambda b: (_rank(b), -_turning(chain, b), -len(b))):
+    for block in sorted(measured, key=lambda b: (b.placing, -_turning(chain, b), -len(b))):
         block = take(block, np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int)))
         arm = forward(chain, block.q)
         check_scale(block, chain)
         for number in np.unique(block.tool):
             name, rows = block.tool_names[number], block.tool == number
-            station, tool = _guess(block, arm, rows, stations.get(block.station), tools.get(name))
+            station, tool = guess(block, arm, rows, stations.get(block.station), tools.get(name))
             tools.setdefault(name, tool)
             if block.has_instrument and station is not None:
                 stations.setdefault(block.station, station)
@@ -78,7 +77,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
         station_names,
         tool_names,
         known=known or Deflection(),
-        optics=_optics(measured),
+        optics=optics,
     )
 
 
@@ -139,12 +138,6 @@ def _likely_units(block: Positions, chain: Chain, measured: float, predicted: fl
     return ".", guesses[-1][2]
 
 
-def _rank(block: PoseMeasurements) -> int:
-    """Return how far behind others a block's kind is in telling where instrument and target stand."""
-    telling = (Poses, Pixels, Positions, Sockets)
-    return next((rank for rank, kind in enumerate(telling) if isinstance(block, kind)), len(telling))
-
-
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
     """Return how far a block's poses turn about their second axis, rms in steps of `TURN`, up to `TURNED` of them."""
     rows = np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int))
@@ -158,14 +151,14 @@ Guess = tuple[np.ndarray | None, np.ndarray]
 
 
 @singledispatch
-def _guess(
+def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
     """Place one target of a block, and its station where it is not placed yet; by the type of the measurements."""
     return None, np.eye(4) if tool is None else tool
 
 
-@_guess.register
+@guess.register
 def _guess_from_poses(
     block: Poses, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
@@ -178,39 +171,7 @@ def _guess_from_poses(
     return place_pose(arm[rows], seen)
 
 
-@_guess.register
-def _guess_from_images(
-    block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
-) -> Guess:
-    return needed("camera_guess").guess_frames(block, arm, station, tool)
-
-
-def _optics(measured: Sequence[PoseMeasurements]) -> Optics:
-    """Return the cameras and boards of all images; of several blocks by one camera the first says its lens.
-
-    Raises:
-        MeasurementError: for images whose camera is not known, or one camera with images of two sizes.
-    """
-    lenses, boards, free = {}, {}, set[str]()
-    for block in measured:
-        if not isinstance(block, Pixels):
-            continue
-        if block.lens is None or not block.mounting:
-            refuse_data(block.file, "lens and mounting of the camera are not known (see complete_camera)")
-        lens = lenses.setdefault(block.camera, block.lens)
-        if lens.size != block.lens.size or lens.model != block.lens.model:
-            refuse_data(
-                block.file,
-                f"camera '{block.camera}' took images of {lens.size} and of {block.lens.size} pixels: are these two "
-                "cameras? Give --tools each (a camera in the hand) or --stations each, or name them in the options",
-            )
-        boards.setdefault(block.target, BoardShape())
-        for name in block.free:
-            free.add(f"{block.camera if name in lens.names else block.target}.{name}")
-    return Optics(tuple(lenses.values()), tuple(lenses), tuple(boards.values()), tuple(boards), frozenset(free))
-
-
-@_guess.register
+@guess.register
 def _guess_from_positions(
     block: Positions, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
@@ -218,7 +179,7 @@ def _guess_from_positions(
     return _place_position(arm[rows], block.position[rows], station, tool)
 
 
-@_guess.register
+@guess.register
 def _guess_from_sockets(
     block: Sockets, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:

@@ -198,7 +198,7 @@ def fit_with_prior(
         if settled is not None:
             return weigher.result(settled)
     assert solution is not None
-    weigher.sigmas, weigher.weights, weigher.noises, weigher.shared = weigher.used
+    weigher.sigmas, weigher.weights, weigher.noises = weigher.used
     return weigher.result(solution)
 
 

@@ -2,17 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from calib.arrays import frozen
-from calib.geometry.images.optics import Optics, View
+from calib.data.poses.measurements import PoseMeasurements
 from calib.robot.calibrated import Deflection, extra_displacements
 from calib.robot.chain import Chain
 from calib.robot.kinematics import Sweep, sweep
 
 FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class NoOptics:
+    """The parameters that instruments add to an installation, where none does; see a camera's for one that does."""
+
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    values = frozen(np.zeros(0))
+    moving = frozen(np.zeros(0), int)
+
+    def __len__(self) -> int:
+        return 0
+
+    def like(self, other: Any) -> NoOptics:
+        """Return the same instruments with the values of another's."""
+        return self
+
+    def view(self, measured: PoseMeasurements, free: np.ndarray) -> Any:
+        """Return what predicts a block's rows beside the poses; `free` counts from the first of these parameters."""
+        return None
+
+    def tables(self) -> Mapping[str, Any]:
+        """Return the tables of ``robot.toml`` that hold the parameters."""
+        return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +52,7 @@ class Installation:
         station_names, tool_names: S and T strings.
         deflection: what q does not say (stiffness, coupling, harmonics), to be fitted.
         known: deflections found earlier, which stay as they are.
-        optics: cameras and boards, where images were taken.
+        optics: cameras and boards, where images were taken: parameters with what `NoOptics` has.
     """
 
     chain: Chain
@@ -36,7 +62,7 @@ class Installation:
     tool_names: tuple[str, ...] = ("tool",)
     deflection: Deflection = field(default_factory=Deflection)
     known: Deflection = field(default_factory=Deflection)
-    optics: Optics = field(default_factory=Optics)
+    optics: Any = field(default_factory=NoOptics)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stations", frozen(self.stations))
@@ -60,13 +86,13 @@ class Seen:
         walked: the pass along the chain, in the station's frame.
         point: (3, m) target positions [m].
         rotation: (3, 3, m) target rotations, ``rotation[c]`` being column c.
-        view: the camera and the board of images; None for other instruments.
+        view: of images, what of camera and board they are predicted with; None for other instruments.
     """
 
     walked: Sweep
     point: np.ndarray
     rotation: np.ndarray
-    view: View | None = None
+    view: Any = None
 
     def poses(self) -> np.ndarray:
         """Return the target poses (m, 4, 4) in the station's frame."""

@@ -7,28 +7,20 @@ Beside the calibrated robot itself (`calib.robot.description`, `calib.robot.cali
     xyz = [1.0, 0.0, 0.3]            # and rpy; or matrix
     [[tool]]                         # pose of the target in the tip's frame
     name = "tool"
-    [[camera]]                       # of images: its lens
-    name = "camera"
-    model = "pinhole"                # or fisheye
-    size = [2448, 2048]              # of its images [px]
-    values = [2400.0, ...]           # fx fy cx cy k1 k2 p1 p2 k3 [k4 k5 k6], or fx fy cx cy k1 k2 k3 k4
-    [[board]]                        # the print: scale, and bending [1/m]
-    name = "board"
-    scale = 1.0
+    [[camera]]                       # and [[board]], of images: see `calib.rooms.camera.optics`
     [provenance]
     nominal_station = [...]          # and nominal_tool: the frames that let the nominal arm fit best
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from calib.data.camera.lens import Lens
 from calib.errors import CalibError, RobotError, refused_as
-from calib.geometry.images.optics import BoardShape, Optics
+from calib.extensions import needed
 from calib.geometry.installation import Installation
 from calib.records import read_record
 from calib.robot import calibrated
@@ -40,34 +32,13 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class _Camera:
-    """An entry of ``camera``."""
-
-    name: str
-    model: str
-    size: tuple[int, int]
-    values: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class _Board:
-    """An entry of ``board``."""
-
-    name: str
-    scale: float = 1.0
-    bend_xx: float = 0.0
-    bend_xy: float = 0.0
-    bend_yy: float = 0.0
-
-
-@dataclass(frozen=True)
 class _Frames:
     """The tables of stations and tools, each entry with a name and a placement."""
 
     station: tuple[Mapping[str, Any], ...] = ()
     tool: tuple[Mapping[str, Any], ...] = ()
-    camera: tuple[_Camera, ...] = ()
-    board: tuple[_Board, ...] = ()
+    camera: tuple[Mapping[str, Any], ...] = ()
+    board: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,15 +51,8 @@ class _NominalFrames:
 
 def frame_tables(cell: Installation) -> dict[str, Any]:
     """Return the tables ``station`` and ``tool`` of an installation, and those of its cameras and boards."""
-    optics, seen = cell.optics, dict[str, Any]()
-    if len(optics):
-        lenses, boards = zip(optics.lens_names, optics.lenses), zip(optics.board_names, optics.boards)
-        seen["camera"] = [
-            {"name": n, "model": each.model, "size": list(each.size), "values": each.values.tolist()}
-            for n, each in lenses
-        ]
-        seen["board"] = [{"name": n, **asdict(each)} for n, each in boards]
-    return seen | {
+    return {
+        **cell.optics.tables(),
         "station": [{"name": n, **placement_table(t)} for n, t in zip(cell.station_names, cell.stations)],
         "tool": [{"name": n, **placement_table(t)} for n, t in zip(cell.tool_names, cell.tools)],
     }
@@ -142,11 +106,8 @@ def _placed(chain: Chain, found: _Frames, where: str) -> Installation:
     if tools:
         given |= {"tool_names": tuple(tools), "tools": np.array(list(tools.values()))}
     if found.camera:
-        with refused_as(RobotError, CalibError, f"{where}: {{}}"):
-            lenses = tuple(Lens(each.model, np.array(each.values), each.size) for each in found.camera)
-        shapes = tuple(BoardShape(*list(asdict(each).values())[1:]) for each in found.board)
-        names = tuple(each.name for each in found.camera), tuple(each.name for each in found.board)
-        given["optics"] = Optics(lenses, names[0], shapes, names[1])
+        with refused_as(RobotError, (CalibError, ValueError), f"{where}: {{}}"):
+            given["optics"] = needed("read_optics")(found.camera, found.board)
     return Installation(chain, **given)
 
 

@@ -6,11 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.pixels import Pixels
 from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout_counts
-from calib.geometry.pixel_residuals import view_of
 from calib.geometry.residuals import Part, parts
 from calib.robot import calibrated
 from calib.robot.kinematics import element_jacobian
@@ -70,8 +68,8 @@ def predict(cell: Installation, block: Block) -> Seen:
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
     seen = predict(cell, block)
-    if isinstance(block.measured, Pixels):
-        seen = replace(seen, view=view_of(cell, block.measured, free))
+    if len(cell.optics):
+        seen = replace(seen, view=cell.optics.view(block.measured, free - sum(layout_counts(cell)[:3])))
     return parts(block.measured, seen, target_jacobian(cell, seen, free, block.station, block.tool, block.bases))
 
 

@@ -8,8 +8,9 @@ the Jacobian is Kaufman's 1975, whose gradient is exact).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import singledispatch
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,6 +31,7 @@ class Part:
         sigma: (rows, m) stated standard deviations; None where they are to be estimated.
         nuisances: unknowns that were eliminated.
         index: (m,) the measurement's rows these residuals belong to.
+        noise: errors that rows have in common, as `fill` whitens by, see `common_noise`; None for none.
     """
 
     label: str
@@ -38,6 +40,8 @@ class Part:
     sigma: np.ndarray | None
     nuisances: int
     index: np.ndarray
+    _: KW_ONLY
+    noise: Any = None
 
     @property
     def height(self) -> int:
@@ -71,6 +75,21 @@ class Part:
     def per_row(self) -> Part:
         """Return the part with one column per measured row, in a unit of its nature."""
         return self
+
+    def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> Any:
+        """Return the errors that rows have in common, estimated from residuals at a state; None where there are none.
+
+        Args:
+            sigma: (rows, m) standard deviations.
+            unknowns: parameters fitted to the residuals.
+            loss, scale: of a robust fit.
+            start: whether a fit begins here, where residuals do not yet show what they have in common.
+        """
+        return None
+
+    def alone(self, sigma: np.ndarray) -> np.ndarray:
+        """Return the residuals (rows, m) without what rows have in common."""
+        return self.value
 
 
 @singledispatch

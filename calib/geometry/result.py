@@ -1,6 +1,7 @@
 """What a geometric fit returns, and how it looks row by row."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -9,10 +10,8 @@ from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution
-from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block
-from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -93,13 +92,10 @@ class GeometricFit:
             np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
         return result
 
-    def used_noises(self) -> list[ImageNoise | None]:
-        """Return per block the noise of its images; None where there are none."""
-        result: list[ImageNoise | None] = [None] * len(self.blocks)
-        for piece in self.pieces:
-            if isinstance(piece.part, PixelPart):
-                result[piece.block] = piece.part.noise
-        return result
+    def used_noises(self) -> list[Any]:
+        """Return per block the noise that its rows have in common; None where there is none."""
+        noises = {piece.block: piece.part.noise for piece in self.pieces if piece.part.noise}
+        return [noises.get(number) for number in range(len(self.blocks))]
 
     def used_sigmas(self) -> list[dict[str, float]]:
         """Return per block the rms standard deviation used for each label [m or rad]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +11,9 @@ from calib.errors import UsageError, refuse_data
 from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution, covariance
-from calib.geometry.images.image_noise import ImageNoise, estimate_noise
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, stack
 from calib.geometry.parameters import layout, parameter_values
-from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit, Piece
 
@@ -66,9 +65,8 @@ class Weigher:
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.sigmas: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
-        self.noises: list[ImageNoise | None] = []
-        self.shared: list[np.ndarray | None] = []
-        self.used = self.sigmas, self.weights, self.noises, self.shared
+        self.noises: list[Any] = []
+        self.used = self.sigmas, self.weights, self.noises
 
     def parts(self, state: Installation, free: np.ndarray | None = None) -> list[Part]:
         """Return the residual parts of all blocks, with their Jacobian for `free`."""
@@ -78,11 +76,8 @@ class Weigher:
         return [part for own in found for part in own]
 
     def noisy(self, found: list[Part]) -> list[Part]:
-        """Return parts of images with the noise that they are whitened by."""
-        return [
-            replace(part, noise=noise, shared=shared) if isinstance(part, PixelPart) else part
-            for part, noise, shared in zip(found, self.noises, self.shared)
-        ]
+        """Return parts with the common noise that they are whitened by."""
+        return [replace(part, noise=noise) if noise else part for part, noise in zip(found, self.noises)]
 
     def update(self, state: Installation, first: bool) -> None:
         """Set sigmas and weights from the residuals at a state."""
@@ -99,17 +94,9 @@ class Weigher:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
         robustly = loss != "none"
         self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
-        self.noises, self.shared = [None] * len(found), [None] * len(found)
-        first_noise = 1e-4  # displacement [m] and turn [rad] of an image that a fit begins with (our choice)
-        for k, part in enumerate(found):
-            if isinstance(part, PixelPart):
-                unknowns = len(self.free) // len(found)
-                noise = estimate_noise(part.own_poses(self.sigmas[k]), unknowns, loss, self.settings.loss_scale)
-                if first and not robustly:
-                    noise = replace(noise, displacement=first_noise, turn=first_noise)
-                self.noises[k] = part.spread_over(noise)
-                self.shared[k] = replace(part, noise=self.noises[k]).shared_errors()
-                self.sigmas[k] = noise.factor * self.sigmas[k]
+        known = len(self.free) // len(found), loss, self.settings.loss_scale, first and not robustly
+        self.noises = [part.common_noise(sigma, *known) for part, sigma in zip(found, self.sigmas)]
+        self.sigmas = [noise.factor * sigma if noise else sigma for noise, sigma in zip(self.noises, self.sigmas)]
         self.weights = [
             robust.weights(_size(part, sigma), loss, self.settings.loss_scale)
             for part, sigma in zip(found, self.sigmas)
@@ -120,7 +107,7 @@ class Weigher:
 
         A common factor on all sigmas changes nothing but the scale, unless a prior stands against them.
         """
-        before, weights, noises, shared = self.used = self.sigmas, self.weights, self.noises, self.shared
+        before, weights, noises = self.used = self.sigmas, self.weights, self.noises
         self.update(solution.state, first=False)
         ratios = [float(np.mean(new / old)) for new, old in zip(self.sigmas, before)]
         steady = all(np.abs(new - old).max(initial=0.0) < 0.02 for new, old in zip(self.weights, weights))
@@ -129,7 +116,7 @@ class Weigher:
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
         if self.prior is not None or any(noises):
-            self.sigmas, self.weights, self.noises, self.shared = before, weights, noises, shared
+            self.sigmas, self.weights, self.noises = before, weights, noises
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
@@ -178,6 +165,5 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
 
 
 def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
-    """Return each row's residual in sigmas, root mean square over its components (m,); a corner's within its image."""
-    value = part.within(sigma) if isinstance(part, PixelPart) else part.value
-    return np.sqrt(np.mean((value / sigma) ** 2, axis=0))
+    """Return each row's residual in sigmas, root mean square over its components (m,), without common noise."""
+    return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

@@ -32,15 +32,16 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.camera.lens import Lens
+from calib.data.poses.choices import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit
 from calib.geometry.parameters import layout
 from calib.robot.chain import random_joints
 from calib.rooms.camera.camera_guess import complete_camera, pnp_poses
-from calib.rooms.camera.image_folders import find_corners, read_images
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.pictures.image_folders import find_corners, read_images
+from calib.rooms.camera.pixels import Pixels
 from calib.rooms.cells.camera_cell import (
     FIVE_MEGAPIXEL,
     CameraCell,

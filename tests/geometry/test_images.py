@@ -11,14 +11,11 @@ from differences import check
 from planted import perturb
 from scipy.spatial.transform import Rotation
 
-from calib.data.camera.lens import Lens
+from calib.data.poses.choices import IN_HAND, TO_HAND
 from calib.data.poses.measurements import Positions, take
-from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, placed_on
-from calib.geometry.images.hand_eye import place_robustly
-from calib.geometry.images.optics import BoardShape
 from calib.geometry.installation import see
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout, step
@@ -27,6 +24,10 @@ from calib.robot.calibrated import Deflection
 from calib.robot.load import load
 from calib.rooms.camera.board_pose import board_poses
 from calib.rooms.camera.camera_guess import complete_camera
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.optics import BoardShape
+from calib.rooms.camera.pixels import Pixels
+from calib.rooms.camera.robust_placement import place_robustly
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
 from calib.rooms.cells.truth import position_errors
@@ -72,7 +73,7 @@ def test_the_residuals_slope_is_minus_the_jacobian(mounting, lens):
     ready = prepare(away, [block])[0]
     free = np.random.default_rng(0).permutation(len(layout(away).names))
     part = observe(away, ready, free)[0]
-    dense = part.dense()
+    dense = np.einsum("ncl,fln->fcn", part.local, part.jacobian[:, :, part.index])
     check(
         lambda x: observe(step(away, free, x), ready, NONE)[0].value / 1e3,
         -dense.transpose(1, 2, 0) / 1e3, np.zeros(len(free)), step=1e-6, tolerance=1e-6,
@@ -99,7 +100,7 @@ def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
         own = part.index == image
         local = part.local[own].reshape(-1, part.local.shape[2])
         slope = local @ part.jacobian[:, :, image].T
-        shared = part.shared[own].reshape(-1, 6)  # of the state that the last pass began at
+        shared = noise.shared[own].reshape(-1, 6)  # of the state that the last pass began at
         now = local[:, :6] @ part.carried[image] * noise.deviations
         assert np.abs(shared - now).max() < 0.05 * np.abs(now).max()
         sigma = piece.sigma.T[own].reshape(-1)
@@ -299,12 +300,13 @@ def test_a_flat_board_has_one_pose_even_from_afar():
 
 @pytest.mark.parametrize("method", ["Shah", "Li", "Park-Martin"])
 def test_every_closed_form_places_exact_poses(method, monkeypatch):
-    from calib.geometry.images import hand_eye
+    from calib.geometry.hand_eye import place_pose
+    from calib.rooms.camera import robust_placement as robust
 
     rng = np.random.default_rng(1)
     arm, station, tool = (pose(Rotation.random(n, rng=rng), rng.normal(size=(n, 3))) for n in (12, 1, 1))
     seen = station[0] @ arm @ tool[0]
-    only = {"Shah": hand_eye.place_pose, "Li": hand_eye._li, "Park-Martin": hand_eye._park_martin}[method]
+    only = {"Shah": place_pose, "Li": robust._li, "Park-Martin": robust._park_martin}[method]
     one, two = only(arm, seen)
     assert one == pytest.approx(station[0], abs=1e-9) and two == pytest.approx(tool[0], abs=1e-9)
     assert place_robustly(arm, seen, 1.0).error < 1e-9

@@ -50,7 +50,7 @@ from typing import Annotated, Any
 
 from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread  # fmt: skip
-from calib.data.poses.choices import MIN_SIGMA, Loss, Model
+from calib.data.poses.choices import IN_HAND, MIN_SIGMA, TO_HAND, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion
 from calib.units import ANGLES, LENGTHS
@@ -92,7 +92,7 @@ class Sigma:
 class CameraOptions:
     """[camera]: how images are understood."""
 
-    mounting: Annotated[str, OneOf(("auto", "in hand", "to hand"))] = "auto"
+    mounting: Annotated[str, OneOf(("auto", IN_HAND, TO_HAND))] = "auto"
     intrinsics: Annotated[str, OneOf(("auto", "given", "fit"))] = "auto"
     model: Annotated[str, OneOf(("pinhole", "fisheye"))] = "pinhole"
     board: Annotated[tuple[Annotated[str, OneOf(("scale", "bend"))], ...], Expect("a list of scale, bend")] = ()

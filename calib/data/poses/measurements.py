@@ -33,6 +33,7 @@ class PoseMeasurements:
     Of a kind:
         kind: its name in files.
         has_instrument: whether rows are seen from a station whose placement matters.
+        placing: rank among kinds in how well they place instrument and target, the best ones 0.
         per_row: fields that hold one entry per row (None where not stated), of whole numbers in `_COUNTS`.
     """
 
@@ -49,6 +50,7 @@ class PoseMeasurements:
 
     kind: ClassVar[str] = ""
     has_instrument: ClassVar[bool] = False
+    placing: ClassVar[int] = 4
     per_row: ClassVar[tuple[str, ...]] = ("q", "tool", "rows")
 
     def __post_init__(self) -> None:
@@ -99,6 +101,11 @@ class PoseMeasurements:
         return np.zeros((len(self), 0))
 
     @property
+    def carried(self) -> tuple[str, object]:
+        """What the arm carries: ``tool``, or an instrument or its target with what distinguishes it from others."""
+        return "tool", None
+
+    @property
     def states_sigma(self) -> bool:
         """Whether the file says how well it was measured."""
         return getattr(self, "sigma", None) is not None
@@ -122,6 +129,7 @@ class Positions(PoseMeasurements):
 
     kind: ClassVar[str] = "position"
     has_instrument: ClassVar[bool] = True
+    placing: ClassVar[int] = 2
     per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "position", "sigma")
 
     @property
@@ -144,6 +152,7 @@ class Poses(Positions):
     sigma_rotation: np.ndarray | None = None
 
     kind: ClassVar[str] = "pose"
+    placing: ClassVar[int] = 0
     per_row: ClassVar[tuple[str, ...]] = (*Positions.per_row, "quaternion", "sigma_rotation")
 
     @property
@@ -225,6 +234,7 @@ class Sockets(GroupedMeasurements):
     links: tuple[tuple[int, int, float], ...] = ()
 
     kind: ClassVar[str] = "sockets"
+    placing: ClassVar[int] = 3
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.errors import refuse_data
-from calib.geometry.images.hand_eye import place_pose
+from calib.geometry.hand_eye import place_pose
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
-from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
-from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.result import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -246,7 +245,7 @@ class _Rows:
     free: np.ndarray
     scales: Sequence[dict[str, float]]
     weights: Sequence[np.ndarray]
-    noises: Sequence[ImageNoise | None]
+    noises: Sequence[Any]
     torques: Sequence[np.ndarray | None] | None
 
     def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
@@ -264,15 +263,13 @@ class _Rows:
             pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
             for piece in filter(len, pieces):
                 ready = prepare(self.cell, [take(block, piece)], [None if torque is None else torque[piece]])
-                for part in observe(self.cell, ready[0], self.free):
-                    weight = self.weights[number][piece][part.index]
-                    if isinstance(part, PixelPart) and (noise := self.noises[number]) is not None:
-                        part = replace(part, noise=replace(noise, weight=np.ones(len(piece))))
+                noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
+                for bare in observe(self.cell, ready[0], self.free):
+                    part, weight = replace(bare, noise=noise), self.weights[number][piece][bare.index]
                     root = 1.0 / np.sqrt(weight)
                     own = gram(*part.whitened(root * self.scales[number][part.label]))
                     whitened = whitened + replace(own, rows=part.value.size)
                     if part.label in METRES:
-                        bare = replace(part, noise=None) if isinstance(part, PixelPart) else part
                         residual, matrix = bare.whitened(root * part.per_length)
                         count += float(weight.sum())
                         if moved is not None and moved[number]:

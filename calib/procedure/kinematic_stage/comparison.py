@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.extensions import offered
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
 from calib.geometry.checks.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.fit import placed_on
@@ -17,7 +18,6 @@ from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
-from calib.procedure.measuring.image_findings import reprojection
 from calib.robot.chain import Chain
 
 # of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all axes
@@ -143,10 +143,10 @@ def compare(
     one, two = (errors(cell, blocks, torques) for cell in cells)
     first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
     rigid = None if alone is None else errors(alone, blocks)
-    corners: Any = tuple(reprojection(cell, blocks, torques) for cell in cells)
+    corners: Any = [room(cell, blocks, torques) for room in offered("reprojection") for cell in cells]
     return Comparison(
         tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, repeated_poses(cells, blocks, torques), None if None in corners else corners,
+        shares_frames, repeated_poses(cells, blocks, torques), None if None in corners else tuple(corners) or None,
     )  # fmt: skip
 
 

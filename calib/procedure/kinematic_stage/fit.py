@@ -10,6 +10,7 @@ import numpy as np
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
+from calib.extensions import offered
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.unidentified import unidentified
@@ -30,7 +31,6 @@ from calib.procedure.kinematic_stage.metrics import Findings, Outlier
 from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
-from calib.procedure.measuring.image_findings import image_notes
 from calib.procedure.measuring.selection_prediction import SelectionPrediction, compared_with_fit
 from calib.robot.calibrated import CalibratedChain
 
@@ -153,7 +153,7 @@ def run(
         *([rigid_misfit] if rigid_misfit else []),
         *_moved_between(found.nominal.cell, inputs.fit, settings),
         *diagnose(found.fit),
-        *image_notes(found.fit),
+        *(note for notes in offered("fit_notes") for note in notes(found.fit)),
     ]
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
         notes.append(ratio)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.data.poses.choices import IMAGES, JOINTS, is_image_folder
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.data.poses.pixels import IN_HAND, JOINTS, Pixels, is_image_folder
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
@@ -243,8 +243,7 @@ def _checked(
     blocks: list[PoseMeasurements], chain: Chain, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
     blocks = [
-        needed("camera_guess").complete_camera(chain, each, like) if isinstance(each, Pixels) else each
-        for each in blocks
+        needed("camera_guess").complete_camera(chain, each, like) if each.kind == IMAGES else each for each in blocks
     ]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
@@ -297,10 +296,10 @@ def _named(
     Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
     """
     result, count, names = [], dict[str, int](), dict[Path, str]()
-    carried = list(dict.fromkeys(_carried(block) for _, block in read))
+    carried = list(dict.fromkeys(block.carried for _, block in read))
     for path, block in read:
         if tools == "one" and len(carried) > 1 and block.tool_names == (FileOptions().tool,):
-            block = replace(block, tool_names=(_carried_name(_carried(block), carried),))
+            block = replace(block, tool_names=(_carried_name(block.carried, carried),))
         if tools == "each":
             block = replace(block, tool_names=tuple(f"{path.stem} {name}" for name in block.tool_names))
         if path not in names:
@@ -312,13 +311,6 @@ def _named(
         result.append(replace(block, station=names[path]))
     targets = {name for block in result for name in block.tool_names}
     return [replace(b, station=f"{b.station} station") if b.station in targets else b for b in result]
-
-
-def _carried(block: PoseMeasurements) -> tuple[str, object]:
-    """Return what the arm carries, as far as it tells two tools apart: a target, a camera by its images, a board."""
-    if not isinstance(block, Pixels):
-        return FileOptions().tool, None
-    return ("camera", block.size) if block.mounting == IN_HAND else ("board", block.board)
 
 
 def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
@@ -338,7 +330,7 @@ def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
 
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
     """Return a validation block seen from a station of the fit, with the fit's tools."""
-    fit = [other for other in fit if _carried(other) == _carried(block)] or fit
+    fit = [other for other in fit if other.carried == block.carried] or fit
     first = fit[0]
     if block.has_instrument:
         stations = [other.station for other in fit if other.has_instrument]

@@ -152,3 +152,20 @@ class FitMetrics(ValidationMetrics):
     def proofs(self) -> dict[str, ComparedRows]:
         """Sets of rows that the fit has not seen, by name."""
         return {name: rows for name, rows in self.validation.items() if rows.unseen}
+
+
+@dataclass(frozen=True)
+class ImageCoverage:
+    """Where in its images a camera saw corners, and how well they are predicted there.
+
+    Attributes:
+        file: the images' folder.
+        size: width and height of the images [px].
+        count: corners per cell of the image, row by row.
+        rms: distance of corners seen from corners predicted [px], per cell; 0 where none was seen.
+    """
+
+    file: str
+    size: tuple[int, int]
+    count: tuple[tuple[int, ...], ...]
+    rms: tuple[tuple[float, ...], ...]

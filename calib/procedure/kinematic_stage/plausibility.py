@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.data.poses.choices import IMAGES
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.data.poses.pixels import Pixels
 from calib.errors import Finding, finding
 from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
@@ -133,7 +133,7 @@ def _as_positions(
     """Return blocks and torques with some images as the poses they show: a board's square is the scale there."""
     shown = []
     for block, torque in zip(blocks, torques):
-        if isinstance(block, Pixels):
+        if block.kind == IMAGES:
             rows = np.unique(np.linspace(0, len(block) - 1, MAX_IMAGES).astype(int))
             block = needed("camera_guess").pnp_poses(take(block, rows))
             torque = None if torque is None else torque[rows]

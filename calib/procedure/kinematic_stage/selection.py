@@ -14,13 +14,12 @@ from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError, require
-from calib.geometry.observability import observation, targets_of
+from calib.geometry.observability import Observation, observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-from calib.procedure.measuring.camera_view import ASSUMED, image_observation
 from calib.procedure.measuring.drivable import Drivable, Exchange, drivable
 from calib.procedure.measuring.pose_limits import Limits, read_limits
-from calib.procedure.measuring.prediction import Prediction, Seen, by_count
+from calib.procedure.measuring.prediction import Prediction, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
 from calib.procedure.measuring.run import Run, RunSettings
@@ -135,7 +134,7 @@ def choose(
     if view is None:
         jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
     else:
-        jacobian = image_observation(view, limits.lower, limits.upper, settings.seed)
+        jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
     if view is not None:
         if progress:
@@ -163,7 +162,7 @@ def choose(
     candidates = _drawn(space, limits, settings) if joints is None else joints
     found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
     comparable = float(found.history[0]) if method == "polish" else found.value
-    notes += [] if view is None else [ASSUMED]
+    notes += [] if view is None else [view.assumed]
     driven = drivable(
         chain, found.joints, Exchange(space.jacobian, candidates, before, index), limits, settings.run, settings.seed,
         lambda words: progress and progress(0, 1, words),
@@ -206,7 +205,7 @@ def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> n
 
 
 def _outlook(
-    seen: Seen,
+    seen: Observation,
     limits: Limits,
     search: SearchSettings,
     m: int,
@@ -226,7 +225,7 @@ def _outlook(
     return PoseOutlook(own, typical, others, blind, comparable)
 
 
-def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
+def _prediction(seen: Observation, outlook: PoseOutlook) -> SelectionPrediction | None:
     """Return what is kept of an outlook; None where a parameter is not identifiable."""
     own = outlook.poses
     if not np.isfinite(own.rms):
@@ -234,7 +233,7 @@ def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
     return SelectionPrediction(seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()))
 
 
-def _typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
+def _typical_poses(limits: Limits, seen: Observation, seed: int) -> np.ndarray:
     """Return poses (s, n) all over the workspace, seen or not, at which the tool's σ is predicted."""
     free = limits.space(seen, sight=False)
     stream = np.random.default_rng([seed, 2])
@@ -242,7 +241,7 @@ def _typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
 
 
 def _blind(
-    seen: Seen, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
+    seen: Observation, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
 ) -> tuple[float, Prediction]:
     """Return index and predicted σ when line-of-sight constraints are ignored."""
     quick = replace(search, method="detmax", climbs=0)

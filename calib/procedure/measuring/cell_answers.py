@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import parse
 from calib.config_types import Real
-from calib.data.camera.board import FILE, read_board
-from calib.data.camera.camera_info import read_lens
-from calib.data.poses.pixels import IN_HAND, TO_HAND
+from calib.data.poses.choices import BOARD, IN_HAND, TO_HAND
 from calib.errors import UsageError, require
+from calib.extensions import needed
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.transforms import pose, to_xyz_rpy
 
@@ -104,12 +103,12 @@ def _mounting(text: str) -> str:
     return held
 
 
-def _file(read: Any, text: str) -> str:
+def _file(read: str, text: str) -> str:
     """Return the path of a lens or a board that can be read."""
     path = Path(text).expanduser()
-    path = path / FILE if read is read_board and path.is_dir() else path
+    path = path / BOARD if read == "read_board" and path.is_dir() else path
     require(path.is_file(), "no such file; give one", ValueError)
-    read(path)
+    needed(read)(path)
     return str(path)
 
 
@@ -136,8 +135,8 @@ _KEYS: dict[str, tuple[str, Any]] = {  # of the limits file, and how the answer 
     "box": ("collision.box", _box),
     "obstacles": ("obstacle", _obstacles),
     "mounting": ("camera.mounting", _mounting),
-    "lens": ("camera.lens", partial(_file, read_lens)),
-    "board": ("camera.board", partial(_file, read_board)),
+    "lens": ("camera.lens", partial(_file, "read_lens")),
+    "board": ("camera.board", partial(_file, "read_board")),
     "carried": ("camera.carried", partial(_turned, "carried", MAX_HELD)),
     "stands": ("camera.stands", partial(_turned, "stands", MAX_FAR)),
 }

@@ -54,12 +54,14 @@ import numpy as np
 
 from calib.config import read, strict
 from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, shown
+from calib.data.poses.choices import IN_HAND, TO_HAND
 from calib.errors import require
-from calib.procedure.measuring.camera_view import UNKNOWN, CameraTable
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
 MARGIN, JOINT_MARGIN = 0.01, 0.01  # [m], share of a joint's range: where the file does not tell (our choice)
 DEFAULTS = ("self-collision", "floor", "joint-margin", "view")
+UNKNOWN = "unknown"
+VIEW_UNCHECKED = "whether the camera sees the board"
 CELL = ("instrument", "box", "obstacles")
 
 Metres = Annotated[float, Real(quantity="length")]
@@ -173,6 +175,36 @@ def _span_or_margin(value: Any) -> Any:
     if not all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in parts):
         raise ValueError(f"expected a list of 2 numbers, lower and upper, found {shown(value)}")
     return tuple(parts) if pair else value
+
+
+def _place_or_unknown(value: Any) -> Any:
+    if value != UNKNOWN and not isinstance(value, Mapping):
+        raise ValueError(f'expected a table with xyz and rpy, or "{UNKNOWN}", found {shown(value)}')
+    return value
+
+
+Place = Annotated[Any, Checked(_place_or_unknown, {"anyOf": [{"type": "object"}, {"const": UNKNOWN}]})]
+
+
+@strict
+@dataclass(frozen=True, kw_only=True)
+class CameraTable:
+    """[camera], see the module; what is ``unknown`` leaves unchecked whether the board is seen."""
+
+    mounting: Annotated[str, OneOf((IN_HAND, TO_HAND, UNKNOWN))]
+    lens: Name
+    board: Name
+    carried: Place
+    stands: Place
+    tilt: Annotated[float, Real(above=0, quantity="angle")] = float(np.radians(50.0))
+    range: Annotated[tuple[Distance, Distance], Expect("two distances, least and largest")] = (0.2, 3.0)
+    margin: Annotated[float, Real(least=0)] = 10.0
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """What would have to be known to tell whether the board is seen."""
+        names = ("mounting", "lens", "board", "carried", "stands")
+        return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 
 
 @strict

@@ -15,17 +15,18 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
-from calib.data.poses.pixels import IN_HAND
 from calib.errors import RobotError, UsageError, require
+from calib.extensions import needed
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
-from calib.procedure.measuring.camera_view import VIEW_UNCHECKED, CameraTable, CameraView, ImageObservation, camera_view
 from calib.procedure.measuring.constraints_file import (
     CELL,
     DEFAULTS,
     JOINT_MARGIN,
     MARGIN,
     MOTION,
+    VIEW_UNCHECKED,
+    CameraTable,
     CollisionTable,
     ConstraintsFile,
     TargetTable,
@@ -36,7 +37,6 @@ from calib.robot.description import TURNS, remarks
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import placement
-from calib.transforms import invert
 from calib.words import listing
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
@@ -54,7 +54,7 @@ class Limits:
         collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None without one.
         clearance: the least distance it asks for [m].
         sight: lines of sight; None where nothing is asked.
-        camera: the view of a camera, where that is the instrument.
+        camera: the view of a camera (`calib.rooms.camera.camera_view.CameraView`), where that is the instrument.
         views: what it takes to be seen by it.
         checked: what is kept, in words.
         unchecked: what cannot be, since nobody has stated it, in words.
@@ -70,10 +70,10 @@ class Limits:
     sight: Sight | None = None
     checked: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
-    camera: CameraView | None = None
+    camera: Any = None
     views: tuple[PoseConstraint, ...] = ()
 
-    def space(self, seen: Observation | ImageObservation, sight: bool = True) -> SearchSpace:
+    def space(self, seen: Observation, sight: bool = True) -> SearchSpace:
         """Return the continuous problem of choosing poses by what an instrument would see.
 
         Args:
@@ -85,7 +85,7 @@ class Limits:
         if self.collision is not None and self.collision.pairs:
             slope = partial(_closing, self.collision)
             kept = (*kept, PoseConstraint("collision", partial(_shortfall, self.collision, self.clearance), slope))
-        if self.sight is not None and sight and len(self.sight.targets) > 1 and isinstance(seen, Observation):
+        if self.sight is not None and sight and len(self.sight.targets) > 1 and seen.product is not None:
             rows = SeenOnly(seen, self.sight)
         return SearchSpace(rows, self.lower, self.upper, rows.product, kept)
 
@@ -131,15 +131,12 @@ def _with_camera(
     if stated.unknown:
         return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))
     try:
-        view = camera_view(stated, cell.chain, where, folder)
+        view = needed("camera_view")(stated, cell.chain, where, folder)
     except RobotError as error:
         raise UsageError(str(error)) from error
-    stand = invert(view.cell.stations[0])[:3, 3]
-    if view.mounting == IN_HAND:
-        stand = (invert(view.cell.stations[0]) @ [*(0.5 * np.array(view.board.extent)), 0.0, 1.0])[:3]
     arm = replace(view.cell, stations=np.eye(4)[None])
     model = None if "view" in absent else limits.collision
-    sight = sight_of(arm, stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
+    sight = sight_of(arm, view.stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
     found = (view.constraint(), *(sight.targets[0] if sight is not None else ()))
     words = "the whole board in the camera's view, its range and its tilt"
     past = ("view past the arm",) if sight is not None else ()

@@ -12,13 +12,11 @@ from numpy.typing import ArrayLike
 
 from calib.geometry.observability import Observation
 from calib.geometry.parameters import layout
-from calib.procedure.measuring.camera_view import ImageObservation
 from poses.design import Pool
 from poses.errors import NotIdentifiable, TooFewCandidates
 from poses.exchange import greedy
 from poses.information import prepared
 
-Seen = Observation | ImageObservation
 COUNTS = (10, 20, 40, 80)
 WORST = 0.95
 
@@ -52,7 +50,7 @@ class Prediction:
         return float(np.quantile(self.spread, WORST)) if np.isfinite(self.spread).all() else float("inf")
 
 
-def predicted(seen: Seen, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
+def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
     """Return what measurements with Jacobians (m, rows, p) will know of a tool at typical poses (s, n).
 
     Args:
@@ -77,7 +75,7 @@ def predicted(seen: Seen, jacobians: np.ndarray, typical: np.ndarray, poses: int
 
 
 def by_count(
-    seen: Seen,
+    seen: Observation,
     candidates: np.ndarray,
     typical: np.ndarray,
     before: np.ndarray | None = None,

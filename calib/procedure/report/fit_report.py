@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib import files
+from calib.data.poses.choices import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.pixels import Pixels
 from calib.errors import UsageError
+from calib.extensions import offered
 from calib.geometry.observation import predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
-from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
+from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
-from calib.procedure.measuring.image_findings import ImageCoverage, image_coverage
 from calib.records import read_json
 from calib.transforms import invert
 
@@ -148,7 +148,7 @@ def collect(outcome: Outcome) -> Report:
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
-        images=image_coverage(fit),
+        images=tuple(each for coverage in offered("image_coverage") for each in coverage(fit)),
     )
 
 
@@ -189,7 +189,7 @@ def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) ->
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
     result: dict[str, float | None] = {}
     for nature, name in (("position", "sigma"), ("orientation", "sigma_rotation")):
-        found = [(block, None if isinstance(block, Pixels) else getattr(block, name, None)) for block in blocks]
+        found = [(block, None if block.kind == IMAGES else getattr(block, name, None)) for block in blocks]
         # a kind with one number per row states it for each axis
         stated = [np.broadcast_to(s.reshape(len(block), -1), (len(block), 3)) for block, s in found if s is not None]
         whole = len(stated) == len(blocks)

@@ -11,11 +11,11 @@ from rich.text import Text
 
 from calib.config import parse
 from calib.errors import UsageError, command_line, require
+from calib.extensions import needed
 from calib.folders import CERTIFICATE, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
@@ -95,7 +95,7 @@ def _limits(
     if told.camera is None:
         return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
     if not told.camera.unknown:
-        camera_view(told.camera, chain, "the cell", Path())
+        needed("camera_view")(told.camera, chain, "the cell", Path())
     given = {key: getattr(told.camera, key) for key in CAMERA_FILES if key not in told.camera.unknown}
     tables = {**stated, "camera": {**stated["camera"], **{key: CAMERA_FILES[key] for key in given}}}
     copied = {CAMERA_FILES[key]: Path(name) for key, name in given.items()}

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
+from calib.data.poses.choices import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, filled_in, read_poses
 from calib.errors import CalibError, UsageError
+from calib.extensions import needed
 from calib.folders import write_staged
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import UNJUDGED, lines_of
@@ -23,7 +24,6 @@ from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
-from calib.procedure.measuring.image_findings import image_words
 from calib.procedure.measuring.selection_prediction import beside
 from calib.procedure.measuring.selection_prediction import read as read_prediction
 from calib.procedure.report import certificate, fit_report
@@ -130,9 +130,9 @@ def check_file(
             notes.append(f"{path.name}: positions only, where the instrument gives poses")
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
         notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
-        if isinstance(block, Pixels):
-            notes.append(f"{path.name}: {image_words(block)}")
-        elif wanted == Pixels.kind:
+        if block.kind == IMAGES:
+            notes.append(f"{path.name}: {needed('image_words')(block)}")
+        elif wanted == IMAGES:
             notes.append(f"{path.name}: no images, which the instrument takes; fitted all the same")
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:

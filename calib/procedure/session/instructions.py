@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from calib.data.csv_table import read_table
-from calib.data.poses.pixels import Pixels
+from calib.data.poses.choices import IMAGES
 from calib.errors import SessionError, command_line
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.session.folder import UNSEEN, WAYS, Session
@@ -27,7 +27,7 @@ def asks(session: Session, state: State) -> tuple[str, str]:
 
 def _at_the_robot(session: Session, name: str, both: bool) -> str:
     path = session.path(f"2-poses/{name}.csv")
-    if session.settings.instrument.measures == Pixels.kind:
+    if session.settings.instrument.measures == IMAGES:
         return _take_images(session, path, both)
     what = "pose" if session.settings.instrument.measures == "pose" else "position"
     device = session.settings.instrument.name
@@ -65,7 +65,7 @@ def _and_validation(session: Session) -> str:
 
 def _form(session: Session, target: str, both: bool) -> str:
     joints = _chain(session).joint_names
-    if session.settings.instrument.measures == Pixels.kind:
+    if session.settings.instrument.measures == IMAGES:
         return _form_of_images(session, joints, target, both)
     full = session.settings.instrument.measures == "pose"
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))

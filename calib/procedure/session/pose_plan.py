@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.poses.pixels import Pixels
+from calib.data.poses.choices import IMAGES
 from calib.data.poses.plans import write_poses
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
-from calib.procedure.measuring.camera_view import VIEW_UNCHECKED
+from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.measuring.selection_prediction import write as write_prediction
@@ -40,7 +40,7 @@ def choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[s
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
     said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
-    if instrument.measures == Pixels.kind and not chosen.by_images and not said:
+    if instrument.measures == IMAGES and not chosen.by_images and not said:
         chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{VIEW_UNCHECKED} ({HOW})"))
     found, q = chosen.selection, chosen.selection.joints
     if found.interrupted:  # a session is resumed, not gone on with half a search
@@ -74,7 +74,7 @@ def choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[s
 
 def _seen_as(measures: str) -> str:
     """Return the kind of measurement that poses are chosen for: an image determines a pose."""
-    return "pose" if measures == Pixels.kind else measures
+    return "pose" if measures == IMAGES else measures
 
 
 def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:

@@ -3,18 +3,27 @@
 OFFERS = {
     "commands": "commands:app",
     "topics": ":TOPICS",
-    "image_folders": "image_folders:",
+    "image_folders": "pictures.image_folders:",
     "camera_guess": "camera_guess:",
+    "optics": "camera_guess:optics_of",
+    "read_optics": "optics:read_optics",
+    "camera_view": "camera_view:camera_view",
+    "fit_notes": "image_findings:image_notes",
+    "image_coverage": "image_findings:image_coverage",
+    "image_words": "image_findings:image_words",
+    "reprojection": "image_findings:reprojection",
+    "read_lens": "camera_info:read_lens",
+    "read_board": "board:read_board",
 }
 TOPICS = {
     "images": (
         "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
         (
-            "calib.rooms.camera.image_folders",
-            "calib.data.camera.board",
-            "calib.data.camera.camera_info",
-            "calib.rooms.camera.corner_file",
-            "calib.rooms.camera.image_bags",
+            "calib.rooms.camera.pictures.image_folders",
+            "calib.rooms.camera.board",
+            "calib.rooms.camera.camera_info",
+            "calib.rooms.camera.pictures.corner_file",
+            "calib.rooms.camera.pictures.image_bags",
         ),
     )
 }

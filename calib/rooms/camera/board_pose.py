@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.camera.board import Board, corners
-from calib.data.camera.lens import Lens, rays
+from calib.rooms.camera.board import Board, corners
+from calib.rooms.camera.lens import Lens, rays
 from calib.transforms import orthonormal, pose
 
 STEPS = 12  # of Gauss–Newton

@@ -1,7 +1,7 @@
 """What images do not say of themselves: the lens, whether the arm carries camera or board, and their first placement.
 
 Every image gives the board's pose by its corners alone (`calib.rooms.camera.board_pose`); the arm's poses beside them
-place camera and board in closed form (`calib.geometry.images.hand_eye`). Both ways of mounting are tried.
+place camera and board in closed form (`calib.rooms.camera.robust_placement`). Both ways of mounting are tried.
 """
 
 from collections.abc import Sequence
@@ -10,15 +10,20 @@ from itertools import product
 
 import numpy as np
 
-from calib.data.camera.board import corners
-from calib.data.camera.lens import Lens
+from calib.data.poses.choices import IN_HAND, TO_HAND
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
-from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
-from calib.errors import MeasurementError
-from calib.geometry.images.hand_eye import Placement, average_pose, misfit, place_robustly
+from calib.errors import MeasurementError, refuse_data
+from calib.geometry.first_guess import guess
+from calib.geometry.hand_eye import average_pose, misfit
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
+from calib.rooms.camera import pixel_residuals  # noqa: F401  # registers what images say of the geometry
+from calib.rooms.camera.board import corners
 from calib.rooms.camera.board_pose import board_poses
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.optics import BoardShape, Optics
+from calib.rooms.camera.pixels import Pixels
+from calib.rooms.camera.robust_placement import Placement, place_robustly
 from calib.transforms import invert, pose, to_quaternion
 from calib.words import counted, listing
 
@@ -269,8 +274,32 @@ def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_sc
         )
 
 
-def guess_frames(
-    block: Pixels, arm: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+def optics_of(measured: Sequence[Pixels]) -> Optics:
+    """Return the cameras and boards of all images; of several blocks by one camera the first says its lens.
+
+    Raises:
+        MeasurementError: for images whose camera is not known, or one camera with images of two sizes.
+    """
+    lenses, boards, free = {}, {}, set[str]()
+    for block in measured:
+        if block.lens is None or not block.mounting:
+            refuse_data(block.file, "lens and mounting of the camera are not known (see complete_camera)")
+        lens = lenses.setdefault(block.camera, block.lens)
+        if lens.size != block.lens.size or lens.model != block.lens.model:
+            refuse_data(
+                block.file,
+                f"camera '{block.camera}' took images of {lens.size} and of {block.lens.size} pixels: are these two "
+                "cameras? Give --tools each (a camera in the hand) or --stations each, or name them in the options",
+            )
+        boards.setdefault(block.target, BoardShape())
+        for name in block.free:
+            free.add(f"{block.camera if name in lens.names else block.target}.{name}")
+    return Optics(tuple(lenses.values()), tuple(lenses), tuple(boards.values()), tuple(boards), frozenset(free))
+
+
+@guess.register
+def _guess_frames(
+    block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return station and tool (4, 4) of a block of images from the arm's poses (m, 4, 4); one of them may be known."""
     found = place_camera(block, arm)

@@ -39,7 +39,7 @@ def board(
         dictionary: of the markers: 4x4_50 to 7x7_1000, apriltag_36h11
         paper: a4, a3, a2, a1 or a0; by default the smallest that fits
     """
-    from calib.rooms.camera import boards
+    from calib.rooms.camera.pictures import boards
 
     for line in boards.make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
         say(line)
@@ -66,7 +66,7 @@ def images(
         joint_topic: of a bag with several robots
     """
     from calib.errors import UsageError
-    from calib.rooms.camera import boards
+    from calib.rooms.camera.pictures import boards
 
     with progress() as show:
         if source.is_dir() and (source / "board.toml").exists():

@@ -15,17 +15,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import files
-from calib.data.camera import board as boards
-from calib.data.camera.board import Board, corners
-from calib.data.camera.lens import Lens
-from calib.data.poses.pixels import IN_HAND, JOINTS, Pixels
+from calib.data.poses.choices import BOARD, IN_HAND, JOINTS
 from calib.errors import CannotSimulate
-from calib.geometry.images.optics import BoardShape, Optics, shaped_points
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal, reach, seen_at
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import forward
+from calib.rooms.camera import board as boards
+from calib.rooms.camera.board import Board, corners
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.optics import BoardShape, Optics, shaped_points
+from calib.rooms.camera.pixels import Pixels
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.transforms import invert, pose
 from calib.units import JOINT
@@ -33,7 +34,7 @@ from calib.units import JOINT
 if TYPE_CHECKING:
     from calib.rooms.cells.rendered_camera import Imaging
 
-BOARD = Board("charuco", 9, 7, 0.03, 0.021)
+CHARUCO = Board("charuco", 9, 7, 0.03, 0.021)
 FIVE_MEGAPIXEL = Lens(
     "pinhole", np.array([2400.0, 2405.0, 1220.0, 1010.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (2448, 2048)
 )  # an 8 mm lens before 3.45 µm pixels, about
@@ -79,7 +80,7 @@ def camera_cell(
     cell: Cell,
     mounting: str = IN_HAND,
     *,
-    board: Board = BOARD,
+    board: Board = CHARUCO,
     lens: Lens = FIVE_MEGAPIXEL,
     shape: BoardShape | None = None,
     reach_of_arm: float | None = None,
@@ -236,10 +237,10 @@ def take_pictures(
         moving: (m, n) how far the joints move during the exposure [rad or m]; None: the arm stands still.
         say: called with each image's name.
     """
-    from calib.rooms.camera.images import write_image
+    from calib.rooms.camera.pictures.images import write_image
     from calib.rooms.cells.rendered_camera import render
 
-    boards.write_board(found.board, folder / boards.FILE)
+    boards.write_board(found.board, folder / BOARD)
     rng = np.random.default_rng([seed, 11])
     recorded = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
     names = [f"{k + 1:04}.png" for k in range(len(q))]

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.camera.board import write_board
-from calib.data.camera.camera_info import write_lens
-from calib.data.camera.lens import Lens
-from calib.data.poses.pixels import IN_HAND
+from calib.data.poses.choices import IN_HAND
 from calib.data.poses.plans import read_poses
+from calib.rooms.camera.board import write_board
+from calib.rooms.camera.camera_info import write_lens
+from calib.rooms.camera.lens import Lens
 from calib.rooms.cells.camera_cell import CameraCell, camera_cell, take_pictures
 from calib.rooms.cells.cell import Cell
 from calib.transforms import invert, pose, to_xyz_rpy

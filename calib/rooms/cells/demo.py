@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import read_poses
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.estimate_files import read_estimate
@@ -25,6 +24,7 @@ from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open
 from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.load import load
+from calib.rooms.camera.pixels import Pixels
 from calib.rooms.cells import camera_files, measured_files
 from calib.rooms.cells.cell import Cell, measure, wandering
 from calib.rooms.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base

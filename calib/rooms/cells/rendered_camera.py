@@ -12,10 +12,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from calib.data.camera.board import Board
-from calib.data.camera.lens import Lens, rays
-from calib.geometry.images.optics import BoardShape, shaped_points
-from calib.rooms.camera.board_print import raster
+from calib.rooms.camera.board import Board
+from calib.rooms.camera.lens import Lens, rays
+from calib.rooms.camera.optics import BoardShape, shaped_points
+from calib.rooms.camera.pictures.board_print import raster
 
 SUB = 3  # sub-pixels each way
 NODES = 16  # pixels between the nodes at which rays are computed; cubic in between

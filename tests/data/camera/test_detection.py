@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.data.camera.board import Board, corners
-from calib.data.camera.lens import Lens
 from calib.errors import MeasurementError
-from calib.rooms.camera.corner_file import Detection
-from calib.rooms.camera.detection import detect
-from calib.rooms.camera.images import decode, read_image
+from calib.rooms.camera.board import Board, corners
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.pictures.corner_file import Detection
+from calib.rooms.camera.pictures.detection import detect
+from calib.rooms.camera.pictures.images import decode, read_image
 from calib.rooms.cells.rendered_camera import Imaging, render
 from calib.transforms import pose
 

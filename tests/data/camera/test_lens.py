@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from differences import check
 
-from calib.data.camera import camera_info
-from calib.data.camera.lens import Lens, pinhole, rays
 from calib.errors import CalibError, MeasurementError
+from calib.rooms.camera.camera_info import read_lens, write_lens
+from calib.rooms.camera.lens import Lens, pinhole, rays
 
 SIZE = (800, 600)
 BASE = [780.0, 782.0, 400.0, 298.0]
@@ -54,8 +54,8 @@ def test_a_point_where_the_distortion_turns_back_is_out_of_sight():
 
 @pytest.mark.parametrize("name", LENSES)
 def test_a_lens_is_written_as_ros_reads_it_and_read_back(name, tmp_path):
-    path = camera_info.write_lens(LENSES[name], tmp_path / "camera.yaml")
-    again = camera_info.read_lens(path)
+    path = write_lens(LENSES[name], tmp_path / "camera.yaml")
+    again = read_lens(path)
     assert np.array_equal(again.values, LENSES[name].values) and again.size == SIZE
     assert again.model == LENSES[name].model
 
@@ -72,10 +72,10 @@ def test_a_lens_is_written_as_ros_reads_it_and_read_back(name, tmp_path):
     ],
 )
 def test_a_camera_file_that_cannot_be_is_refused_by_key(change, words, tmp_path):
-    path = camera_info.write_lens(LENSES["plain"], tmp_path / "camera.yaml")
+    path = write_lens(LENSES["plain"], tmp_path / "camera.yaml")
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(MeasurementError, match=words):
-        camera_info.read_lens(path)
+        read_lens(path)
 
 
 def test_a_lens_without_focal_length_is_refused():

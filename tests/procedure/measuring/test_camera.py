@@ -11,23 +11,22 @@ import numpy as np
 import pytest
 
 from calib.cli import run
-from calib.data.camera.board import read_board
 from calib.data.poses.measurements import Distances
 from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
-from calib.procedure.measuring.camera_view import image_observation
 from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.session.commands import begin, go_on
 from calib.procedure.session.folder import open_session
 from calib.robot.calibrated import Deflection
 from calib.robot.load import load
-from calib.rooms.camera.boards import make
-from calib.rooms.camera.corner_file import Detection, Found
-from calib.rooms.camera.image_bags import ImageBag, write_image_folder
+from calib.rooms.camera.board import read_board
+from calib.rooms.camera.pictures.boards import make
+from calib.rooms.camera.pictures.corner_file import Detection, Found
+from calib.rooms.camera.pictures.image_bags import ImageBag, write_image_folder
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells import camera_files
 from calib.rooms.cells.cell import SimulatedInstrument
@@ -56,7 +55,7 @@ def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
     q = camera.views(cell, 200, 3, camera.Views((0.2, 0.7), 0.9, whole=False))
     seen, kept = camera.visible(cell, q).all(axis=1), (exact(q) <= 0.0).all(axis=1)
     assert 0.2 < seen.mean() < 0.9 and (seen == kept).mean() > 0.97
-    space = limits.space(image_observation(view, limits.lower, limits.upper))
+    space = limits.space(view.observation(limits.lower, limits.upper))
     found = view.draw(10, partial(is_feasible, space), limits.lower, limits.upper, 0)
     assert len(found) == 10 and is_feasible(space, found).all()
     assert "view past the arm" in limits.checked
@@ -192,7 +191,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     with camera_files.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
     q, everywhere = camera.views(cell, 40, 5), random_joints(cell.cell.nominal, 200, 1)
-    seen = image_observation(limits.camera, limits.lower, limits.upper)
+    seen = limits.camera.observation(limits.lower, limits.upper)
     predicted = foretold(seen, seen(q), everywhere)
     block = complete_camera(cell.cell.nominal, camera.photograph(cell, q, 0.05, 5))
     start = install(cell.cell.nominal, [block])

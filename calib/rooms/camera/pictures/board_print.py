@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from calib.data.camera.board import Board
-from calib.rooms.camera.images import quiet
+from calib.rooms.camera.board import Board
+from calib.rooms.camera.pictures.images import quiet
 
 PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}
 EDGE = 0.008  # printers leave this free [m]

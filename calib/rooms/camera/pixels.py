@@ -1,22 +1,14 @@
 """Corners of a board in images: what a camera measures; one image is one row."""
 
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from calib.data.camera.board import FILE, Board
-from calib.data.camera.lens import Lens
+from calib.data.poses.choices import IMAGES, IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
-
-IN_HAND, TO_HAND = "in hand", "to hand"
-JOINTS, CORNERS = "joints.csv", "corners.csv"  # of a folder of images: joint values, and the corners found
-
-
-def is_image_folder(path: Path) -> bool:
-    """Say whether a path is a folder of images (or of the corners found in them) beside joint values."""
-    return path.is_dir() and ((path / JOINTS).exists() or (path / FILE).exists())
+from calib.rooms.camera.board import Board
+from calib.rooms.camera.lens import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +43,8 @@ class Pixels(PoseMeasurements):
     known: bool = False
     free: tuple[str, ...] = ()
 
-    kind: ClassVar[str] = "pixels"
+    kind: ClassVar[str] = IMAGES
+    placing: ClassVar[int] = 1
     has_instrument: ClassVar[bool] = True
     per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "pixel", "sigma")
 
@@ -68,6 +61,10 @@ class Pixels(PoseMeasurements):
     def camera(self) -> str:
         """The name of the camera among an installation's lenses: what carries it."""
         return self.tool_names[0] if self.mounting == IN_HAND else self.station
+
+    @property
+    def carried(self) -> tuple[str, object]:
+        return ("camera", self.size) if self.mounting == IN_HAND else ("board", self.board)
 
     @property
     def target(self) -> str:

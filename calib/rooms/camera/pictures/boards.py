@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.camera import board as boards
-from calib.data.camera.board import KINDS, Board
-from calib.data.poses.pixels import JOINTS
+from calib.data.poses.choices import BOARD, JOINTS
 from calib.errors import CalibError, MeasurementError, UsageError, refused_as, require
-from calib.procedure.measuring.image_findings import coverage_words
-from calib.rooms.camera.corner_file import Found
-from calib.rooms.camera.image_folders import find_corners, joint_table, problem_words, read_own_board
+from calib.rooms.camera import board as boards
+from calib.rooms.camera.board import KINDS, Board
+from calib.rooms.camera.image_findings import coverage_words
+from calib.rooms.camera.pictures.corner_file import Found
+from calib.rooms.camera.pictures.image_folders import find_corners, joint_table, problem_words, read_own_board
 
 Show = Callable[[str], None]
 USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
@@ -27,7 +27,7 @@ def make(
 
     Args:
         out: folder.
-        kind, columns, rows, words, paper: see `calib.data.camera.board`; a dictionary, and the paper's name. None: the
+        kind, columns, rows, words, paper: see `calib.rooms.camera.board`; a dictionary, and the paper's name. None: the
             usual ones.
         square, marker: [mm].
         overwrite: replace another board that is there, whose squares somebody may have measured.
@@ -35,8 +35,8 @@ def make(
     Raises:
         UsageError: for a board that cannot be, or does not fit onto its paper, and for another that is there already.
     """
-    from calib.rooms.camera import board_print
-    from calib.rooms.camera.detection import MIN_CORNERS
+    from calib.rooms.camera.pictures import board_print
+    from calib.rooms.camera.pictures.detection import MIN_CORNERS
 
     require(kind in KINDS, f"--kind {kind}: expected one of {', '.join(KINDS)}", UsageError)
     if paper is not None and paper.lower() not in board_print.PAPERS:
@@ -51,7 +51,7 @@ def make(
         if (count := len(boards.corners(made))) < MIN_CORNERS:
             raise UsageError(f"a {made.words} has {count} corners; an image counts from {MIN_CORNERS} on: more squares")
         size = board_print.page_size(made, (paper or "").lower())
-    there = out / boards.FILE
+    there = out / BOARD
     if not overwrite and there.exists() and not _as_printed(out):
         raise UsageError(
             f"{there} is not as it was printed: somebody measured its squares, or it is another's; nothing changed. "
@@ -59,19 +59,19 @@ def make(
         )
     files.write(out / "board.pdf", board_print.pdf(made, size))
     files.write(out / "board.svg", board_print.svg(made, size))
-    boards.write_board(made, out / boards.FILE)
+    boards.write_board(made, out / BOARD)
     wide, high = (round(1e3 * length) for length in size)
     return [
         f"{made.words}, {len(boards.corners(made))} corners, on a page of {wide} x {high} mm: {out / 'board.pdf'}",
         "print it at 100 % (not fitted to the page), check the ruler, glue it onto glass or aluminium; then measure "
-        f"several squares together and put the size of one into {out / boards.FILE}: the robot's lengths get their "
+        f"several squares together and put the size of one into {out / BOARD}: the robot's lengths get their "
         "scale from it",
     ]
 
 
 def _as_printed(out: Path) -> bool:
     """Tell whether a folder's ``board.toml`` is that of its ``board.svg``, as `make` left both."""
-    from calib.rooms.camera import board_print
+    from calib.rooms.camera.pictures import board_print
 
     try:
         found, drawn = boards.read_board(out), (out / "board.svg").read_bytes()
@@ -94,7 +94,7 @@ def look(folder: Path, show: Show) -> list[str]:
 
 
 def _images(folder: Path) -> list[str]:
-    from calib.rooms.camera.images import SUFFIXES
+    from calib.rooms.camera.pictures.images import SUFFIXES
 
     names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     require(names, f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})", UsageError)
@@ -128,7 +128,7 @@ def from_bag(
     bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Show
 ) -> list[str]:
     """Make a folder of images' corners and joint values from a bag; return what was found, in sentences."""
-    from calib.rooms.camera.image_bags import read_image_bag, write_image_folder
+    from calib.rooms.camera.pictures.image_bags import read_image_bag, write_image_folder
 
     made = boards.read_board(board)
     found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))

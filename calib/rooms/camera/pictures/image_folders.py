@@ -22,19 +22,20 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.camera import board as boards
-from calib.data.camera import camera_info
-from calib.data.camera.board import Board
-from calib.data.camera.lens import Lens
 from calib.data.csv_table import Table, read_table
 from calib.data.poses import plausible
+from calib.data.poses.choices import BOARD, CORNERS, JOINTS
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.pixels import CORNERS, JOINTS, Pixels
 from calib.data.poses.plausible import Limits
 from calib.errors import CalibError, MeasurementError, require
-from calib.rooms.camera import corner_file
-from calib.rooms.camera.corner_file import Found
+from calib.rooms.camera import board as boards
+from calib.rooms.camera.board import Board
+from calib.rooms.camera.camera_info import LENS, read_lens
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.pictures import corner_file
+from calib.rooms.camera.pictures.corner_file import Found
+from calib.rooms.camera.pixels import Pixels
 from calib.words import counted, listing
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
@@ -89,8 +90,8 @@ def read_own_board(path: Path) -> Board:
     Raises:
         MeasurementError: where there is none.
     """
-    words = f"has no {boards.FILE}, which says what board is seen: copy the one that calib board wrote into it"
-    require((path / boards.FILE).is_file(), words, MeasurementError, path)
+    words = f"has no {BOARD}, which says what board is seen: copy the one that calib board wrote into it"
+    require((path / BOARD).is_file(), words, MeasurementError, path)
     return boards.read_board(path)
 
 
@@ -118,14 +119,14 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     stored = path / CORNERS
     images = [path / name for name in names if (path / name).is_file()]
     if stored.is_file():
-        newest = max((each.stat().st_mtime for each in (*images, path / boards.FILE)), default=0.0)
+        newest = max((each.stat().st_mtime for each in (*images, path / BOARD)), default=0.0)
         kept = corner_file.read_corners(stored, board)
         if stored.stat().st_mtime >= newest and {each.name for each in images} <= set(kept.images):
             return kept
     if not images:
         missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
         raise MeasurementError(f"none of the images that {JOINTS} names is there ({missing})", path)
-    from calib.rooms.camera.detection import detected  # loads OpenCV: only where images are looked at
+    from calib.rooms.camera.pictures.detection import detected  # loads OpenCV: only where images are looked at
 
     found = detected(((each.name, each) for each in images), board, len(images), progress)
     with suppress(CalibError):  # a folder that cannot be written into is read all the same
@@ -174,12 +175,12 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
 
 def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
     """Return the folder's lens and whether it was given; None where it is to be found from the images."""
-    place = path / camera_info.FILE
+    place = path / LENS
     if not place.is_file():
         if options.camera.intrinsics == "given":
-            raise MeasurementError(f"has no {camera_info.FILE}, which intrinsics = 'given' asks for", path)
+            raise MeasurementError(f"has no {LENS}, which intrinsics = 'given' asks for", path)
         return None, False
-    lens = camera_info.read_lens(place)
+    lens = read_lens(place)
     if size[0] and lens.size != size:
         raise MeasurementError(
             f"is about images of {lens.size[0]} x {lens.size[1]} pixels, those beside it have {size[0]} x {size[1]}",

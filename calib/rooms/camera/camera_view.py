@@ -3,31 +3,32 @@
 ``[camera]`` of the constraints file states the camera (`calib formats constraints`).
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.config import strict
-from calib.config_types import Checked, Expect, Name, OneOf, Real, shown
-from calib.data.camera.board import Board, corners, read_board
-from calib.data.camera.camera_info import read_lens
-from calib.data.camera.lens import Lens
-from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
+from calib.data.poses.choices import IN_HAND
 from calib.errors import UsageError, require
 from calib.geometry.identifiability import base_columns
-from calib.geometry.images.image_noise import ImageNoise
-from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal, reach, seen_at
-from calib.geometry.observation import observe, prepare, target_jacobian
+from calib.geometry.observability import Observation
+from calib.geometry.observation import Block, observe, prepare, target_jacobian
 from calib.geometry.parameters import layout
-from calib.geometry.pixel_residuals import PixelPart
+from calib.procedure.measuring.constraints_file import CameraTable
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
+from calib.rooms.camera.board import Board, corners, read_board
+from calib.rooms.camera.camera_info import read_lens
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.optics import BoardShape, Optics
+from calib.rooms.camera.pixel_residuals import ImageNoise
+from calib.rooms.camera.pixels import Pixels
 from calib.transforms import invert, pose
 from poses.space import PoseConstraint
 
@@ -37,40 +38,6 @@ ASSUMED = (
     f"{1e3 * TURN:g} mrad per axis; what no model holds comes on top"
 )
 TRIES = 60
-UNKNOWN = "unknown"
-VIEW_UNCHECKED = "whether the camera sees the board"
-Angle = Annotated[float, Real(above=0, quantity="angle")]
-Distance = Annotated[float, Real(least=0, quantity="length")]
-
-
-def _place_or_unknown(value: Any) -> Any:
-    if value != UNKNOWN and not isinstance(value, Mapping):
-        raise ValueError(f'expected a table with xyz and rpy, or "{UNKNOWN}", found {shown(value)}')
-    return value
-
-
-Place = Annotated[Any, Checked(_place_or_unknown, {"anyOf": [{"type": "object"}, {"const": UNKNOWN}]})]
-
-
-@strict
-@dataclass(frozen=True, kw_only=True)
-class CameraTable:
-    """[camera], see the module; what is ``unknown`` leaves unchecked whether the board is seen."""
-
-    mounting: Annotated[str, OneOf((IN_HAND, TO_HAND, UNKNOWN))]
-    lens: Name
-    board: Name
-    carried: Place
-    stands: Place
-    tilt: Angle = float(np.radians(50.0))
-    range: Annotated[tuple[Distance, Distance], Expect("two distances, least and largest")] = (0.2, 3.0)
-    margin: Annotated[float, Real(least=0)] = 10.0
-
-    @property
-    def unknown(self) -> tuple[str, ...]:
-        """What would have to be known to tell whether the board is seen."""
-        names = ("mounting", "lens", "board", "carried", "stands")
-        return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +86,43 @@ class CameraView:
         rest = np.column_stack([self.span[0] - far, far - self.span[1], lean])
         return np.concatenate([outside.reshape(len(q), -1), rest], axis=1)
 
+    @property
+    def stand(self) -> np.ndarray:
+        """(3,) where the camera or the board's middle stands, in the arm's base [m]."""
+        placed = invert(self.cell.stations[0])
+        middle = 0.5 * np.array(self.board.extent) if self.mounting == IN_HAND else np.zeros(2)
+        return (placed @ [*middle, 0.0, 1.0])[:3]
+
     def constraint(self) -> PoseConstraint:
         """Return it as pose selection takes it."""
         return PoseConstraint("board in view of the camera", self)
+
+    @property
+    def assumed(self) -> str:
+        """What a prediction of accuracy takes for granted, in words."""
+        return ASSUMED
+
+    def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
+        """Return the observation Jacobian of images in the columns that postures which see the board can identify."""
+        table = layout(self.cell)
+        columns = np.concatenate([table.arm_index, table.frame_index])
+        q = self.draw(100, lambda each: np.all(self(each) <= 1e-8, axis=1), lower, upper, seed)
+        if len(q) < 20:
+            raise UsageError(
+                f"the camera sees the board at hardly any posture ({len(q)} of 100 were found): look at [camera], "
+                "carried and stands, tilt and range"
+            )
+        split = base_columns(self.cell, self.block(q), columns)
+        return ImageObservation(self.cell, True, columns[split.kept], view=self)
+
+    def block(self, q: np.ndarray) -> list[Block]:
+        """Return images of the board at joint values (m, n) as a fit takes them, without what they show."""
+        pixel = np.zeros((len(q), len(corners(self.board)), 2))
+        block = Pixels(
+            q, self.cell.chain.joint_names, pixel, self.board, self.lens, mounting=self.mounting,
+            station=self.cell.station_names[0], tool_names=self.cell.tool_names,
+        )  # fmt: skip
+        return prepare(self.cell, [block])
 
     def draw(
         self, count: int, feasible: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray,
@@ -156,7 +157,7 @@ class CameraView:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageObservation:
+class ImageObservation(Observation):
     """Whitened observation Jacobian of images, in base columns: q (m, n) -> (m, rows, p).
 
     An image's corners are reduced to what they say of the board's pose and the lens; noise of corners and of the arm's
@@ -164,22 +165,11 @@ class ImageObservation:
 
     Attributes:
         view: camera and board.
-        free: (p,) the parameters that images can identify, in the full vector.
     """
 
+    _: KW_ONLY
     view: CameraView
-    free: np.ndarray
-    product = None
-
-    @property
-    def full(self) -> bool:
-        """Whether orientations are seen."""
-        return True
-
-    @property
-    def cell(self) -> Installation:
-        """The arm with camera and board."""
-        return self.view.cell
+    product = None  # type: ignore[assignment]
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where what the arm carries is in its base (m, 3) [m], and its Jacobian (m, 3, p), not whitened."""
@@ -188,40 +178,10 @@ class ImageObservation:
         return seen.point.T, columns[:, :3].transpose(2, 1, 0)
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        part = _part(self.view, q, self.free)
+        part = observe(self.cell, self.view.block(q)[0], self.free)[0]
         noise = ImageNoise(1.0, DISPLACEMENT, TURN, np.ones(len(q)))
         matrix = replace(part, noise=noise).whitened(np.full(part.value.shape, CORNER))[1]
         return matrix.reshape(len(q), -1, len(self.free))
-
-
-def _part(view: CameraView, q: np.ndarray, free: np.ndarray) -> PixelPart:
-    cell, table = view.cell, corners(view.board)
-    pixel = np.zeros((len(q), len(table), 2))
-    block = Pixels(
-        q, cell.chain.joint_names, pixel, view.board, view.lens, mounting=view.mounting,
-        station=cell.station_names[0], tool_names=cell.tool_names,
-    )  # fmt: skip
-    part = observe(cell, prepare(cell, [block])[0], free)[0]
-    assert isinstance(part, PixelPart)
-    return part
-
-
-def image_observation(view: CameraView, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
-    """Return the observation Jacobian of images in the columns that postures which see the board can identify."""
-    table = layout(view.cell)
-    columns = np.concatenate([table.arm_index, table.frame_index])
-    q = view.draw(100, lambda each: np.all(view(each) <= 1e-8, axis=1), lower, upper, seed)
-    if len(q) < 20:
-        raise UsageError(
-            f"the camera sees the board at hardly any posture ({len(q)} of 100 were found): look at [camera], carried "
-            "and stands, tilt and range"
-        )
-    block = Pixels(
-        q, view.cell.chain.joint_names, np.zeros((len(q), len(corners(view.board)), 2)), view.board, view.lens,
-        mounting=view.mounting, station=view.cell.station_names[0], tool_names=view.cell.tool_names,
-    )  # fmt: skip
-    split = base_columns(view.cell, prepare(view.cell, [block]), columns)
-    return ImageObservation(view, columns[split.kept])
 
 
 def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> CameraView:

@@ -24,6 +24,7 @@ import numpy as np
 from calib import files
 from calib.config import parse, read_toml, strict
 from calib.config_types import OneOf, Real, Whole
+from calib.data.poses.choices import BOARD
 from calib.errors import UsageError, require
 
 KINDS = ("charuco", "chessboard", "apriltag")
@@ -31,7 +32,6 @@ DICTIONARIES = (
     *(f"{bits}x{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
 )  # fmt: skip
-FILE = "board.toml"
 
 
 @strict
@@ -122,7 +122,7 @@ def read_board(path: str | Path) -> Board:
     Raises:
         UsageError: for a key or a value that cannot be.
     """
-    path = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    path = Path(path) / BOARD if Path(path).is_dir() else Path(path)
     return parse(Board, read_toml(path), str(path))
 
 

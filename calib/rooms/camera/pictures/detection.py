@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.data.camera.board import DICTIONARIES, Board, corners
 from calib.errors import MeasurementError
-from calib.rooms.camera.board_print import charuco, dictionary
-from calib.rooms.camera.corner_file import Detection, Found
-from calib.rooms.camera.images import quiet, read_image
+from calib.rooms.camera.board import DICTIONARIES, Board, corners
+from calib.rooms.camera.pictures.board_print import charuco, dictionary
+from calib.rooms.camera.pictures.corner_file import Detection, Found
+from calib.rooms.camera.pictures.images import quiet, read_image
 
 MIN_CORNERS = 8  # corners that make an image useful
 MIN_MARKERS = 4  # markers that tell a dictionary

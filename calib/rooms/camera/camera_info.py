@@ -12,10 +12,10 @@ import numpy as np
 
 from calib import files
 from calib.config_types import shown
-from calib.data.camera.lens import Lens
 from calib.errors import CalibError, MeasurementError, refused_as, require, suggestion
+from calib.rooms.camera.lens import Lens
 
-FILE = "camera.yaml"
+LENS = "camera.yaml"
 MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 
 

@@ -5,21 +5,135 @@
 with (R, p) the board in the camera's frame. All corners of an image share the six numbers [v; ω]: a QR of its own
 2K x (6 + k + 1) matrix leaves 6 + k + 1 rows of the least-squares problem, the same problem (Golub & Van Loan 2013,
 sec. 5.3), so that thousands of images take the memory of thousands of poses.
+
+How wrong images are: corners one by one, and all corners of an image together.
+
+    r_i = J_i M_i ξ_i + ε_i,   ε ~ N(0, f² σ²),   ξ ~ N(0, diag(s_v², s_v², s_v², s_ω², s_ω², s_ω²))
+
+ξ is what the arm does not repeat and the model does not explain: a displacement and a turn of what the arm carries,
+common to all corners of the image (M_i takes them to the board's twist). Were it left out, forty-eight corners would
+count as forty-eight measurements of the arm. Both variances are estimated: f from what remains in each image after its
+own best pose (2K - 6 numbers), s_v and s_ω by moments of those best poses' residuals beyond what ε explains
+(variance components; Rao 1972).
 """
 
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.data.camera.board import corners
-from calib.data.poses.pixels import IN_HAND, Pixels
-from calib.errors import refuse_data, refuse_option
-from calib.geometry.images.image_noise import ImageNoise, OwnPoses
-from calib.geometry.images.optics import View, shape_slopes
-from calib.geometry.installation import Installation, Seen
-from calib.geometry.parameters import layout_counts
+from calib.arrays import frozen
+from calib.data.poses.choices import IN_HAND
+from calib.errors import refuse_data
+from calib.estimation import robust
+from calib.geometry.installation import Seen
 from calib.geometry.residuals import Part, parts
+from calib.rooms.camera.board import corners
+from calib.rooms.camera.optics import shape_slopes
+from calib.rooms.camera.pixels import Pixels
 
+# change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
+MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ImageNoise:
+    """The noise of one block of images.
+
+    Attributes:
+        factor: of the corners' stated sigmas.
+        displacement: s_v [m].
+        turn: s_ω [rad].
+        weight: (m,) robust weight of each image.
+        shared: (N, 2, 6) what one standard deviation of each component of ξ does to the corners [px] at a state that
+            the fit began at, so that a fit has one metric; None: of the state at hand.
+    """
+
+    factor: float = 1.0
+    displacement: float = 0.0
+    turn: float = 0.0
+    weight: np.ndarray = field(default_factory=lambda: np.ones(0))
+    shared: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "weight", frozen(self.weight))
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """(6,) standard deviations of ξ."""
+        return np.repeat([self.displacement, self.turn], 3)
+
+    def unweighted(self, images: int) -> ImageNoise:
+        """Return the noise of as many images of full weight, at the state at hand."""
+        return replace(self, weight=np.ones(images), shared=None)
+
+    def near(self, other: ImageNoise) -> bool:
+        """Say whether two estimates are alike, so that the fit need not be repeated."""
+        pairs = ((self.factor, other.factor), (self.displacement, other.displacement), (self.turn, other.turn))
+        alike = all(abs(a - b) <= MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE for a, b in pairs)
+        return alike and np.abs(self.weight - other.weight).max(initial=0.0) < 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class OwnPoses:
+    """What the images say of themselves: k of them, each fitted with a pose of its own.
+
+    Attributes:
+        residual: (k, 6) of what the arm carries: best pose minus predicted [v; ω].
+        information: (k, 6, 6) of it, at the stated sigmas.
+        within: (k,) squared residual that the own pose leaves, in sigmas.
+        spare: (k,) numbers that are left for it, 2K - 6.
+    """
+
+    residual: np.ndarray
+    information: np.ndarray
+    within: np.ndarray
+    spare: np.ndarray
+
+
+def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
+    """Return the noise that residuals at an optimum show.
+
+    Args:
+        found: see there.
+        unknowns: parameters fitted to them.
+        loss, scale: of a robust fit, for the images' weights.
+    """
+    k = len(found.spare)
+    share = max(1.0 - unknowns / max(6 * k, 1), 0.2)
+    use = found.spare > 0
+    factor = 1.0
+    if use.any():
+        each = found.within[use] / found.spare[use]
+        robustly = loss != "none"
+        factor = float(np.sqrt(np.median(each) if robustly else found.within[use].sum() / found.spare[use].sum()))
+    factor = max(factor, 1e-3)
+    covariance = factor**2 * np.linalg.pinv(found.information, hermitian=True)
+    own = np.einsum("kii->ki", covariance)
+    square = found.residual**2
+    max_ratio = 25.0  # squared residuals beyond so many times their median are taken for it (our choice)
+    square = np.minimum(square, max_ratio * np.median(square, axis=0)) / share
+    spread = [_component(square[:, axes], own[:, axes]) for axes in (slice(0, 3), slice(3, 6))]
+    total = covariance + np.diag(np.repeat(np.square(spread), 3))
+    size = np.sqrt(
+        np.einsum("ki,ki->k", found.residual, np.linalg.solve(total, found.residual[:, :, None])[:, :, 0]) / 6
+    )
+    return ImageNoise(factor, *spread, weight=robust.weights(size, loss, scale))
+
+
+def _component(square: np.ndarray, known: np.ndarray, max_steps: int = 20) -> float:
+    """Return s with E[t²] = s² + known, by the maximum-likelihood score Σ (t² - s² - c) / (s² + c)² = 0."""
+    value = max(float(np.mean(square - known)), 1e-3 * float(np.median(square)))
+    for _ in range(max_steps):
+        weight = 1.0 / (value + known) ** 2
+        value = max(float(np.sum(weight * (square - known)) / np.sum(weight)), 0.0)
+        if value == 0.0:
+            break
+    return float(np.sqrt(value))
+
+
+FIRST_NOISE = 1e-4  # displacement [m] and turn [rad] of an image that a fit begins with (our choice)
 STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axis beyond which a corner is taken at it
 
 
@@ -37,9 +151,7 @@ class PixelPart(Part):
         axes: (m, 3, 3) a displacement of what the arm carries, in the station's axes, per one of the board in the
             camera's.
         carried: (m, 6, 6) the board's twist per twist [v; ω] of what the arm carries, both in the camera's axes.
-        noise: of corners and images, as `fill` whitens by; None for that of the scale alone.
-        shared: (N, 2, 6) `shared_errors` of a state that the fit began at, so that a fit has one metric; None: of this
-            one.
+        noise: an `ImageNoise`; None for that of the scale alone.
     """
 
     local: np.ndarray
@@ -47,8 +159,6 @@ class PixelPart(Part):
     depth: np.ndarray
     axes: np.ndarray
     carried: np.ndarray
-    noise: ImageNoise | None = None
-    shared: np.ndarray | None = None
 
     @property
     def height(self) -> int:
@@ -74,16 +184,14 @@ class PixelPart(Part):
         mean = np.bincount(place, weight) / count
         return images, mean if self.noise is None else mean * self.noise.weight[images]
 
-    def dense(self) -> np.ndarray:
-        """Return the derivative of every corner (f, 2, N)."""
-        return np.einsum("ncl,fln->fcn", self.local, self.jacobian[:, :, self.index])
-
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
         scale = np.broadcast_to(scale, self.value.shape)
         images, first = np.unique(self.index, return_index=True)
         edges = np.append(first, len(self.index))
         width = self.local.shape[2] + 1
-        shared = None if self.noise is None else self.shared_errors() if self.shared is None else self.shared
+        shared = None
+        if self.noise is not None:
+            shared = self._shared_errors(self.noise) if self.noise.shared is None else self.noise.shared
         chunk = 500  # images reduced at once
         for start in range(0, len(images), chunk):
             own = slice(start, min(start + chunk, len(images)))
@@ -100,10 +208,8 @@ class PixelPart(Part):
             by_image = self.jacobian[:, :, images[own]].transpose(2, 1, 0)
             matrix[:, place] = (small[:, :, :-1] @ by_image).reshape(-1, len(self.jacobian)).T
 
-    def shared_errors(self) -> np.ndarray:
-        """Return what one standard deviation of each component of an image's error does to its corners, (N, 2, 6)."""
-        assert self.noise is not None
-        return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * self.noise.deviations
+    def _shared_errors(self, noise: ImageNoise) -> np.ndarray:
+        return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
         """Return what the images say with a pose of their own each, at sigmas `scale` (2, N)."""
@@ -117,16 +223,18 @@ class PixelPart(Part):
         residual = np.einsum("kij,kj->ki", np.linalg.pinv(information, hermitian=True), gradient)
         return OwnPoses(residual, information, small[:, 6, 6] ** 2, np.maximum(2 * counts - 6, 0))
 
-    def spread_over(self, noise: ImageNoise) -> ImageNoise:
-        """Return the noise with one weight per measured row, of weights per image with corners."""
+    def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> ImageNoise:
+        noise = estimate_noise(self.own_poses(sigma), unknowns, loss, scale)
+        if start:
+            noise = replace(noise, displacement=FIRST_NOISE, turn=FIRST_NOISE)
         weight = np.ones(self.jacobian.shape[2])
         weight[np.unique(self.index)] = noise.weight
-        return replace(noise, weight=weight)
+        return replace(noise, weight=weight, shared=self._shared_errors(noise))
 
-    def within(self, scale: np.ndarray) -> np.ndarray:
+    def alone(self, sigma: np.ndarray) -> np.ndarray:
         """Return the corners' residuals (2, N) [px] that their image's own best pose leaves."""
         images, place = np.unique(self.index, return_inverse=True)
-        found = self.own_poses(scale)
+        found = self.own_poses(sigma)
         moved = np.einsum("kij,kj->ki", self.carried[images], found.residual)
         return self.value - np.einsum("ncl,nl->cn", self.local[:, :, :6], moved[place])
 
@@ -149,26 +257,6 @@ def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
     # U (1 - 1/sqrt(1 + s²)) Uᵀ with U = G V / s
     factor = (1.0 - 1.0 / np.sqrt(1.0 + values)) / np.maximum(values, 1e-300)
     return rows - axes @ (factor[:, :, None] * (axes.transpose(0, 2, 1) @ rows))
-
-
-def view_of(cell: Installation, measured: Pixels, free: np.ndarray) -> View:
-    """Return the lens and the board that images are predicted with, and which of their values are free."""
-    if measured.camera not in cell.optics.lens_names or measured.target not in cell.optics.board_names:
-        refuse_option(
-            measured.file,
-            f"camera '{measured.camera}' with board '{measured.target}' is not part of the "
-            f"installation, which has {', '.join(cell.optics.lens_names) or 'no camera'}",
-        )
-    start = sum(layout_counts(cell)[:3])
-    wanted = start + cell.optics.place(measured.camera, measured.target)
-    where = {int(k): place for place, k in enumerate(free)}
-    own = np.array([place for place, k in enumerate(wanted) if int(k) in where], dtype=int)
-    return View(
-        cell.optics.lenses[cell.optics.lens_names.index(measured.camera)],
-        cell.optics.boards[cell.optics.board_names.index(measured.target)],
-        own,
-        np.array([where[int(wanted[k])] for k in own], dtype=int),
-    )
 
 
 @parts.register

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.camera import board as boards
-from calib.data.camera.board import Board
-from calib.data.poses.pixels import CORNERS, JOINTS
+from calib.data.poses.choices import BOARD, CORNERS, JOINTS
 from calib.errors import MeasurementError, refuse_data, require, suggestion
-from calib.rooms.camera import corner_file
-from calib.rooms.camera.corner_file import Found
-from calib.rooms.camera.detection import detected
+from calib.rooms.camera import board as boards
+from calib.rooms.camera.board import Board
+from calib.rooms.camera.pictures import corner_file
+from calib.rooms.camera.pictures.corner_file import Found
+from calib.rooms.camera.pictures.detection import detected
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 JOINT = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
@@ -133,7 +133,7 @@ def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
 
 
 def _grey(message: Any) -> np.ndarray:
-    from calib.rooms.camera.images import decode, to_grey
+    from calib.rooms.camera.pictures.images import decode, to_grey
 
     if hasattr(message, "format"):
         return decode(bytes(message.data))
@@ -186,8 +186,8 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
 
 
 def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
-    """Write what a bag came to as a folder that `calib.rooms.camera.image_folders` reads."""
-    boards.write_board(board, folder / boards.FILE)
+    """Write what a bag came to as a folder that `calib.rooms.camera.pictures.image_folders` reads."""
+    boards.write_board(board, folder / BOARD)
     rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
     files.write_table(folder / JOINTS, ["image", *found.joint_names], rows)
     corner_file.write_corners(folder / CORNERS, found.corners)

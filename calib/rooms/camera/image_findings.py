@@ -1,39 +1,23 @@
 """What a fit says of its images: how well corners are predicted, what the arm adds, where the scale is from."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from calib.data.poses.choices import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.errors import Finding, finding
 from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
-from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.result import GeometricFit
+from calib.procedure.kinematic_stage.metrics import ImageCoverage
+from calib.rooms.camera.pixel_residuals import PixelPart
+from calib.rooms.camera.pixels import Pixels
 
 GRID = (12, 9)  # cells of the image that coverage counts (our choice)
 MAX_NOISE = 4.0  # corner noise over its stated sigma from which on it is remarked on (our choice)
-
-
-@dataclass(frozen=True)
-class ImageCoverage:
-    """Where in its images a camera saw corners, and how well they are predicted there.
-
-    Attributes:
-        file: the images' folder.
-        size: width and height of the images [px].
-        count: corners per cell of the image, row by row (`GRID`).
-        rms: distance of corners seen from corners predicted [px], per cell; 0 where none was seen.
-    """
-
-    file: str
-    size: tuple[int, int]
-    count: tuple[tuple[int, ...], ...]
-    rms: tuple[tuple[float, ...], ...]
 
 
 def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
@@ -81,7 +65,7 @@ def image_notes(found: GeometricFit) -> list[Finding]:
         if not isinstance(block, Pixels) or not isinstance(part, PixelPart) or part.noise is None:
             continue
         name, noise = Path(block.file).name, part.noise
-        rms, image = (float(np.sqrt(np.mean(np.sum(v**2, axis=0)))) for v in (part.value, part.within(piece.sigma)))
+        rms, image = (float(np.sqrt(np.mean(np.sum(v**2, axis=0)))) for v in (part.value, part.alone(piece.sigma)))
         values = {"rms": rms, "image": image, "shift": noise.displacement, "turn": noise.turn}
         result.append(finding("reprojection", file=name, **values))
         if noise.factor > MAX_NOISE and block.sigma is not None:

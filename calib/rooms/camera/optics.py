@@ -1,17 +1,32 @@
 """What an image adds to an installation: lenses, and the shape of boards as printed; their parameters and derivatives.
 
 A corner (x, y, 0) of the table stands on the board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y counted
-from the board's middle: s is the scale of the print, b how the board bends [1/m].
+from the board's middle: s is the scale of the print, b how the board bends [1/m]. In ``robot.toml`` of a fit::
+
+    [[camera]]                       # its lens
+    name = "camera"
+    model = "pinhole"                # or fisheye
+    size = [2448, 2048]              # of its images [px]
+    values = [2400.0, ...]           # fx fy cx cy k1 k2 p1 p2 k3 [k4 k5 k6], or fx fy cx cy k1 k2 k3 k4
+    [[board]]                        # the print: scale, and bending [1/m]
+    name = "board"
+    scale = 1.0
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from calib.data.camera.board import Board
-from calib.data.camera.lens import Lens
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import refuse_option
+from calib.records import read_record
+from calib.rooms.camera.board import Board
+from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.pixels import Pixels
 
 SHAPE = ("scale", "bend_xx", "bend_xy", "bend_yy")
 UNITS = ("", "1/m", "1/m", "1/m")
@@ -99,12 +114,65 @@ class Optics:
         boards = tuple(shapes.get(name, alone) for name in self.board_names)
         return replace(self, lenses=lenses, boards=boards, free=frozenset())
 
-    def place(self, camera: str, board: str) -> np.ndarray:
-        """Return the positions of the parameters that an image by `camera` of `board` depends on."""
+    def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
+        """Return the lens and the board that images are predicted with, and which of their values are free."""
+        if not isinstance(measured, Pixels):
+            return None
+        if measured.camera not in self.lens_names or measured.target not in self.board_names:
+            refuse_option(
+                measured.file,
+                f"camera '{measured.camera}' with board '{measured.target}' is not part of the "
+                f"installation, which has {', '.join(self.lens_names) or 'no camera'}",
+            )
         edges = np.cumsum([0, *(len(lens.values) for lens in self.lenses)])
-        lens = self.lens_names.index(camera)
-        first = int(edges[-1]) + len(SHAPE) * self.board_names.index(board)
-        return np.concatenate([np.arange(edges[lens], edges[lens + 1]), np.arange(first, first + len(SHAPE))])
+        lens, board = self.lens_names.index(measured.camera), self.board_names.index(measured.target)
+        first = int(edges[-1]) + len(SHAPE) * board
+        used = np.concatenate([np.arange(edges[lens], edges[lens + 1]), np.arange(first, first + len(SHAPE))])
+        _, own, place = np.intersect1d(used, free, return_indices=True)
+        return View(self.lenses[lens], self.boards[board], own, place)
+
+    def tables(self) -> dict[str, Any]:
+        """Return the tables ``camera`` and ``board`` of ``robot.toml``; `read_optics` reads them."""
+        lenses, boards = zip(self.lens_names, self.lenses), zip(self.board_names, self.boards)
+        return {
+            "camera": [
+                {"name": name, "model": lens.model, "size": list(lens.size), "values": lens.values.tolist()}
+                for name, lens in lenses
+            ],
+            "board": [{"name": name, **asdict(shape)} for name, shape in boards],
+        }
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """An entry of ``camera``."""
+
+    name: str
+    model: str
+    size: tuple[int, int]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Board(BoardShape):
+    """An entry of ``board``."""
+
+    name: str = ""
+
+
+def read_optics(cameras: Sequence[Mapping[str, Any]], boards: Sequence[Mapping[str, Any]]) -> Optics:
+    """Return the cameras and boards of the tables ``camera`` and ``board`` of a fit's ``robot.toml``.
+
+    Raises:
+        ValueError, CalibError: for a table that is not one.
+    """
+    lenses, shapes = read_record(tuple[_Camera, ...], cameras), read_record(tuple[_Board, ...], boards)
+    return Optics(
+        tuple(Lens(each.model, np.array(each.values), each.size) for each in lenses),
+        tuple(each.name for each in lenses),
+        tuple(BoardShape(*each.values) for each in shapes),
+        tuple(each.name for each in shapes),
+    )
 
 
 @dataclass(frozen=True, eq=False)

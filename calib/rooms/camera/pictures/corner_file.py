@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.camera.board import Board, corners
 from calib.errors import MeasurementError, refuse_data, refused_as
+from calib.rooms.camera.board import Board, corners
 
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
 USUAL = 0.1  # sigma where a file states none [px]; our choice

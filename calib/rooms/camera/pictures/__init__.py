@@ -1,0 +1,1 @@
+"""From a printed board and images of it, files or bags, to its corners."""
