@@ -144,10 +144,11 @@ class GeometryFit(Judged, fit.Outcome):
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
         """Return the figures of the certificate by name."""
-        from calib.procedure.report import charts, figures
+        from calib.procedure.report import charts, geometry_figures
         from calib.procedure.report.fit_report import collect
 
-        return {name: charts.figure(chart) for name, (chart, _) in figures.captioned(collect(self)).items()}
+        captioned = geometry_figures.captioned(collect(self))
+        return {name: charts.figure(chart) for name, (chart, _) in captioned.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

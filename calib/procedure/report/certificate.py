@@ -161,18 +161,15 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, page: bool = T
     """
     report = fit_report.collect(outcome)
     fit_report.write(report, FitFolder(folder).report)
-    drawn = draw(report) if plots else {}
+    drawn: Mapping[str, Picture] = {}
+    if plots:
+        from calib.procedure.report.geometry_figures import draw
+
+        drawn = draw(report)
     for name, figure in drawn.items():
         files.write(folder / f"plot_{name}.png", figure.png)
     if page:
         files.write(folder / CERTIFICATE, render(of_fit(report, drawn, outcome.inputs)))
-
-
-def draw(report: Report) -> Mapping[str, Picture]:
-    """Return the figures by name; matplotlib is loaded here."""
-    from calib.procedure.report import figures
-
-    return figures.draw(report)
 
 
 def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None = None) -> Page:

@@ -1,7 +1,4 @@
-"""The figures of the dynamics: those of an identification's outcome for its folder, those of plain arrays for both.
-
-A certificate draws the latter from what the folder keeps (`calib.procedure.report.figures`).
-"""
+"""The figures of the dynamics: of an identification's outcome for its folder, and of what a folder keeps for a page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,11 +12,15 @@ from calib.estimation.whiteness import Whiteness
 from calib.identification.cases import Case
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.excitation import coefficients
 from calib.procedure.report.charts import Chart, Panel, bars, level, line, picture, save_all, text
-from calib.procedure.report.page import Picture
+from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of
+from calib.procedure.report.page import Picture, Pictures
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
+from calib.robot.chain import Joint
 from calib.units import small
 
 MAX_HALF_PAGE_ROWS = 8  # torque rows whose figures fit half a page
@@ -30,7 +31,8 @@ T = TypeVar("T")
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
     """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png``, ``plot_friction.png`` and more."""
     save_all(figures(outcome), folder)
-    write_tables(folder)
+    for name, drawn in from_folder(folder).items():
+        files.write(folder / f"plot_{name}.png", drawn.png)
 
 
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
@@ -60,27 +62,30 @@ def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
 
 
 def _friction(outcome: IdentificationOutcome) -> Chart:
-    """Draw the friction that the first file shows, and the model's."""
+    """Draw each joint's friction over its velocity: what the rigid model leaves of the first file, and the model's."""
     found, case = outcome.found, outcome.inputs.cases[0]
     model = found.dynamics.model
     terms = list(zip(model.columns, found.dynamics.values[model.inertial :]))
-    n, rows = case.motion.n, case.target.shape[1]
-    v, observed = np.asarray(case.motion.v), np.asarray(case.target - outcome.predictions[case.name])[:, rows - n :]
-    curves, units = [], outcome.inputs.row_units[rows - n :]
-    observed = observed.copy()
-    for j in range(n):
-        own = [one for one in terms if one[0].form.of_velocity and one[0].joint == j]
+    joints, rows = outcome.inputs.chain.joints, case.target.shape[1]
+    units = outcome.inputs.row_units[rows - len(joints) :]
+    v = np.asarray(case.motion.v)
+    observed = np.array(case.target - outcome.predictions[case.name])[:, rows - len(joints) :]
+    columns, step = min(len(joints), 4), max(1, len(v) // 1400)
+    panels = []
+    for j, joint in enumerate(joints):
         grid = np.linspace(v[:, j].min(), v[:, j].max(), 400)
         curve = np.zeros(len(grid))
-        for one, value in own:
-            for speeds, target in ((grid, curve), (v[:, j], observed[:, j])):
-                still = np.zeros(len(speeds))
-                target += value * one.values(Joined(still, speeds, still))
-        curves.append((grid, curve))
-    speeds = ["m/s" if joint.kind == "prismatic" else "rad/s" for joint in outcome.inputs.chain.joints]
+        for one, value in terms:
+            if one.form.of_velocity and one.joint == j:
+                for speeds, target in ((grid, curve), (v[:, j], observed[:, j])):
+                    still = np.zeros(len(speeds))
+                    target += value * one.values(Joined(still, speeds, still))
+        cloud = line(v[::step, j], observed[::step, j], ".", BEFORE, size=1.5, label="model + residual")
+        words = f"friction [{units[j]}]" if j % columns == 0 or units[j] != units[j - 1] else ""
+        speed = f"velocity [{'m/s' if joint.kind == 'prismatic' else 'rad/s'}]"
+        panels.append(Panel([cloud, line(grid, curve, width=1.2, label="model")], joint.name, speed, words))
     title = f"friction over velocity on {case.name}"
-    names = outcome.inputs.chain.joint_names
-    return friction(v, observed, curves, names, list(zip(speeds, units)), title)
+    return Chart(panels, 0.5 + 1.55 * -(-len(joints) // columns), columns, title=title)
 
 
 def _rows(outcome: IdentificationOutcome) -> tuple[str, ...]:
@@ -116,19 +121,6 @@ def torques(
     return Chart(panels, 0.7 + 0.95 * -(-len(rows) // columns), columns, title=title)
 
 
-def errors_by_row(fitted: np.ndarray, unseen: np.ndarray, rows: Sequence[str]) -> Chart:
-    """Return the relative error of every row [%], on the training and on unseen motion."""
-    shown = [
-        bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
-        bars(unseen, AFTER, shift=0.19, thick=0.36, label="unseen motion"),
-    ]
-    title = f"at most {max(unseen):.3g} % left" if len(rows) else ""
-    panel = Panel(shown, x="torque unexplained [%]", ynames=rows, grid="x")
-    return Chart(
-        [panel], 0.8 + 0.21 * len(rows), width=PAGE_WIDTH if len(rows) > MAX_HALF_PAGE_ROWS else HALF_WIDTH, title=title
-    )
-
-
 def autocorrelations(
     found: Sequence[Whiteness | None], rows: Sequence[str], title: str = "", width: float = PAGE_WIDTH
 ) -> Chart:
@@ -159,43 +151,6 @@ def autocorrelations(
     return Chart(panels or [Panel([])], 0.65 + 0.95 * -(-max(1, len(shown)) // columns), columns, width, title)
 
 
-def friction(
-    velocity: np.ndarray, observed: np.ndarray, curves: Sequence[tuple[np.ndarray, np.ndarray]], rows: Sequence[str],
-    units: Sequence[tuple[str, str]], title: str = "",
-) -> Chart:  # fmt: skip
-    """Return each joint's friction over its velocity: what the rigid model leaves, and the model's terms of velocity.
-
-    Args:
-        velocity, observed: (N, n), of each joint.
-        curves: velocities and the model's friction there, of each joint.
-        rows: names of the joints.
-        units: of velocity and of friction, of each joint.
-        title: of the whole.
-    """
-    columns, step = min(len(rows), 4), max(1, len(velocity) // 1400)
-    panels = []
-    for j, row in enumerate(rows):
-        cloud = line(velocity[::step, j], observed[::step, j], ".", BEFORE, size=1.5, label="model + residual")
-        words = f"friction [{units[j][1]}]" if j % columns == 0 or units[j] != units[j - 1] else ""
-        layers = [cloud, line(*curves[j], width=1.2, label="model")]
-        panels.append(Panel(layers, row, f"velocity [{units[j][0]}]", words))
-    return Chart(panels, 0.5 + 1.55 * -(-len(rows) // columns), columns, title=title)
-
-
-def significance(names: Sequence[str], values: np.ndarray, sigma: np.ndarray) -> Chart:
-    """Return how many sigmas each parameter is from zero; below two it is not significant.
-
-    Args:
-        names: (p,).
-        values, sigma: (p,), in each parameter's unit.
-    """
-    share = np.maximum(np.abs(values) / np.maximum(sigma, 1e-300), 0.1)
-    shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
-    title = f"{int((share > 2).sum())} of {len(names)} parameters differ from zero by two sigmas"
-    limits = 0.1, 2.0 * float(share.max(initial=2.0))
-    return Chart([Panel([shown, level(2.0)], title, y="|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
-
-
 def from_folder(folder: Path) -> dict[str, Picture]:
     """Return the figures that an identification's folder gives, by name; none of a robot without a fit."""
     result: dict[str, Picture] = {}
@@ -217,16 +172,8 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "it moves most, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
-        result["effects"] = picture(_effects(known[:MAX_ELEMENTS]), words)
+        result["geometry_effects"] = picture(_effects(known[:MAX_ELEMENTS]), words)
     return result
-
-
-def write_tables(folder: Path) -> None:
-    """Write ``plot_geometries.png`` and ``plot_geometry_effects.png`` beside the tables they show."""
-    drawn = from_folder(folder)
-    for name, file in (("geometries", "plot_geometries.png"), ("effects", "plot_geometry_effects.png")):
-        if name in drawn:
-            files.write(folder / file, drawn[name].png)
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
@@ -258,16 +205,80 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
         bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), level(MIN_SHIFT, upright=True),
         *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
     ]  # fmt: skip
-    labels = [f"{row.element} ({_milli(row)})" for row in rows]
+    labels = [f"{row.element} ({small(row.sigma or 0.0, row.unit, digits=2)})" for row in rows]
     title = f"{int((size > MIN_SHIFT).sum())} of these {len(rows)} geometric errors matter"
     limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))
     panel = Panel(layers, title, "shift [σ of torque noise]", xlim=limits, ynames=labels)
     return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF_WIDTH)
 
 
-def _milli(row: GeometricEffect) -> str:
-    return small(row.sigma or 0.0, row.unit, digits=2)
-
-
 def _read(kind: type[T], path: Path) -> tuple[T, ...]:
     return read_rows(kind, path) if path.is_file() else ()
+
+
+def draw_dynamics(
+    found: DynamicReport, folder: Path, excitation: Path | None, joints: Sequence[Joint]
+) -> dict[str, Pictures]:
+    """Return the figures of the dynamics by name, as a page shows them; those that the data do not give are empty.
+
+    Args:
+        folder: of the identification.
+        excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``; None where other motions
+            were played.
+        joints: of the robot.
+    """
+    motions = []
+    if excitation is not None and (excitation / "training" / coefficients.NAME).exists():
+        from calib.procedure.report.motion_figures import trained_on
+
+        motions = [trained_on(excitation / "training", joints)]
+    return {
+        "errors": Pictures("", _judged(found.unseen)),
+        "torques": Pictures("Torques", _torques(found.unseen)),
+        "excitation": Pictures("Excitation", motions),
+        "geometry": Pictures("", list(from_folder(folder).values())),
+        "parameters": Pictures("Dynamic parameters", [_significance(found)]),
+    }
+
+
+def _judged(unseen: UnseenReport) -> list[Picture]:
+    """Return the error of every row [%], and the residuals' autocorrelations, of the recording that judges."""
+    _, proof, where = proof_of(unseen)
+    fitted, left = (np.nan_to_num(one.raw.joints) for one in (next(iter(unseen.fit.values())), proof))
+    shown = [
+        bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
+        bars(left, AFTER, shift=0.19, thick=0.36, label="unseen motion"),
+    ]
+    title = f"at most {max(left, default=0.0):.3g} % left"
+    panel = Panel(shown, x="torque unexplained [%]", ynames=unseen.rows, grid="x")
+    width = PAGE_WIDTH if len(unseen.rows) > MAX_HALF_PAGE_ROWS else HALF_WIDTH
+    errors = Chart([panel], 0.8 + 0.21 * len(unseen.rows), width=width, title=title)
+    name, looked = next(iter((unseen.validation or unseen.fit).items()))
+    drawn = autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
+    shares = f"Share of each torque that the model leaves, on the training motion and on {where}."
+    rest = f"Autocorrelation of the residuals below the band on {name}; dashed: white noise."
+    return [picture(errors, shares), picture(drawn, rest)]
+
+
+def _torques(unseen: UnseenReport) -> list[Picture]:
+    """Return measured and predicted torques of each unseen recording, or of those fitted."""
+    seen = "unseen" if unseen.validation else "fitted"
+    result = []
+    for curves in unseen.curves:
+        raw = {**unseen.fit, **unseen.validation}[curves.name].raw
+        sides = curves.measured.T, curves.predicted.T
+        title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
+        chart = torques(curves.t, *sides, unseen.rows, unseen.units, title, raw.joints)
+        result.append(picture(chart, f"Torques on {curves.name}, {seen}: measured, predicted, and the residual."))
+    return result
+
+
+def _significance(found: DynamicReport) -> Picture:
+    """Return how many sigmas each parameter is from zero; below two it is not significant."""
+    known = [row for row in found.estimate if row.sigma]
+    share = np.array([max(abs(row.value) / max(row.sigma or 0.0, 1e-300), 0.1) for row in known])
+    shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
+    title = f"{int((share > 2).sum())} of {len(known)} parameters differ from zero by two sigmas"
+    limits, names = (0.1, 2.0 * float(share.max(initial=2.0))), [row.name for row in known]
+    chart = Chart([Panel([shown, level(2.0)], title, y="|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
+    return picture(chart, "How far each parameter is from zero, in its σ; grey: not significant.")

@@ -133,7 +133,7 @@ def certificate_section(
     """Return the section of a certificate: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
-        drawn: figures by name, see `calib.procedure.report.figures.draw_dynamics`; those not there are left out.
+        drawn: figures by name (`draw_dynamics`); those that are not there are left out.
         exported: what the export had to say.
         tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
     """

@@ -29,7 +29,7 @@ READ = (1, SCHEMA)  # 1 kept the findings here, too
 NATURES = ("position", "orientation", "distance")
 
 
-class _FittedParameter(NamedTuple):
+class FittedParameter(NamedTuple):
     """One parameter of the fit; `rsd` in percent, `group` arm, station, tool or deflection."""
 
     name: str
@@ -106,7 +106,7 @@ class Report:
     joints: tuple[str, ...]
     prismatic: tuple[bool, ...]
     metrics: FitMetrics
-    parameters: tuple[_FittedParameter, ...]
+    parameters: tuple[FittedParameter, ...]
     kept: tuple[str, ...]
     correlations: tuple[_CorrelatedPair, ...]
     correlated: _CorrelationMatrix
@@ -140,7 +140,7 @@ def collect(outcome: Outcome) -> Report:
         joints=tuple(chain.joint_names),
         prismatic=tuple(joint.kind == "prismatic" for joint in chain.joints),
         metrics=metrics(outcome),
-        parameters=tuple(_FittedParameter(*row, groups[row[0]]) for row in table.rows()),
+        parameters=tuple(FittedParameter(*row, groups[row[0]]) for row in table.rows()),
         kept=tuple(name for name in chain.names if name not in fitted),
         correlations=tuple(_CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(0.9)),
         correlated=_correlated(table.names, table.covariance),

@@ -1,4 +1,4 @@
-"""The figures of a geometric calibration: plain arrays in, a `Chart` out. Lengths come in m, angles in rad.
+"""The figures of a geometric calibration, of a `Report` or of plain arrays [m, rad], as `Chart`s with captions.
 
 Before is light and after is dark everywhere, so that a greyscale print still distinguishes them.
 """
@@ -7,7 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.procedure.report.charts import Chart, Panel, bars, dots, heat, histogram, level, line, text
+from calib.geometry.model_choice.ladder import ModelStep
+from calib.procedure.report.charts import Chart, Panel, bars, dots, heat, histogram, level, line, picture, text
+from calib.procedure.report.fit_report import FittedParameter, Report
+from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
 from calib.units import ERRORS
 
@@ -52,7 +55,7 @@ def residuals_by_joint(
     before: np.ndarray,
     after: np.ndarray,
     joint_names: Sequence[str],
-    prismatic: Sequence[bool] | None = None,
+    prismatic: Sequence[bool],
     nature: str = "position",
 ) -> Chart:
     """Return errors against each joint (small multiples): a trend that stays is something no parameter describes.
@@ -67,12 +70,11 @@ def residuals_by_joint(
     factor, unit = ERRORS[nature]
     n = q.shape[1]
     columns = n if n < 4 else 4 if n in (4, 7, 8) else -(-n // 2) if n < 7 else 4
-    slides = prismatic or [False] * n
     sizes = factor * np.concatenate([before, after])
     limits = float(max(np.percentile(sizes, 2), 1e-9)) * 0.5, float(max(sizes.max(), 1e-8)) * 1.3
     panels = []
     for j in range(n):
-        x = q[:, j] if slides[j] else np.rad2deg(q[:, j])
+        x = q[:, j] if prismatic[j] else np.rad2deg(q[:, j])
         cloud = [
             line(x, factor * errors, ".", colour, size=4.5, label=label)
             for errors, colour, label in ((before, BEFORE, "nominal"), (after, AFTER, "calibrated"))
@@ -81,7 +83,7 @@ def residuals_by_joint(
         panels.append(
             Panel(
                 cloud,
-                x=f"{joint_names[j]} [{'m' if slides[j] else 'deg'}]",
+                x=f"{joint_names[j]} [{'m' if prismatic[j] else 'deg'}]",
                 y="" if inner else f"error [{unit}]",
                 ylim=limits,
                 log="y",
@@ -150,28 +152,26 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
     return Chart(panels, 0.8 + 0.5 * (PAGE_WIDTH - 2.0) * high / wide, 2)
 
 
-def parameter_changes(
-    names: Sequence[str], units: Sequence[str], changes: np.ndarray, sigmas: np.ndarray, most: int = 48
-) -> Chart:
+def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
     """Return calibrated minus nominal with bars of two sigmas, lengths in mm and angles in mrad side by side.
 
     Args:
-        names, units: (p,); units are ``m`` or ``rad``, others are left out.
-        changes, sigmas: (p,) [unit].
+        rows: fitted parameters; those in other units are left out.
         most: parameters per panel, those furthest from nominal by their sigma.
     """
     panels, longest = [], 5
-    weight = np.abs(changes) / np.maximum(sigmas, 1e-15)
     for base, unit, what in (("m", "mm", "lengths"), ("rad", "mrad", "angles")):
-        chosen = [k for k, one in enumerate(units) if one == base]
-        chosen = sorted(sorted(chosen, key=lambda k: -weight[k])[:most])
-        if not chosen:
+        own = [row for row in rows if row.unit == base]
+        change = np.array([row.value - row.nominal for row in own])
+        sigma = np.array([row.sigma for row in own])
+        chosen = np.sort(np.argsort(-np.abs(change) / np.maximum(sigma, 1e-15), kind="stable")[:most])
+        if not len(chosen):
             continue
-        value, spread = 1e3 * changes[chosen], 2e3 * sigmas[chosen]
+        value, spread = 1e3 * change[chosen], 2e3 * sigma[chosen]
         clear = np.abs(value) > spread
         shown = bars(value, [AFTER if one else PALE for one in clear], spread=spread)
         words = f"{int(clear.sum())} of {len(chosen)} {what} clearly changed"
-        labels = [names[k] for k in chosen]
+        labels = [own[k].name for k in chosen]
         panels.append(Panel([shown], words, f"calibrated - nominal [{unit}], bars ±2σ", ynames=labels, grid="x"))
         longest = max(longest, len(chosen))
     return Chart(panels, 0.65 + 0.155 * longest, max(1, len(panels)))
@@ -201,23 +201,15 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
     )
 
 
-def ladder(
-    models: Sequence[str],
-    parameters: Sequence[int],
-    unseen: Sequence[float],
-    kept: Sequence[bool],
-    noise: float | None = None,
-) -> Chart:
+def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
     """Return the cross-validated error of every model tried: the search ends where the gain ends.
 
     Args:
-        models: names of the models.
-        parameters: fitted by each.
-        unseen: cross-validated rms [m].
-        kept: whether the search went on from there; the last one kept is the model chosen.
+        steps: models with such an error; the last one kept, without a note, is the model chosen.
         noise: rms of the instrument's own error [m].
     """
-    errors, x, taken = 1e3 * np.asarray(unseen, dtype=float), np.arange(len(models)), np.flatnonzero(kept)
+    errors, x = np.array([step.cross_validated_mm for step in steps], dtype=float), np.arange(len(steps))
+    taken = np.flatnonzero([not step.note for step in steps])
     left_out, last = np.setdiff1d(x, taken), taken[-1:]
     layers: list = [
         line(x[taken], errors[taken], "o-", size=5.0), line(x[left_out], errors[left_out], "o", size=5.0, hollow=True),
@@ -227,35 +219,21 @@ def ladder(
     if noise:
         layers.append(level(1e3 * noise, INK, ":", words="instrument"))
     limits = 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max()
-    title = f"{str(models[last[0]]).removeprefix('+ ')} is where the gain ends: {errors[last[0]]:.3g} mm"
-    names = [f"{model}\n{count}" for model, count in zip(models, parameters)]
+    ends = (f"{steps[k].model.removeprefix('+ ')} is where the gain ends: {errors[k]:.3g} mm" for k in last)
     panel = Panel(
-        layers, title if len(taken) else "", "model, parameters", "cross-validated error [mm]", ylim=limits, log="y",
-        xnames=names, grid="y",
+        layers, next(ends, ""), "model, parameters", "cross-validated error [mm]", ylim=limits, log="y",
+        xnames=[f"{step.model}\n{step.parameters}" for step in steps], grid="y",
     )  # fmt: skip
     return Chart([panel], 2.4)
 
 
-def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: float = 0.9, most: int = 24) -> Chart:
-    """Return the correlations of those parameters that go together with some other one by more than `threshold`.
-
-    Args:
-        names: (p,).
-        correlation: (p, p).
-        threshold: of a strong pair.
-        most: parameters shown, the strongest.
-    """
-    off = np.abs(correlation - np.diag(np.diag(correlation))).max(axis=1)
-    chosen = np.flatnonzero(off > threshold)
-    if len(chosen) < 2:
-        chosen = np.argsort(-off)[:6]
-    chosen = np.sort(chosen[np.argsort(-off[chosen])][:most])
-    labels = [str(names[k]) for k in chosen]
-    title = f"correlations up to {off[chosen].max():.2f}" if len(chosen) > 1 else ""
-    matrix = heat(correlation[np.ix_(chosen, chosen)], limits=(-1.0, 1.0), colours="PuOr", written=len(labels) <= 10)
-    longest = max(map(len, labels), default=0)
-    side = max(HALF_WIDTH, 0.13 * len(labels) + 0.05 * longest + 1.0)  # long names widen the figure, and never overlap
-    panel = Panel([matrix], title, xnames=labels, ynames=labels)
+def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
+    """Return the correlations (p, p) of parameters by their names (p,)."""
+    off = np.abs(correlation - np.diag(np.diag(correlation)))
+    matrix = heat(correlation, limits=(-1.0, 1.0), colours="PuOr", written=len(names) <= 10)
+    # long names widen the figure, and never overlap
+    side = max(HALF_WIDTH, 0.13 * len(names) + 0.05 * max(map(len, names)) + 1.0)
+    panel = Panel([matrix], f"correlations up to {off.max():.2f}", xnames=names, ynames=names)
     return Chart([panel], side - 0.3, width=side)
 
 
@@ -278,3 +256,49 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         (0.7 * low[1], 1.4 * high[1]), log="xy", grid="both",
     )  # fmt: skip
     return Chart([panel], 2.4, width=HALF_WIDTH)
+
+
+Captioned = tuple[Chart, str]  # with what it shows, in a sentence
+
+
+def draw(report: Report) -> dict[str, Picture]:
+    """Return the figures of a report as pictures by name, drawn once."""
+    return {name: picture(*found) for name, found in captioned(report).items()}
+
+
+def captioned(report: Report) -> dict[str, Captioned]:
+    """Return the charts of a report by name; those that the data do not give are left out."""
+    result: dict[str, Captioned] = {}
+    proof = next((rows for rows in report.sets if rows.unseen), report.sets[0])
+    label = f"{proof.poses} {'unseen' if proof.unseen else 'fitted'} poses ({proof.name})"
+    for nature in ("position", "orientation", "distance"):
+        if nature in proof.calibrated:
+            sizes = [np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated)]
+            chart = error_histogram(sizes[0], sizes[1], nature, report.noise.get(nature))
+            result[nature] = chart, f"{nature.capitalize()} errors before and after, {label}; dashed: rms."
+    rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
+    if len(rungs) > 1:
+        chart = ladder(rungs, report.noise.get("position"))
+        result["ladder"] = chart, "Models tried, by their cross-validated error. Filled: kept; open: left out."
+    if report.singular_values:
+        chart = singular_values(np.array(report.singular_values), report.rank)
+        words = "Singular values of the scaled observation matrix: filled ones carry a parameter, open ones none."
+        result["singular_values"] = chart, words
+    if proof.q:
+        nature = "position" if "position" in proof.calibrated else "distance"
+        before, after = (np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated))
+        chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature)
+        result["joints"] = chart, f"Errors against each joint, {label}: a trend is an unmodelled effect."
+        chart = error_map(np.array(proof.points), after, expected=np.array(proof.expected))
+        below = "; below: 95 % are expected within." if proof.expected else "."
+        result["map"] = chart, f"Remaining error over the workspace, {label}{below}"
+    for count, seen in enumerate(report.images, 1):
+        chart = image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
+        words = f"Where in the image corners were seen, and how well they are predicted there ({seen.file})."
+        result["coverage" if count == 1 else f"coverage_{count}"] = chart, words
+    if arm := [row for row in report.parameters if row.group == "arm"]:
+        result["parameters"] = parameter_changes(arm), "What the fit changed in the arm. Grey: less than two sigmas."
+    if len(report.correlated.names) > 1:
+        chart = correlation_map(report.correlated.names, np.array(report.correlated.matrix))
+        result["correlations"] = chart, "The most strongly correlated parameters."
+    return result

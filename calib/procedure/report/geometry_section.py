@@ -71,7 +71,7 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
     """Return the section of a certificate: errors, ladder, parameters, identifiability, figures, outliers.
 
     Args:
-        drawn: figures by name, see `calib.procedure.report.figures.draw`; those that are not there are left out.
+        drawn: figures by name (`geometry_figures.draw`); those that are not there are left out.
     """
     metrics = report.metrics
     blocks: list[Block] = [_error_table(metrics), *iso9283_tables(metrics)]

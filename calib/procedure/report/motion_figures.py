@@ -8,10 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib.procedure.report.charts import Chart, Panel, level, line, save_all, text
+from calib.folders import METRICS
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.metrics import DesignMetrics
+from calib.procedure.report.charts import Chart, Panel, level, line, picture, save_all, text
 from calib.procedure.report.geometry_figures import outlook_figure
+from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
-from calib.robot.chain import Chain
+from calib.records import read_json
+from calib.robot.chain import Chain, Joint
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
 from trajectories.constraints import BoxLimit
@@ -23,65 +28,52 @@ if TYPE_CHECKING:
     from calib.procedure.excitation.planning import Planned
 
 POINTS = 800
+DRAWN = 300  # points per curve of a certificate
+Limited = tuple[np.ndarray, np.ndarray, np.ndarray]  # values, lower and upper limit
 TITLES = ("position", "velocity", "acceleration", "torque")
 
 
-def motion_sheet(
-    times: np.ndarray, series: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], units: Sequence[str],
-    names: Sequence[str],
-) -> Chart:  # fmt: skip
+def _motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
     """Return series of every joint, a line per joint and a column per series, with their limits dashed.
 
     Args:
         times: (N,) [s].
-        series: values (N, n), lower and upper limit (n,), infinite without one, and title.
-        units: of each series.
-        names: of the n joints.
+        series: values (N, n), lower and upper limit (n,), infinite without one: q, v, and a and τ where known.
+        joints: of the robot (n).
     """
-    n, columns = len(names), len(series)
-    panels = []
-    for j, k in ((j, k) for j in range(n) for k in range(columns)):
-        values, lower, upper, quantity = series[k]
-        last = j == n - 1
-        bounds = [level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
-        label = names[j].replace("_", "_\n") if len(names[j]) > 12 else names[j]
-        panels.append(
-            Panel(
-                [line(times, values[:, j]), *bounds],
-                f"{quantity} [{units[k]}]" if j == 0 else "",
-                "time [s]" if last else "",
-                label if k == 0 else "",
-                xlim=(times[0], times[-1]),
-                ticks=4,
-                bare="" if last else "x",
-            )
-        )
-    return Chart(panels, 0.7 + 0.75 * n, columns, title=_nearest(series, names))
-
-
-def _nearest(series: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], names: Sequence[str]) -> str:
-    """Say which series of which joint comes nearest to its limit, of those that have both."""
-    least, words = np.inf, ""
-    for values, lower, upper, title in series:
-        known = np.isfinite(lower) & np.isfinite(upper) & (upper > lower)
-        for j in map(int, np.flatnonzero(known)):
-            gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
-            if gap < least:
-                least, words = gap, f"{title} of {names[j]} comes nearest to its limit (dashed)"
-    return words
+    units = motion_units(joint.kind for joint in joints)
+    panels, nearest, title = [], np.inf, ""
+    for j, joint in enumerate(joints):
+        last = joint is joints[-1]
+        label = joint.name.replace("_", "_\n") if len(joint.name) > 12 else joint.name
+        for (values, lower, upper), quantity, unit in zip(series, TITLES, units):
+            first = values is series[0][0]
+            bounds = [level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
+            panels.append(
+                Panel(
+                    [line(times, values[:, j]), *bounds], f"{quantity} [{unit}]" if j == 0 else "",
+                    "time [s]" if last else "", label if first else "", xlim=(times[0], times[-1]), ticks=4,
+                    bare="" if last else "x",
+                )
+            )  # fmt: skip
+            gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / max(upper[j] - lower[j], 1e-300)
+            if len(bounds) == 2 and gap < nearest:
+                nearest, title = gap, f"{quantity} of {joint.name} comes nearest to its limit (dashed)"
+    return Chart(panels, 0.7 + 0.75 * len(joints), len(series), title=title)
 
 
 def _motion_figure(designed: Designed) -> Chart:
     """Return q, v, a and τ of every joint over one period, with their limits dashed."""
-    motion = _motion(designed)
-    states = zip((motion.q, motion.v, motion.a), (_limits(designed, order) for order in range(3)), TITLES)
-    rows = [(values, lower, upper, title) for values, (lower, upper), title in states]
-    values = designed.inputs.model.values
-    if values is not None:
-        torque = designed.inputs.model.exact.regressor(motion.q, motion.v, motion.a) @ values
-        rows.append((torque, -designed.inputs.limits.torque, designed.inputs.limits.torque, TITLES[3]))
-    units = motion_units(joint.kind for joint in designed.inputs.chain.joints)
-    return motion_sheet(motion.times, rows, units, designed.inputs.chain.joint_names)
+    motion, model, limits = _motion(designed), designed.inputs.model, designed.inputs.limits
+    boxes = {limit.order: (limit.lower, limit.upper) for limit in limits.constraints if isinstance(limit, BoxLimit)}
+    none = np.full(designed.inputs.chain.n, np.inf)
+    rows: list[Limited] = [
+        (values, *boxes.get(order, (-none, none))) for order, values in enumerate((motion.q, motion.v, motion.a))
+    ]
+    if model.values is not None:
+        torque = model.exact.regressor(motion.q, motion.v, motion.a) @ model.values
+        rows.append((torque, -limits.torque, limits.torque))
+    return _motion_sheet(motion.times, rows, designed.inputs.chain.joints)
 
 
 def _path_figure(designed: Designed) -> Chart:
@@ -122,15 +114,6 @@ def _motion(designed: Designed) -> Any:
     return dense_motion(designed.family, designed.found.x, times, designed.found.factor)
 
 
-def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits (n,) of position, velocity or acceleration; infinite without one."""
-    for limit in designed.inputs.limits.constraints:
-        if isinstance(limit, BoxLimit) and limit.order == order:
-            return limit.lower, limit.upper
-    none = np.full(designed.inputs.chain.n, np.inf)
-    return -none, none
-
-
 def design_figures(designed: Designed) -> dict[str, Chart]:
     """Return the figures of a designed motion by name: motion, an arm's tool path, search, front and outlook if any."""
     figures = {"motion": _motion_figure(designed), "history": _history_figure(designed)}
@@ -163,15 +146,11 @@ def write_plan(planned: Planned, folder: Path) -> None:
 def _plan_figure(planned: Planned) -> Chart:
     """Return q, v, a and τ of every joint with their limits dashed."""
     track, limits = planned.track, planned.limits
-    rows = [
-        (track.q, planned.lower, planned.upper, "position"),
-        (track.v, -limits.velocity, limits.velocity, "velocity"),
-    ]
-    rows.append((track.a, -limits.acceleration, limits.acceleration, "acceleration"))
+    rows: list[Limited] = [(track.q, planned.lower, planned.upper), (track.v, -limits.velocity, limits.velocity)]
+    rows.append((track.a, -limits.acceleration, limits.acceleration))
     if track.tau is not None:
-        rows.append((track.tau, -limits.torque, limits.torque, "torque"))
-    units = motion_units(joint.kind for joint in planned.chain.joints)
-    return motion_sheet(track.times, rows, units, planned.chain.joint_names)
+        rows.append((track.tau, -limits.torque, limits.torque))
+    return _motion_sheet(track.times, rows, planned.chain.joints)
 
 
 def _profile_figure(planned: Planned) -> Chart:
@@ -191,3 +170,20 @@ def _profile_figure(planned: Planned) -> Chart:
         Panel(above, x="time [s]", y="speed along the path", xlim=(0.0, start)),
     ]
     return Chart(panels, 3.8, title=f"{start:.3g} s, with a limit all but reached for {share:.0%} of them")
+
+
+def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
+    """Return a designed motion of joints from its folder, and how well it identifies the parameters."""
+    motion = coefficients.read(folder)
+    t = np.linspace(0.0, motion.period, DRAWN)
+    q, v, _ = motion.orders(t)
+    made = read_json(folder / METRICS, "design the motion again", DesignMetrics)
+    margins = ", ".join(f"{name} {one.share:.1%} of its scale" for name, one in made.margins.items())
+    words = (
+        f"The training motion, one period of {made.setting.period:g} s: condition number "
+        f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
+        f"{len(made.setting.columns)} columns. Every limit was kept, at and between {made.setting.instants_verified} "
+        f"instants; smallest margins: {margins}."
+    )
+    none = np.full(q.shape[1], np.inf)
+    return picture(_motion_sheet(t, [(q, -none, none), (v, -none, none)], joints), words)

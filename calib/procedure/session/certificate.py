@@ -38,18 +38,22 @@ def certify(session: Session, say: Say) -> list[str]:
     say("drawing" if session.plots else "writing")
     judged, whole = [], None
     if session.geometric:
-        whole = _whole_report(session)
-        section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
+        whole, drawn = _whole_report(session), {}
+        if session.plots:
+            from calib.procedure.report.geometry_figures import draw
+
+            drawn = draw(whole)
+        section = geometry_section.certificate_section(whole, drawn)
         judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session).notes("export")
         drawn = {}
         if session.plots:
-            from calib.procedure.report.figures import draw_dynamics
+            from calib.procedure.report.dynamics_figures import draw_dynamics
 
             motions = session.path("6-excitation") if session.settings.dynamics.plan else None
-            drawn = draw_dynamics(dynamics, session.identification.path, motions)
+            drawn = draw_dynamics(dynamics, session.identification.path, motions, chain_of(session).joints)
         tolerance = session.settings.dynamics.tolerance_percent
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
         own = session.verdicts().stages["dynamics"]

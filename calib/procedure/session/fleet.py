@@ -15,7 +15,7 @@ from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, complaint, require
 from calib.procedure.findings import LEVELS
 from calib.procedure.report import console
-from calib.procedure.session import instructions, steps
+from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import SETTINGS, locked, open_session
 from calib.workers import Workers
 
@@ -114,7 +114,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
     with locked(session, say):
         waiting = steps.run_next(session, say, lambda words: None, command)
     if waiting is not None:
-        asks = tuple(instructions.asks(session, waiting))
+        asks = tuple(commands.asks(session, waiting))
         for words in asks:
             say(words)
         words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"

@@ -120,7 +120,7 @@ def _largest_memory() -> float:
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     """Return what an engineer would be asked, and how to let the simulated cell do it."""
-    from calib.procedure.session.instructions import asks
+    from calib.procedure.session.commands import asks
 
     folder = session.folder
     return (

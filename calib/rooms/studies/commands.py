@@ -40,10 +40,10 @@ def study(
     """
     from calib.identification.methods.registry import LISTING
     from calib.procedure.report import console
-    from calib.rooms.studies.reports import outcome, report
+    from calib.rooms.studies.reports import report
 
     if list_methods or list_studies:
-        say(*(map(str, LISTING) if list_methods else ()), *(outcome.study_lines() if list_studies else ()))
+        say(*(map(str, LISTING) if list_methods else ()), *(report.study_lines() if list_studies else ()))
         return
     if not studies:
         raise UsageError("no study named: give a file, or a name out of calib study --list")
@@ -52,7 +52,7 @@ def study(
     folder = out or Path(f"{Path(studies[0]).stem}-study")
     log_interval = 30.0  # [s] between two lines on progress where the output is no terminal
     with reporting(log_interval) as (_, progress):
-        found = outcome.run_study(
+        found = report.run_study(
             studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
         )  # fmt: skip
@@ -63,7 +63,7 @@ def study(
     else:
         blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]
     say(*console.rendered(blocks), result=True)
-    say(*found.described(), f"written to {folder}: {outcome.REPORT} shows it")
+    say(*found.described(), f"written to {folder}: {report.REPORT} shows it")
 
 
 @command(app)

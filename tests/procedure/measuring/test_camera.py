@@ -208,7 +208,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     from calib.procedure.kinematic_stage.fit import run as fitted
     from calib.procedure.kinematic_stage.inputs import gather
     from calib.procedure.kinematic_stage.settings import FitSettings
-    from calib.procedure.report import figures, fit_report
+    from calib.procedure.report import fit_report, geometry_figures
     from calib.robot.chain import random_joints
     from calib.rooms.camera.camera_guess import complete_camera
     from calib.rooms.cells.cell import measure, true_poses
@@ -233,7 +233,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     (seen,) = fit_report.collect(found).images
     assert np.sum(seen.count) == block.seen.sum() and seen.size == cell.lens.size
     assert 0.03 < np.sqrt(np.sum(np.square(seen.rms) * seen.count) / np.sum(seen.count)) < 0.15
-    assert "coverage" in figures.captioned(fit_report.collect(found))
+    assert "coverage" in geometry_figures.captioned(fit_report.collect(found))
 
 
 @pytest.mark.slow

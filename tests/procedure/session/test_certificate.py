@@ -20,7 +20,8 @@ from sessions import go_on
 from without_figures import run
 
 from calib.errors import CalibError
-from calib.procedure.report import certificate, charts, figures, fit_report, geometry_figures, style
+from calib.geometry.model_choice.ladder import ModelStep
+from calib.procedure.report import certificate, charts, fit_report, geometry_figures, style
 from calib.procedure.session.folder import Session
 
 
@@ -131,7 +132,7 @@ def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Pat
 
 def test_names_of_correlated_parameters_do_not_overlap() -> None:
     names = [f"shoulder_lift_joint.offset cos {k} shoulder_lift_joint" for k in range(12)]
-    figure = charts.figure(geometry_figures.correlation_map(names, 0.5 + 0.5 * np.eye(12), 0.0))
+    figure = charts.figure(geometry_figures.correlation_map(names, 0.5 + 0.5 * np.eye(12)))
     figure.draw_without_rendering()
     axes = figure.axes[0].get_position()
     inches = axes.height * figure.get_figheight(), axes.width * figure.get_figwidth()
@@ -145,6 +146,13 @@ def test_before_and_after_differ_in_greyscale() -> None:
     assert grey(style.BEFORE) - grey(style.AFTER) > 0.35
 
 
+def changed(names, units, changes, sigmas) -> list[fit_report.FittedParameter]:
+    rows = zip(names, units, changes, sigmas)
+    return [
+        fit_report.FittedParameter(name, unit, 0.0, change, sigma, None, "arm") for name, unit, change, sigma in rows
+    ]
+
+
 def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     before, after = rng.gamma(4.0, 1e-3, 60), rng.gamma(4.0, 1e-5, 60)
@@ -155,11 +163,11 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
         geometry_figures.error_histogram(before, before, "orientation"),
         geometry_figures.residuals_by_joint(q, before, after, names[:7], [False] * 6 + [True]),
         geometry_figures.error_map(points, after),
-        geometry_figures.parameter_changes(names, ["m", "rad"] * 10, rng.normal(size=20), np.ones(20), most=6),
-        geometry_figures.parameter_changes(names[:2], ["rad", "rad"], np.ones(2), np.ones(2)),
+        geometry_figures.parameter_changes(changed(names, ["m", "rad"] * 10, rng.normal(size=20), np.ones(20)), most=6),
+        geometry_figures.parameter_changes(changed(names[:2], ["rad", "rad"], np.ones(2), np.ones(2))),
         geometry_figures.singular_values(np.array([3.0, 1.0, 1e-9, 0.0]), 2),
         geometry_figures.singular_values(np.array([3.0, 1.0]), 2),
-        geometry_figures.ladder(["frames", "geometry"], [12, 34], [5e-3, 1e-3], [True, True], 1e-4),
+        geometry_figures.ladder([ModelStep("frames", 12, 5.0, True), ModelStep("geometry", 34, 1.0, True)], 1e-4),
         geometry_figures.correlation_map(names, np.eye(20)),
     ]
     for number, figure in enumerate(map(charts.figure, drawn)):
@@ -184,7 +192,7 @@ def test_a_figure_is_drawn_the_same_twice() -> None:
 def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
     """Matplotlib would read what stands between two of them as mathematics, and fail where it is none."""
     changes, units = np.array([1e-3, 2e-3]), ["m", "rad"]
-    figure = charts.figure(geometry_figures.parameter_changes([name, name], units, changes, changes / 9.0))
+    figure = charts.figure(geometry_figures.parameter_changes(changed([name, name], units, changes, changes / 9.0)))
     assert style.png(figure, dpi=40)[:4] == b"\x89PNG"
     labels = [label for axes in figure.axes for label in axes.get_yticklabels()]
     assert [label.get_text() for label in labels] == [name, name] and not any(
@@ -208,7 +216,7 @@ def test_paper_is_white_and_peaks_are_kept() -> None:
 def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
     found = fit_report.read(finished_folder / "4-fit/report.json")
     bare = (replace(found.sets[0], q=(), points=()),)
-    drawn = figures.draw(replace(found, sets=bare, singular_values=()))
+    drawn = geometry_figures.draw(replace(found, sets=bare, singular_values=()))
     assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn
 
 

@@ -15,7 +15,7 @@ from sessions import edit, go_on
 from calib import cli
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
-from calib.procedure.session import commands, instructions, steps
+from calib.procedure.session import commands, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
@@ -90,7 +90,7 @@ def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> No
 
 def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
-    first, second = instructions.asks(waiting, state)
+    first, second = commands.asks(waiting, state)
     assert "6-excitation/training/run.csv" in first and "validation/run.csv" in first
     assert "2 times" in first and "250 Hz" in first and "never used for training" in first
     assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
@@ -105,7 +105,7 @@ def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> 
     stopped = go_on(session)
     assert stopped is not None and stopped.step.name == "record"
     assert not session.path("6-excitation").exists()
-    assert "unseen one" in instructions.asks(session, stopped)[0]
+    assert "unseen one" in commands.asks(session, stopped)[0]
 
 
 @pytest.mark.slow

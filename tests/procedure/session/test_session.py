@@ -17,7 +17,7 @@ from sessions import edit, go_on, quiet
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
 from calib.procedure.findings import UNJUDGED
-from calib.procedure.session import certificate, instructions, steps
+from calib.procedure.session import certificate, commands, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.markup import with_comment
 from calib.robot.load import load
@@ -41,7 +41,7 @@ def test_a_finished_session_is_done_wherever_it_is(finished: Session, tmp_path: 
 
 def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
     waiting = next(state for state in steps.states(planned) if state.kind == steps.WAITING)
-    first, second = instructions.asks(planned, waiting)
+    first, second = commands.asks(planned, waiting)
     assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
     assert "measured.csv" in second and "joint1 [deg]" in second and "qw" in second
     assert "the 8 of" in first and "2-poses/validation.csv (never fitted)" in first and "validation.csv" in second
@@ -51,7 +51,7 @@ def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Sess
     validation = measured.path("3-measured/validation.csv").rename(measured.folder / "later.csv")
     waiting = go_on(measured)
     assert waiting is not None and waiting.step.name == "validate"
-    assert "8 poses" in instructions.asks(measured, waiting)[0]
+    assert "8 poses" in commands.asks(measured, waiting)[0]
     before = measured.path("4-fit/robot.toml").stat().st_mtime_ns
     validation.rename(measured.path("3-measured/validation.csv"))
     assert go_on(measured) is None
