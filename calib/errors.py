@@ -183,7 +183,7 @@ def refused_as(
     except kinds as error:
         if kinds is Exception and isinstance(error, CalibError):  # said by ourselves
             raise
-        said = getattr(error, "strerror", None) or error
+        said = getattr(error, "strerror", None) or (brief(error) if kinds is Exception else error)
         raise kind(words.replace("{}", str(said)), *details) from error
 
 

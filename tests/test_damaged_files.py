@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from strategies import damaged
 
 from calib.data.poses.fit_options import read_options
-from calib.data.poses.plans import read_poses
 from calib.data.poses.pose_files import read_measurements
-from calib.data.poses.target_files import read_targets
+from calib.data.poses.pose_lists import read_poses, read_targets
 from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_files import read_recording
 from calib.errors import CalibError

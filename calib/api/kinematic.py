@@ -17,7 +17,7 @@ from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.target_files import Targets, read_targets
+from calib.data.poses.pose_lists import Targets, read_targets
 from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection

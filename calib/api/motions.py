@@ -14,7 +14,7 @@ from calib.api.dynamic import DynamicsModel
 from calib.api.given import optional, progress_shown, saved
 from calib.arguments import checked
 from calib.config import Tables
-from calib.data.poses.target_files import Targets
+from calib.data.poses.pose_lists import Targets
 from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings

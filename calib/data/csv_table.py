@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -101,15 +101,15 @@ class Table:
             found = "an empty or NaN cell" if np.isnan(cells[row]) else f"{cells[row]}"
             message = f"found {found} where a number is needed; leave the row out, or measure it again"
             self.fail(message, name, row)
-        return cells * self._factor(column, dimension, unit)
+        known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
+        return cells * self.factor(column, known, unit)
 
-    def _factor(self, column: int, dimension: str, unit: str) -> float:
+    def factor(self, column: int, known: Mapping[str, float], unit: str) -> float:
+        """Return the factor to SI of a column's unit, one of those known, which its header or `unit` states."""
         name, own = self.header[column], self.units[column]
         if own and unit and own != unit:
-            message = f"its header says [{own}], the options say {unit}: take one of them away"
-            self.fail(message, name)
+            self.fail(f"its header says [{own}], the options say {unit}: take one of them away", name)
         unit = own or unit
-        known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
         if unit and unit.lower() not in known:
             expected = ", ".join(name for name in known if name.isascii())
             self.fail(f"unit [{unit}] is none of {expected}", name)

@@ -16,7 +16,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
     "targets": (
         "targets of calib compensate, and the commands it writes",
-        ("calib.data.poses.target_files", "calib.procedure.kinematic_stage.compensation"),
+        ("calib.data.poses.pose_lists", "calib.procedure.kinematic_stage.compensation"),
     ),
     "options": ("the TOML file of calib fit --options", ("calib.data.poses.fit_options",)),
     "identify-options": (

@@ -14,7 +14,7 @@ import pytest
 from both_ways import Judgement, agree, command, go_on, read, same, session_with
 from sessions import edit
 
-from calib.data.poses.plans import read_poses
+from calib.data.poses.pose_lists import read_poses
 from calib.errors import finding
 from calib.procedure.findings import sentence
 from calib.procedure.session.folder import open_session

@@ -13,7 +13,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -23,7 +24,7 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recordings.recording import Joints, Recording, read_only, span
+from calib.data.recordings.recording import Joints, Recording, read_only, rows_of_cut
 from calib.data.recordings.recording_options import (
     KEYS_BESIDE_SERIES,
     RATES,
@@ -31,7 +32,7 @@ from calib.data.recordings.recording_options import (
     RecordingOptions,
     find_names,
     joint_order,
-    scale,
+    one_effort,
 )
 from calib.errors import MeasurementError, refuse_data, refused_as, require
 
@@ -39,10 +40,28 @@ MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (
 Ends = tuple[float | None, float | None]
 
 
-def read_archive(
-    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
-) -> Recording:
+def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
     """Return the rows of a NumPy archive (.npz) from ends[0] to ends[1] [s], unchecked but for their shapes."""
+    with _opened(path) as archive:
+        return _recording(archive, joints, options, ends)
+
+
+def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps (N,) [s] and positions (N, n) of an archive without torques: q_ref, or q where there is none."""
+    with _opened(path) as archive:
+        found = find_names(tuple(archive.members), options, path)
+        ours = "q_ref" if "q_ref" in found else "q"
+        if ours not in found:
+            archive.fail(f"a reference needs t and q_ref (or q); found: {', '.join(archive.members)}")
+        q = archive.read(found[ours])
+        if q.ndim != 2:
+            archive.fail(f"has shape {q.shape}, expected (samples, joints)", found[ours])
+        order = joint_order(_names(archive), joints, q.shape[1], path)[0]
+        return _stamps(archive, found, options, len(q)), _arrange(q, order, options.factor(ours))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator["_Archive"]:
     damaged = (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, UnicodeError)
     with (
         refused_as(MeasurementError, OSError, "cannot be read: {}", path),
@@ -56,7 +75,7 @@ def read_archive(
         refused_as(MeasurementError, damaged, "is a damaged archive ({}): was it copied whole?", path),
         zipfile.ZipFile(path) as archive,
     ):
-        return _recording(_Archive(archive, path), joints, options or RecordingOptions(), ends)
+        yield _Archive(archive, path)
 
 
 @dataclass(frozen=True)
@@ -129,7 +148,7 @@ class _Archive:
 def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptions, ends: Ends) -> Recording:
     count, path = len(archive.file.infolist()), archive.path
     require(count <= MAX_MEMBERS, f"has {count} members: is this a recording?", MeasurementError, path)
-    found = find_names(tuple(archive.members), options, path)
+    found = one_effort(find_names(tuple(archive.members), options, path), options, tuple(archive.members), path)
     stream, shape, _, _ = archive.header(found["q"])
     stream.close()
     t = _stamps(archive, found, options, (shape or (0,))[0])
@@ -146,7 +165,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         values = archive.read(theirs, rows)
         if values.shape != q.shape:
             archive.fail(f"has shape {values.shape} where {found['q']} has {q.shape} (samples, joints)", theirs)
-        series["effort" if ours == kind else ours] = _arrange(values, order, scale(ours, options.units.get(ours, "")))
+        series["effort" if ours == kind else ours] = _arrange(values, order, options.factor(ours))
     gain = archive.few("drive_gain", q.shape[1])
     if gain is not None and (gain == 0.0).any():
         archive.fail("has a gain of zero: no current makes a torque there", "drive_gain")
@@ -159,11 +178,11 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
     noise = _variance(archive, variance, q.shape, rows)
     return Recording(
         t[rows],
-        _arrange(q, order, scale("q", options.units.get("q", ""))),
+        _arrange(q, order, options.factor("q")),
         kind=kind,
         joint_names=names,
         drive_gain=None if gain is None else gain[order],
-        effort_variance=None if noise is None else noise[order] * scale(kind, options.units.get(kind, "")) ** 2,
+        effort_variance=None if noise is None else noise[order] * options.factor(kind) ** 2,
         file=str(path),
         rows=np.arange(rows.start, rows.stop) + 1,
         notes=(*notes, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
@@ -199,18 +218,14 @@ def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptio
     t = archive.read(found["t"], exact=True, kinds="fiu").ravel()
     if len(t) != count:
         archive.fail(f"has {len(t)} stamps where q has {count} samples", found["t"])
-    return (t - t[0] if len(t) else t).astype(float) * scale("t", options.units.get("t", ""))
+    return (t - t[0] if len(t) else t).astype(float) * options.factor("t")
 
 
 def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[slice, list[str]]:
     """Return the rows to read: of the cut, else of the file's use_range, else all."""
     if ends != (None, None):
         ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
-        first, end = span(ordered, *ends)
-        if first >= end:
-            empty = np.zeros((len(t), 0))
-            Recording(t, empty, empty, "torque", (), file=str(archive.path)).cut(*ends)
-        return slice(first, end), []
+        return rows_of_cut(ordered, *ends, archive.path), []
     stated = archive.few("use_range", 2) if options.use_range else None
     if stated is None:
         return slice(0, len(t)), []

@@ -14,33 +14,35 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.errors import MeasurementError, brief, refuse_data, require, suggestion
+from calib.errors import MeasurementError, refuse_data, refused_as, require, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 
-def read_bag(
-    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
-) -> Recording:
-    """Return the joint states of a bag from ends[0] to ends[1] [s] after its first, unchecked but for their shapes."""
+def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
+    """Return the joint states of a bag, unchecked but for their shapes."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    options = options or RecordingOptions()
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            connections = _connections(reader, options, path)
-            names, parts, skipped = _collect(reader, connections, joints, path)
-    except MeasurementError:
-        raise
-    except Exception as error:  # whatever a damaged file makes of readers that are not ours
-        raise MeasurementError(
-            f"cannot be read as a ROS bag ({brief(error)}): was it closed properly?", path
-        ) from error
-    return _assemble(names, parts, skipped, path, options, ends)
+    damaged = "cannot be read as a ROS bag ({}): was it closed properly?"  # whatever it makes of others' readers
+    with (
+        refused_as(MeasurementError, Exception, damaged, path),
+        AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
+    ):
+        names, parts, skipped = _collect(reader, _connections(reader, options, path), joints, path)
+    for ours, what in (("q", "positions"), ("effort", "efforts")):
+        require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
+    notes = [f"{skipped} messages lack one of the joints; left out"] if skipped else []
+    stamps = parts["header"]
+    if not stamps.any():
+        stamps = parts["logged"]
+        notes.append("the headers have no stamps; the times of logging are used, which jitter more")
+    return Recording(
+        (stamps - stamps[0]) * 1e-9, parts["q"], parts["effort"], options.kind or "torque", names,
+        v=parts["v"] if parts["v"].size else None, file=str(path), notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _connections(reader: Any, options: RecordingOptions, path: Path) -> list[Any]:
@@ -104,31 +106,3 @@ def _refuse_joints(names: Sequence[str], seen: Sequence[tuple[str, ...]], path: 
         f"no joint '{missing[0]}'{suggestion(missing[0], known)}" if missing else "no message with all joints at once"
     )
     refuse_data(path, f"has {what}; found: {', '.join(known)}")
-
-
-def _assemble(
-    names: tuple[str, ...],
-    parts: dict[str, np.ndarray],
-    skipped: int,
-    path: Path,
-    options: RecordingOptions,
-    ends: Ends,
-) -> Recording:
-    for ours, what in (("q", "positions"), ("effort", "efforts")):
-        require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
-    notes = [f"{skipped} messages lack one of the joints; left out"] if skipped else []
-    stamps = parts["header"]
-    if not stamps.any():
-        stamps = parts["logged"]
-        notes.append("the headers have no stamps; the times of logging are used, which jitter more")
-    recording = Recording(
-        (stamps - stamps[0]) * 1e-9,
-        parts["q"],
-        parts["effort"],
-        options.kind or "torque",
-        names,
-        v=parts["v"] if parts["v"].size else None,
-        file=str(path),
-        notes=tuple(notes),
-    )
-    return recording if ends == (None, None) else recording.cut(*ends)

@@ -14,26 +14,22 @@ from typing import Any
 import numpy as np
 
 from calib.data.csv_table import Table, read_table
-from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording, named
 from calib.data.recordings.recording_options import (
     MEASURED,
+    SCALES,
     SYNONYMS,
     RecordingOptions,
     check_units,
     one_effort,
     plain_stems,
-    scale,
     stem_of,
 )
-from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, suggestion
+from calib.errors import refuse_data, suggestion
 
 
-def read_log(
-    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
-) -> Recording:
-    """Return the rows of a CSV table from ends[0] to ends[1] [s], unchecked but for their shapes; some 20 MB/s."""
-    options = options or RecordingOptions()
+def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
+    """Return the rows of a CSV table, unchecked but for their shapes; some 20 MB/s."""
     table = _numbered_brackets(read_table(path, doubles=True))
     found = _find(table, options, joints.names if joints else ())
     chosen = one_effort({ours: ours for ours in found}, options, table.header, path)
@@ -41,8 +37,7 @@ def read_log(
     n = len(found["q"])
     for ours, columns in found.items():
         if ours != "t" and len(columns) != n:
-            message = f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q"
-            refuse_data(path, message)
+            refuse_data(path, f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q")
         check_units(ours, [table.units[place] for place in columns], joints, path)
     kind = "current" if "current" in found else "torque"
     series: dict[str, Any] = {
@@ -59,7 +54,7 @@ def read_log(
         if len(units := dict.fromkeys(table.units[place] or "no unit" for place in columns)) > 1:
             notes.append(f"the columns of {ours} differ in their units ({', '.join(units)}): is that meant?")
     names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
-    recording = Recording(
+    return Recording(
         _stamps(table, found, options),
         np.column_stack([_values(table, place, "q", options) for place in found["q"]]),
         kind=kind,
@@ -69,17 +64,13 @@ def read_log(
         notes=tuple(notes),
         **series,
     )
-    return recording if ends == (None, None) else recording.cut(*ends)
 
 
-def read_positions(
-    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps (N,) [s] and positions (N, n) of a table without torques: of q_ref, or of q where that is not."""
-    options = options or RecordingOptions()
     table = _numbered_brackets(read_table(path, doubles=True))
     here = replace(options, names={key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")})
-    found = _find(table, here, joints.names if joints else ())
+    found = _find(table, here, joints.names)
     ours = "q_ref" if "q_ref" in found else "q"
     if ours not in found:
         wanted = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
@@ -153,15 +144,9 @@ def _joint_names(table: Table, places: Sequence[int]) -> list[str]:
 
 def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> np.ndarray:
     """Return a column in SI; a NaN stays, and is refused later with the rows of the cut alone."""
-    cells, own, stated = table.cells[place], table.units[place], options.units.get(ours, "")
-    if cells.dtype != float:
-        values = table.numbers(table.header[place])  # raises, with the row
-        table.fail(f"expected numbers, found {values}", table.header[place])
-    if own and stated and own != stated:
-        message = f"its header says [{own}], the options say {stated}: take one of them away"
-        table.fail(message, table.header[place])
-    with refused_as(MeasurementError, UsageError, "{}", table.file, None, table.header[place]):
-        return cells * scale(ours, own or stated)
+    if table.cells[place].dtype != float:
+        table.numbers(table.header[place])  # refuses, with the row
+    return table.cells[place] * table.factor(place, SCALES[ours], options.units.get(ours, ""))
 
 
 def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,6 @@ class Joints:
         names: n joint names in the robot's order.
         kinds: URDF's joint types (``revolute``, ``continuous``, ``prismatic``).
         lower, upper: (n,) position limits [rad or m].
-        velocity: (n,) [rad/s or m/s].
         effort: (n,) [N·m or N].
     """
 
@@ -35,14 +35,13 @@ class Joints:
     kinds: tuple[str, ...] = ()
     lower: np.ndarray = None  # type: ignore[assignment]  # set below
     upper: np.ndarray = None  # type: ignore[assignment]  # set below
-    velocity: np.ndarray = None  # type: ignore[assignment]  # set below
     effort: np.ndarray = None  # type: ignore[assignment]  # set below
 
     def __post_init__(self) -> None:
         n = len(self.names)
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "kinds", tuple(self.kinds) or ("revolute",) * n)
-        for name in ("lower", "upper", "velocity", "effort"):
+        for name in ("lower", "upper", "effort"):
             value = getattr(self, name)
             object.__setattr__(self, name, frozen(np.full(n, np.nan) if value is None else value))
             if getattr(self, name).shape != (n,):
@@ -152,12 +151,7 @@ class Recording:
         Raises:
             MeasurementError: where nothing is left.
         """
-        first, end = span(self.t, start, stop)
-        if first >= end:
-            low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
-            last = f"{self.t[-1]:.4g} s" if len(self) else "nothing"
-            refuse_data(self.file, f"the cut @{low}:{high} leaves no sample; the recording ends at {last}")
-        return self.take(slice(first, end))
+        return self.take(rows_of_cut(self.t, start, stop, self.file))
 
     def take(self, index: slice | np.ndarray) -> Recording:
         """Return the samples at `index`, a slice or a mask (N,); they keep their times and row numbers."""
@@ -191,8 +185,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
     t = recording.t + lag
     inside = (t >= recording.t[0]) & (t <= recording.t[-1]) if len(t) else np.zeros(0, bool)
     if not inside.any():
-        message = f"torques {lag:g} s late leave no sample of {recording.duration:.3g} s"
-        refuse_data(recording.file, message)
+        refuse_data(recording.file, f"torques {lag:g} s late leave no sample of {recording.duration:.3g} s")
     moved = {
         name: np.column_stack([np.interp(t, recording.t, own) for own in value.T])
         for name in LATE
@@ -202,10 +195,15 @@ def earlier(recording: Recording, lag: float) -> Recording:
     return replace(recording, notes=notes, **moved).take(inside)
 
 
-def span(t: np.ndarray, start: float | None, stop: float | None) -> tuple[int, int]:
-    """Return the first sample with t ≥ start and the first with t ≥ stop; a grain of 1 ns forgives rounding."""
+def rows_of_cut(t: np.ndarray, start: float | None, stop: float | None, file: str | Path) -> slice:
+    """Return the samples with start ≤ t < stop, refusing a cut without any; a grain of 1 ns forgives rounding."""
     first = 0 if start is None else int(np.searchsorted(t, start - 1e-9))
-    return first, len(t) if stop is None else int(np.searchsorted(t, stop - 1e-9))
+    end = len(t) if stop is None else int(np.searchsorted(t, stop - 1e-9))
+    if first >= end:
+        low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
+        last = f"{t[-1]:.4g} s" if len(t) else "nothing"
+        refuse_data(file, f"the cut @{low}:{high} leaves no sample; the recording ends at {last}")
+    return slice(first, end)
 
 
 def parse_cut(text: str) -> tuple[str, float | None, float | None]:

@@ -1,6 +1,7 @@
 """Recordings from files: NumPy archives, CSV tables, ROS bags; the first bytes say which."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from calib.data.recordings.archives import Ends, read_archive
@@ -12,7 +13,7 @@ from calib.data.recordings.recording_options import RecordingOptions, check_unit
 from calib.errors import MeasurementError, refuse_data
 from calib.files import check_regular
 
-Reader = Callable[[Path, Joints | None, RecordingOptions, Ends], Recording]
+Reader = Callable[[Path, Joints | None, RecordingOptions], Recording]
 
 
 def read_recording(
@@ -31,8 +32,9 @@ def read_recording(
     options = options or RecordingOptions()
     for name, unit in options.units.items():
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
-    reader = _reader(Path(file))
-    recording = reader(Path(file), joints, options, (start, stop))
+    recording = _reader(Path(file), (start, stop))(Path(file), joints, options)
+    if (start, stop) != (None, None):
+        recording = recording.cut(start, stop)
     if joints is not None:
         _check_names(recording, joints)
     return check_recording(earlier(recording, options.lag), joints)
@@ -48,7 +50,7 @@ def _check_names(recording: Recording, joints: Joints) -> None:
         refuse_data(recording.file, message)
 
 
-def _reader(path: Path) -> Reader:
+def _reader(path: Path, ends: Ends) -> Reader:
     """Return the reader that the first bytes of the file, or a folder, ask for."""
     try:
         if path.exists():
@@ -61,7 +63,7 @@ def _reader(path: Path) -> Reader:
         hint = "; a cut is written log.npz@0:9.4, in seconds" if "@" in path.name else ""
         raise MeasurementError(f"cannot be read: {error.strerror}{hint}", path) from error
     if head[:2] == b"PK":
-        return read_archive
+        return partial(read_archive, ends=ends)  # other rows are not kept
     if head and path.suffix == ".npz":
         refuse_data(path, "is no NumPy archive, whatever its name says: was it written by np.savez?")
     if not head or b"\0" in head:

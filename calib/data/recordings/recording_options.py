@@ -112,12 +112,10 @@ class RecordingOptions:
             _ours(self.names)
             _known(self.units)
 
-
-def scale(name: str, unit: str) -> float:
-    """Return the factor from `unit` to SI for one of our names; "" is SI."""
-    with refused_as(UsageError, ValueError, "{}"):
-        _known({name: unit})
-    return SCALES[name][unit.lower()] if unit else 1.0
+    def factor(self, name: str) -> float:
+        """Return the factor to SI from the unit that is stated for one of our names."""
+        unit = self.units.get(name, "")
+        return SCALES[name][unit.lower()] if unit else 1.0
 
 
 def check_units(name: str, units: Sequence[str], joints: Joints | None, path: str | Path) -> None:
@@ -150,7 +148,7 @@ def plain_stems(stems: Sequence[str]) -> dict[str, str]:
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
-    """Return our name → the file's, with either ``torque`` or ``current``; needs positions and one of these two."""
+    """Return our name → the file's, of all series that the file has."""
     plain = {stem: member for member in reversed(members) if not (named := stem_of(member))[1] for stem in [named[0]]}
     plain = {name: plain[stem] for name, stem in plain_stems(tuple(plain)).items()}
     found = {}
@@ -162,7 +160,7 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
             found[ours] = options.names[ours]
         elif name := next((plain[own] for synonym in synonyms if (own := stem_of(synonym)[0]) in plain), ""):
             found[ours] = name
-    return one_effort(found, options, members, path)
+    return found
 
 
 def one_effort(

@@ -23,28 +23,21 @@ USABLE = 0.8  # of the Nyquist frequency
 
 @dataclass(frozen=True, eq=False)
 class Cutoffs:
-    """Proposed cut-offs, and the spectra behind them for a plot.
+    """Proposed cut-offs.
 
     Attributes:
-        dynamics: f_dyn of the robot [Hz], joint_dynamics: (n,) of each joint (0 for one that does not move).
+        dynamics: f_dyn of the robot [Hz].
         position: cut-off of the positions' Butterworth filter, f_q [Hz].
         band: cut-off of the parallel decimation, f_p [Hz], factor: its n_d.
-        resonance: (n,) where power rises again above the motion's [Hz]; NaN where it does not.
         noise: (n,) standard deviation of white noise in the positions [rad or m], read above the motion.
-        frequency: (F,) [Hz], position_power, effort_power: (F, n) one-sided spectral densities [unit²/Hz].
         reasons: how the values came about, in words.
     """
 
     dynamics: float
-    joint_dynamics: np.ndarray
     position: float
     band: float
     factor: int
-    resonance: np.ndarray
     noise: np.ndarray
-    frequency: np.ndarray
-    position_power: np.ndarray
-    effort_power: np.ndarray
     reasons: tuple[str, ...]
 
     def acceleration_noise(self, cutoff: float | np.ndarray, rate: float) -> np.ndarray:
@@ -67,27 +60,21 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     window_length = 4.0  # length of the spectra's windows [s]
     size = min(stop - start, max(64, int(window_length * sampled.rate)))
     f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
-    _, effort = spectrum(sampled.series["effort"][own], sampled.rate, size)
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
     active = _active(sampled.series["q"][own])
     read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
-    per_joint, resonance = frozen([joint for joint, _ in read]), frozen([peak for _, peak in read])
-    dynamics, reason = _choose(per_joint, dynamics)
+    dynamics, reason = _choose(np.array([joint for joint, _ in read]), dynamics)
     reasons = [reason]
     reasons += [
         f"joint {j + 1}: a resonance, or noise of the loop, at {peak:.3g} Hz is left out"
-        for j, peak in enumerate(resonance)
+        for j, (_, peak) in enumerate(read)
         if np.isfinite(peak)
     ]
     position, why = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
     factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
     band = USABLE * sampled.rate / (2 * factor)
     reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, to the next whole n_d = {factor})"]
-    noise = np.sqrt(floor * sampled.rate / 2)
-    return Cutoffs(
-        dynamics, per_joint, position, band, factor, resonance, frozen(noise), frozen(f), frozen(power), frozen(effort),
-        tuple(reasons),
-    )  # fmt: skip
+    return Cutoffs(dynamics, position, band, factor, frozen(np.sqrt(floor * sampled.rate / 2)), tuple(reasons))
 
 
 def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,10 +9,9 @@ evaluated at the kept samples only, so it has no phase, can run over blocks, and
 window sticks out are left out.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs  # type: ignore[attr-defined]
@@ -46,17 +45,6 @@ class Decimator:
     def reach(self) -> int:
         """h, the samples on each side that a kept one needs."""
         return len(self.taps) // 2
-
-
-class _Timed(Protocol):
-    @property
-    def segment(self) -> np.ndarray: ...
-    @property
-    def q(self) -> np.ndarray: ...
-    @property
-    def v(self) -> np.ndarray: ...
-    @property
-    def a(self) -> np.ndarray: ...
 
 
 def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimator:
@@ -135,25 +123,6 @@ def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Itera
         if (count := (rest.shape[-1] - len(taps)) // r + 1) > 0:
             yield _windows(rest, taps, r, count)
             rest = rest[..., count * r :]
-
-
-def decimate_regressor(
-    regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-    motion: _Timed,
-    decimator: Decimator,
-    block: int = 4096,
-) -> Iterator[np.ndarray]:
-    """Return blocks (M_i, rows, p) of the decimated observation matrix of a motion, built `block` samples at a time.
-
-    Args:
-        regressor: (q, v, a), each (k, n), to (k, rows, p).
-        motion: q, v, a and segments; an hour of 1 kHz needs no more memory than a minute.
-    """
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(motion.segment)) + 1, [len(motion.segment)]])
-    for a, b in pairwise(edges):
-        spans = [slice(i, min(i + block, b)) for i in range(a, b, block)]
-        blocks = (np.moveaxis(regressor(motion.q[s], motion.v[s], motion.a[s]), 0, -1) for s in spans)
-        yield from (np.moveaxis(part, -1, 0) for part in decimate_blocks(blocks, decimator))
 
 
 def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.ndarray:

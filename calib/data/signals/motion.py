@@ -15,7 +15,6 @@ import numpy as np
 from calib.arrays import frozen
 from calib.config import strict
 from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
-from calib.data.recordings.clock import CLOCKS
 from calib.data.recordings.recording import Recording, read_only
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
 from calib.data.signals.filtering import KINDS as DECIMATORS
@@ -32,7 +31,7 @@ from calib.data.signals.filtering import (
     slope,
     too_short,
 )
-from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resample
+from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample
 from calib.errors import UsageError, refuse_data
 
 # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
@@ -225,7 +224,7 @@ def sample(recording: Recording, options: FilterOptions) -> Resampled:
 def thin(motion: Motion) -> Motion:
     """Return the motion at the samples its decimator keeps: q, v, a as they are there, efforts filtered to the band.
 
-    W for it is `decimate_regressor` of the *whole* motion; building W from the thinned q, v, a would not be parallel.
+    W for it is that of the *whole* motion, decimated; building W from the thinned q, v, a would not be parallel.
     """
     index = kept(motion.segment, motion.decimator)
     efforts = {

@@ -1,49 +1,36 @@
 """What a motion can excite, before any model: is it one sine, do joints move together, is it the motion seen before?"""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.fft import next_fast_len
 from scipy.spatial import KDTree
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import hann
 from calib.data.signals.motion import Motion
+from calib.words import listing
 
 SINE = 0.98  # of the variance: a joint that moves as one sine
 MIN_TRAVEL = 1e-3  # a joint that goes less far has not moved [rad or m]
 MAX_STATES = 20_000  # states of a motion that are compared
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ExcitationReport:
     """How rich the motion of the joints is.
 
     Attributes:
-        lines: (n,) number of spectral lines of each joint's position that have 3e-3 or more of the strongest's power.
-        strongest: (n,) frequency of the sine that fits best [Hz]; NaN for a joint that does not move.
-        share: (n,) part of the joint's variance that one sine at about that frequency explains.
-        correlation: (n, n) of the positions.
         functions: number of independent functions of time that all positions are made of (2 for one sine).
-        still: (n,) joints that never move.
+        poor: whether the motion is one frequency, or fewer functions of time than half the joints that move.
         seconds: for which any joint moves [s].
         notes: for the user.
     """
 
-    lines: np.ndarray
-    strongest: np.ndarray
-    share: np.ndarray
-    correlation: np.ndarray
     functions: int
-    still: np.ndarray
+    poor: bool
     seconds: float
     notes: tuple[str, ...]
-
-    @property
-    def poor(self) -> bool:
-        """Whether the motion is one frequency, or fewer functions of time than half the joints that move."""
-        moving = ~self.still
-        return bool((self.share[moving] > SINE).all()) or self.functions < 0.5 * moving.sum()
 
 
 def report_excitation(motion: Motion) -> ExcitationReport:
@@ -58,19 +45,27 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > max_samples else 1
     q = motion.q[start:stop:thin] - motion.q[start:stop:thin].mean(axis=0)
     still = np.ptp(q, axis=0) < MIN_TRAVEL
-    found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate / thin) for j in range(motion.n)]
     unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
-    correlation = unit.T @ unit
     singular = np.linalg.svd(unit[:: max(1, len(unit) // MAX_STATES)], compute_uv=False)
     min_share = 0.02  # of the largest singular value: a function of time that counts
     functions = int((singular > min_share * singular[0]).sum())
-    lines, strongest, share = (np.array(part) for part in zip(*found))
-    notes = _notes(motion.joint_names, share, strongest, correlation, functions, still)
+    moving = np.flatnonzero(~still)
+    share, strongest = np.array([_best_sine(q[:, j], motion.rate / thin) for j in moving]).reshape(-1, 2).T
+    one_frequency, names = bool((share > SINE).all()), motion.joint_names
+    notes = [f"{names[j]} never moves" for j in np.flatnonzero(still)]
+    if len(moving) and one_frequency:
+        low, high = strongest.min(), strongest.max()
+        hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
+        notes.append(f"each joint moves at one frequency ({hertz}): inertia and gravity or stiffness look alike")
+    correlation = unit.T @ unit
+    min_correlation = 0.98  # of two joints that move as one
+    pairs = [f"{names[i]}–{names[j]}" for i, j in combinations(moving, 2) if abs(correlation[i, j]) > min_correlation]
+    if pairs:
+        notes.append(f"joints that move as one (correlation above {min_correlation:g}): {listing(pairs, 6)}")
+    if len(moving) > 1 and functions < len(moving):
+        notes.append(f"all {len(moving)} moving joints follow {functions} functions of time")
     seconds = float((~motion.standstill()).sum() / motion.rate)
-    return ExcitationReport(
-        frozen(lines, int), frozen(strongest), frozen(share), frozen(correlation), functions, frozen(still, bool),
-        seconds, notes,
-    )  # fmt: skip
+    return ExcitationReport(functions, one_frequency or functions < 0.5 * len(moving), seconds, tuple(notes))
 
 
 def repeats(training: Motion, other: Motion) -> float:
@@ -102,37 +97,12 @@ def repeats(training: Motion, other: Motion) -> float:
     return float(np.isfinite(distance).mean())
 
 
-def _lines(q: np.ndarray, rate: float, min_line_power: float = 3e-3) -> tuple[int, float, float]:
-    """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains.
-
-    `min_line_power`: of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4.
-    """
+def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
+    """Return the part of the variance of a series (N,) that its best sine explains, and the sine's frequency [Hz]."""
     window, size = hann(len(q)), int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
-    best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, size))
-    return max(1, count_peaks(power, min_line_power * power.max())), frequency, best
-
-
-def count_peaks(power: np.ndarray, least: float) -> int:
-    """Return how many peaks of a spectrum (N,) are at least so high, 8 bins apart and half as high above the dips."""
-    high = 1 + np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]) & (power[1:-1] >= least))
-    apart: list[int] = []
-    for peak in high[np.argsort(-power[high], kind="stable")]:
-        if all(abs(peak - other) >= 8 for other in apart):
-            apart.append(int(peak))
-    count = 0
-    for peak in apart:
-        above = np.flatnonzero(power > power[peak])
-        place = int(np.searchsorted(above, peak))
-        start, stop = above[place - 1] if place else 0, above[place] if place < len(above) else len(power)
-        dip = max(power[start : peak + 1].min(), power[peak:stop].min())
-        count += bool(power[peak] - dip >= 0.5 * least)
-    return count
-
-
-def _about(top: int, rate: float, size: int) -> list[float]:
-    """Return frequencies about the strongest line of a transform of `size`, an eighth of its step apart [Hz]."""
-    return [(top + i / 8) * rate / size for i in range(-16, 17) if top + i / 8 > 0.5]
+    eighths = int(np.argmax(power)) + np.arange(-16, 17) / 8  # of a step of the transform, about its strongest line
+    return max((_one_sine(q, f, rate), f) for f in (eighths[eighths > 0.5] * rate / size).tolist())
 
 
 def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
@@ -142,27 +112,3 @@ def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
     basis = np.stack([np.ones(len(y)), np.sin(angle), np.cos(angle)], axis=1)
     left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
     return float(1 - (left @ left) / (y @ y))
-
-
-def _notes(
-    names: tuple[str, ...],
-    share: np.ndarray,
-    strongest: np.ndarray,
-    correlation: np.ndarray,
-    functions: int,
-    still: np.ndarray,
-) -> tuple[str, ...]:
-    moving = np.flatnonzero(~still)
-    notes = [f"{names[j]} never moves" for j in np.flatnonzero(still)]
-    if len(moving) and (share[moving] > SINE).all():
-        low, high = strongest[moving].min(), strongest[moving].max()
-        hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
-        notes.append(f"each joint moves at one frequency ({hertz}): inertia and gravity or stiffness look alike")
-    min_correlation = 0.98  # correlation of two joints that move as one
-    pairs = [(i, j) for i in moving for j in moving if i < j and abs(correlation[i, j]) > min_correlation]
-    if pairs:
-        told = ", ".join(f"{names[i]}–{names[j]}" for i, j in pairs[:6]) + (" …" if len(pairs) > 6 else "")
-        notes.append(f"joints that move as one (correlation above {min_correlation:g}): {told}")
-    if len(moving) > 1 and functions < len(moving):
-        notes.append(f"all {len(moving)} moving joints follow {functions} functions of time")
-    return tuple(notes)

@@ -250,7 +250,7 @@ def joints_of(chain: Chain) -> Joints:
     """Return what a recording is held against."""
     return Joints(
         chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
-        np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
+        np.array([joint.effort for joint in chain.joints]),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Expect, numbers
-from calib.data.poses.target_files import Targets
+from calib.data.poses.pose_lists import Targets
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel

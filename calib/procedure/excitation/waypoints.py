@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import read_header
-from calib.data.poses.plans import read_poses
-from calib.data.poses.target_files import Targets, read_targets
+from calib.data.poses.pose_lists import Targets, read_poses, read_targets
 from calib.errors import UsageError
 from calib.geometry import inverse
 from calib.geometry.installation import Installation

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.target_files import Targets
+from calib.data.poses.pose_lists import Targets
 from calib.errors import UsageError
 from calib.geometry import installation_file, inverse
 from calib.geometry.installation import Installation, see
@@ -416,7 +416,7 @@ def _header(names: Sequence[str]) -> list[str]:
 
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
-    """Write COMMANDS.csv, see `calib.data.poses.target_files`.
+    """Write COMMANDS.csv, see `calib.data.poses.pose_lists`.
 
     Raises:
         UsageError: where targets are not reached and `partial` does not allow that; nothing is written.

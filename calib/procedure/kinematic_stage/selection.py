@@ -12,7 +12,7 @@ from calib import files
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.plans import read_poses, write_poses
+from calib.data.poses.pose_lists import read_poses, write_poses
 from calib.errors import UsageError, require
 from calib.geometry.observability import Observation, observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot

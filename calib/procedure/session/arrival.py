@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.plans import MAX_JOINT_DIFFERENCE
+from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE
 from calib.data.recordings.recording import Recording
 from calib.errors import Finding, finding, refuse_data
 from calib.geometry.checks.repeatability import drift_between, drift_within, noise_of_difference

@@ -13,7 +13,7 @@ from calib import files
 from calib.data.poses.choices import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.data.poses.plans import check_against, filled_in, read_poses
+from calib.data.poses.pose_lists import check_against, filled_in, read_poses
 from calib.errors import CalibError, UsageError
 from calib.extensions import needed
 from calib.folders import write_staged

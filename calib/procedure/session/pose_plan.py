@@ -9,7 +9,7 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.choices import IMAGES
-from calib.data.poses.plans import write_poses
+from calib.data.poses.pose_lists import write_poses
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.choices import IN_HAND
-from calib.data.poses.plans import read_poses
+from calib.data.poses.pose_lists import read_poses
 from calib.rooms.camera.board import write_board
 from calib.rooms.camera.camera_info import write_lens
 from calib.rooms.camera.lens import Lens

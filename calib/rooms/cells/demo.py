@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.plans import read_poses
+from calib.data.poses.pose_lists import read_poses
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.estimate_files import read_estimate
 from calib.folders import CERTIFICATE

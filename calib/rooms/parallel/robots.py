@@ -66,7 +66,7 @@ class ParallelMechanism:
         joints = self.known.robot.joints
         return Joints(
             self.known.robot.joint_names, tuple(joint.kind for joint in joints),
-            *(np.array([getattr(joint, key) for joint in joints]) for key in ("lower", "upper", "velocity", "effort")),
+            *(np.array([getattr(joint, key) for joint in joints]) for key in ("lower", "upper", "effort")),
         )  # fmt: skip
 
     def __repr__(self) -> str:

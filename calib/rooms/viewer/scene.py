@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.config import read_toml
 from calib.data.csv_table import Table, read_table
-from calib.data.poses.plans import read_poses
+from calib.data.poses.pose_lists import read_poses
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refuse_option, require
 from calib.geometry import installation_file

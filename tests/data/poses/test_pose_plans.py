@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.data.poses.measurements import Planes
-from calib.data.poses.plans import check_against, read_poses, write_poses
+from calib.data.poses.pose_lists import check_against, read_poses, write_poses
 from calib.errors import CalibError, MeasurementError
 
 NAMES = ("a", "b", "c", "d")

@@ -9,7 +9,7 @@ from strategies import column_names
 
 from calib import files
 from calib.data.csv_table import read_table
-from calib.data.poses.plans import read_poses, write_poses
+from calib.data.poses.pose_lists import read_poses, write_poses
 
 
 @given(st.lists(column_names(), min_size=1, max_size=6, unique=True), st.integers(0, 9))

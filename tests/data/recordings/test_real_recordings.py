@@ -43,7 +43,6 @@ def test_the_pandas_samples_are_whole_milliseconds_apart(data):
 def test_the_lwr_moves_at_one_frequency_and_its_second_half_repeats_the_first(data):
     report = report_excitation(make_motion(read_recording(data / LWR)))
     assert report.poor and report.functions == 2
-    np.testing.assert_allclose(report.strongest, 0.08, atol=0.005)
     halves = [make_motion(read_recording(f"{data / LWR}@{part}")) for part in ("0:13", "13:")]
     assert repeats(*halves) > 0.8
 

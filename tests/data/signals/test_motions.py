@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.recordings.clock import find_clock
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import propose_cutoffs, spectrum
-from calib.data.signals.filtering import decimate, decimate_regressor
+from calib.data.signals.filtering import decimate
 from calib.data.signals.motion import FilterOptions, make_motion, moving, thin
 from calib.data.signals.persistency import repeats, report_excitation
-from calib.data.signals.resampling import resample
+from calib.data.signals.resampling import find_clock, resample
 from calib.errors import MeasurementError, UsageError
 
 
@@ -155,7 +154,7 @@ def test_cutoffs_are_one_or_one_per_joint():
 def test_proposed_cutoffs_follow_the_motion_and_the_noise():
     t = even(500.0, 20.0)
     proposed = propose_cutoffs(resample(recorded(t, t, noise=1e-6)))
-    assert proposed.joint_dynamics.max() <= 1.75 and proposed.dynamics == 2.0  # lines up to 1.3 Hz, windows of 4 s
+    assert proposed.dynamics == 2.0  # lines up to 1.3 Hz, windows of 4 s
     assert proposed.position == 10.0 and 3.99 < proposed.band < 4.2
     assert proposed.band == pytest.approx(0.8 * 500 / (2 * proposed.factor))
     np.testing.assert_allclose(proposed.noise, 1e-6, rtol=0.1)
@@ -174,14 +173,11 @@ def test_a_resonance_does_not_raise_the_cutoff():
 
 
 def test_the_model_holds_after_the_parallel_decimation():
-    """W x = y for the true parameters, filtered and thinned alike, in blocks."""
+    """W x = y for the true parameters, filtered and thinned alike."""
     t = even()
     motion = make_motion(recorded(t, t), FilterOptions(cutoff=40.0, band=20.0))
 
-    def regressor(q, v, a):
-        return np.stack([np.cos(q), v, a], axis=-1)
-
-    w = np.concatenate(list(decimate_regressor(regressor, motion, motion.decimator, block=700)))
+    w = decimate(np.stack([np.cos(motion.q), motion.v, motion.a], axis=-1), motion.decimator, motion.segment)
     y = decimate(motion.effort, motion.decimator, motion.segment)
     x = np.linalg.lstsq(w.reshape(-1, 3), y.ravel(), rcond=None)[0]
     np.testing.assert_allclose(x, [20.0, 2.0, 0.5], rtol=2e-4)
@@ -220,12 +216,11 @@ def one_sine(t: np.ndarray) -> Recording:
 def test_one_frequency_is_noticed():
     t = even()
     report = report_excitation(make_motion(one_sine(t)))
-    assert list(report.lines) == [1, 1, 1] and report.functions == 2 and report.poor
-    np.testing.assert_allclose(report.strongest, 0.4, atol=0.03)
-    assert any("at one frequency (0." in note for note in report.notes)
+    assert report.functions == 2 and report.poor
+    assert any(note.startswith("each joint moves at one frequency (0.4 Hz)") for note in report.notes)
     assert any("a–b" in note for note in report.notes)
     rich = report_excitation(make_motion(recorded(t, t)))
-    assert list(rich.lines) == [3, 3] and not rich.poor and not rich.notes
+    assert not rich.poor and not rich.notes
 
 
 def test_a_repeat_is_recognised_however_it_is_shifted():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib import cli, config
-from calib.data.poses.target_files import read_targets
+from calib.data.poses.pose_lists import read_targets
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal

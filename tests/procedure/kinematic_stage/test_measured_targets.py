@@ -16,7 +16,7 @@ import pytest
 
 from calib import cli
 from calib.data.poses.measurements import Poses
-from calib.data.poses.target_files import Targets
+from calib.data.poses.pose_lists import Targets
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
 from calib.procedure.kinematic_stage import compensation, inputs

@@ -12,7 +12,7 @@ import pytest
 
 from calib.cli import run
 from calib.data.poses.measurements import Distances
-from calib.data.poses.plans import read_poses
+from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage import selection
