@@ -8,17 +8,17 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
+from calib.column_changes import Change, Explanation
 from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import Finding, MeasurementError, finding
 from calib.identification.cases import Case, make_case
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
-from calib.identification.checks.whole_robot import Rearranged
 from calib.identification.identify import identify
 from calib.identification.possible.contradiction import Contradiction, contradiction
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_signs
+from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
 from calib.procedure.findings import Verdict, level_of, settle
 from calib.robot.load import load
 
@@ -235,19 +235,36 @@ def test_joints_of_reversed_sign_are_named_and_no_others(reverse: tuple[int, ...
     signs = np.where(np.isin(np.arange(3), reverse), -1.0, 1.0)
     case = case_of(recorded(tau=recorded().effort * signs))
     for arm in (ARM, replace(ARM, inertias=None)):
-        told = wrong_signs({"log": signs_of(case, arm)}, NAMES)
+        told = wrong_joints({"log": signs_of(case, arm)}, NAMES)
         assert [(one.code, level_of(one)) for one in told] == [("torque-sign", "fail")] * len(reverse)
         assert [(one.values["file"], one.values["joint"]) for one in told] == [("log", NAMES[j]) for j in reverse]
 
 
-def test_an_exchange_that_leaves_the_torques_unexplained_is_not_told() -> None:
-    def told(left: float, factor: float, quarters: int = 0) -> bool:
-        joints = (1,) if quarters else (1, 2)
-        size = replace(compare_sizes(case_of(recorded()), ARM), other=Rearranged(joints, quarters, factor, left))
-        return bool(findings([size], NAMES))
+@pytest.mark.parametrize(
+    ("left", "factor", "code", "told"),
+    [
+        (0.02, 0.9, "columns-exchanged", True),
+        (0.46, 0.85, "columns-exchanged", False),
+        (0.02, 0.99, "columns-exchanged", False),
+        (0.02, 0.5, "zero-elsewhere", True),
+        (0.02, 0.9, "zero-elsewhere", False),
+    ],
+)
+def test_a_change_that_leaves_the_torques_unexplained_is_not_told(left, factor, code, told) -> None:
+    change = Change(code, lambda samples: samples, (1, 0), {"angle": np.pi})
+    other = Explanation((change,), np.array([left / factor**2]), np.array([left]))
+    assert bool(findings([replace(compare_sizes(case_of(recorded()), ARM), other=other)], NAMES)) == told
 
-    assert told(0.02, 0.9) and not told(0.46, 0.85) and not told(0.02, 0.99)
-    assert told(0.02, 0.5, 1) and not told(0.02, 0.9, 1)
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_joint_that_counts_from_the_one_before_it_is_named(way: float) -> None:
+    """Whether the robot's own masses are known or not."""
+    log = recorded()
+    case = case_of(replace(log, q=log.q - way * log.q[:, [0, 1, 1]] * [0.0, 0.0, 1.0], v=None))
+    for arm in (ARM, replace(ARM, inertias=None)):
+        (told,) = wrong_joints({"log": signs_of(case, arm)}, NAMES)
+        assert (told.code, level_of(told)) == ("axis-coupled", "marginal")
+        assert [told.values[key] for key in ("joint", "other", "way")] == ["joint3", "joint2", "+" if way > 0 else "-"]
 
 
 def logged(clock: float = 1.0, speed: float | np.ndarray = 1.0) -> Recording:

@@ -48,6 +48,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import files
 from calib.arrays import frozen, shaped
+from calib.column_changes import assigned
 from calib.data.csv_table import read_table
 from calib.data.poses import plausible
 from calib.data.poses.columns import MATRIX, POSITION, QUATERNION, Sheet
@@ -199,11 +200,7 @@ def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
                 taken = planned.query(sign * q[:, k : k + 1])[0]
                 missed = KDTree(sign * q[:, k : k + 1]).query(plan[:, j : j + 1])[0]
                 cost[s, j, k] = np.minimum(taken, 1.0).mean() + np.minimum(missed, 1.0).mean() + 1e-9 * s
-    from scipy.optimize import linear_sum_assignment  # slow to load
-
-    order = linear_sum_assignment(cost.min(axis=0))[1]
-    sign = np.where(cost[0, np.arange(n), order] <= cost[1, np.arange(n), order], 1.0, -1.0)
-    return order, sign
+    return assigned(cost)
 
 
 def _listed(numbers: np.ndarray) -> str:

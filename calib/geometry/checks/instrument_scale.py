@@ -1,26 +1,17 @@
-"""Can an instrument have seen this arm? One factor on all lengths, and axes that are left-handed.
-
-Both are looked at with the nominal arm: base and tool placement take up what they can, and what an arm's own errors
-leave is small against either. All thresholds are our choice.
-"""
+"""Can an instrument have seen this arm? One factor on all lengths, of the measured ones or of the fitted ones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.errors import CalibError
-from calib.geometry.accuracy import errors
-from calib.geometry.first_guess import install
-from calib.geometry.fit import polish_frames
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit
 from calib.robot.chain import element_length
 
-FLIP = np.array([1.0, -1.0, 1.0])
 Torques = Sequence[np.ndarray | None] | None
 
 
@@ -103,27 +94,3 @@ def length_factor(fit: GeometricFit) -> Scale | None:
         return None
     share = common**2 / power / max(float(grown @ weight @ grown), 1e-300)
     return Scale(1.0 + common / power, power**-0.5, share)
-
-
-def mirrored_rms(nominal: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float:
-    """Return the rms [m] that base and tool placement of the nominal arm leave where the instrument's y is turned.
-
-    NaN where no positions were measured, or they place no instrument.
-    """
-    flipped = [_flipped(block) for block in blocks if isinstance(block, Positions)]
-    if not flipped:
-        return np.nan
-    own = None if torques is None else [t for t, block in zip(torques, blocks) if isinstance(block, Positions)]
-    try:
-        placed = polish_frames(install(nominal.chain, flipped, nominal.known), flipped, None, own).cell
-    except CalibError:
-        return np.nan
-    return float(np.sqrt(np.mean(errors(placed, flipped, own).main ** 2)))
-
-
-def _flipped(block: Positions) -> Positions:
-    """Return a block seen in a frame of the other hand: y turned; a rotation R becomes F R F."""
-    turned = {"position": np.asarray(block.position) * FLIP}
-    if isinstance(block, Poses):
-        turned["quaternion"] = np.asarray(block.quaternion) * [-1.0, 1.0, -1.0, 1.0]
-    return replace(block, **turned)

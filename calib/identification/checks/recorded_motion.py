@@ -3,13 +3,13 @@
 Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from calib.column_changes import Change, assigned, best_changes, coupling, couplings
 from calib.data.recordings.recording import Recording
 from calib.data.signals.filtering import moving_cubics
 from calib.dynamics.bodies import bodies_of, standard_parameters
@@ -22,6 +22,8 @@ STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
 SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
 UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
 CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
+Pair = tuple[np.ndarray, np.ndarray]
+"""Recorded positions (N, n), and one period of a motion (P, n)."""
 
 
 class DesignedMotion(Protocol):
@@ -53,25 +55,6 @@ class LocatedMotion:
     loosest: int
 
 
-@dataclass(frozen=True)
-class DifferentMotion:
-    """How a recording relates to a designed motion that is not found in it.
-
-    Attributes:
-        name: of another designed motion that it is; empty: none.
-        speed: share of the design's speed at which it was played.
-        unit: factor on the recorded positions that makes them the design's.
-        order: recorded column that holds each joint, where columns are swapped or signs reversed; empty: as they are.
-        sign: of these columns.
-    """
-
-    name: str = ""
-    speed: float = 1.0
-    unit: float = 1.0
-    order: tuple[int, ...] = ()
-    sign: tuple[float, ...] = ()
-
-
 def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None:
     """Find the repetitions of a designed motion in a recording; None where there are none."""
     grid, q = _on_grid(recording)
@@ -90,31 +73,36 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     )  # fmt: skip
 
 
-def explain(
-    recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]
-) -> DifferentMotion | None:
+def another_motion(recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]) -> Change | None:
     """Find what a recording without the designed motion holds instead; None where nothing that is tried explains it.
 
     Args:
         recording: of n joints.
-        motion: the one that was to be played; it is tried at other `SPEEDS`, in other `UNITS`, and with its columns
-            swapped and reversed.
+        motion: the one that was to be played; it is tried at other `SPEEDS`, in other `UNITS`, with its columns swapped
+            and reversed, and with joints that count from the one before them.
         others: designed motions by name, one of which may have been played instead.
     """
-    q = _on_grid(recording)[1]
-    for name, other in others.items():
-        if _found(q, _one_period(other)):
-            return DifferentMotion(name=name)
-    for speed in SPEEDS:
-        if _found(q, _one_period(motion, speed)):
-            return DifferentMotion(speed=speed)
-    reference = _one_period(motion)
+    q, reference = _on_grid(recording)[1], _one_period(motion)
+
+    def instead(other: DesignedMotion, speed: float = 1.0) -> Callable[[Pair], Pair]:
+        return lambda data: (data[0], _one_period(other, speed))
+
+    def altered(matrix: np.ndarray) -> Callable[[Pair], Pair]:
+        return lambda data: (data[0] @ matrix.T, data[1])
+
+    table = [Change("motion-exchanged", instead(other), values={"motion": name}) for name, other in others.items()]
+    table += [Change("motion-rehearsed", instead(motion, speed), values={"speed": speed}) for speed in SPEEDS]
     if len(q) >= len(reference):
         order, sign = _best_order(q, reference)
-        for unit in UNITS:
-            if _found(unit * q[:, order] * sign, reference):
-                return DifferentMotion(unit=unit, order=tuple(map(int, order)), sign=tuple(map(float, sign)))
-    return None
+        moved = sign[:, None] * np.eye(len(order))[order]
+        values = {"order": order.tolist(), "sign": sign.tolist()}
+        table += [Change("motion-altered", altered(unit * moved), values={"unit": unit, **values}) for unit in UNITS]
+    table += [
+        Change("motion-coupled", altered(coupling(len(q[0]), j, k, way)), (j, k), {"way": "+-"[way < 0.0]})
+        for j, k, way in couplings(len(q[0]))
+    ]
+    found = best_changes((q, reference), table, _unlike)
+    return found and found.changes[0]
 
 
 def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -150,6 +138,12 @@ def _found(q: np.ndarray, reference: np.ndarray, min_likeness: float = 0.9) -> R
         return None
 
 
+def _unlike(data: Pair) -> np.ndarray:
+    """Return the share (1,) of a motion's variance that no recorded period explains; 1 where it is not there."""
+    found = _found(*data)
+    return np.array([1.0 if found is None else max(1.0 - min(found.likeness), 1e-9)])
+
+
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which recorded column (n,) moves most like each joint, and with which sign (n,), at any shift."""
     n = reference.shape[1]
@@ -161,9 +155,7 @@ def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.nd
             crossed = sliding_products(x, r) / max(np.linalg.norm(r), 1e-12)
             power = np.sqrt(np.maximum(sliding_products(x**2, np.ones(len(r))), 1e-12))
             likeness[0, j, k], likeness[1, j, k] = (crossed / power).max(), (-crossed / power).max()
-    order = linear_sum_assignment(-likeness.max(axis=0))[1]
-    rows = np.arange(n)
-    return order, np.where(likeness[0, rows, order] >= likeness[1, rows, order], 1.0, -1.0)
+    return assigned(-likeness)
 
 
 def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:

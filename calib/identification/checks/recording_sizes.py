@@ -10,19 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.column_changes import Explanation
 from calib.dynamics.bodies import Bodies, bodies_of
 from calib.identification.cases import Case
 from calib.identification.checks.motion_samples import take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
 from calib.identification.checks.torque_lag import Lag, lag_of
-from calib.identification.checks.whole_robot import (
-    ClockRatio,
-    Rearranged,
-    ReversedSigns,
-    clock_ratio,
-    rearranged,
-    reversed_signs,
-)
+from calib.identification.checks.whole_robot import ClockRatio, clock_ratio, rearranged, wrong_joints
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
@@ -46,7 +40,7 @@ class RecordingSizes:
         rate: of the samples, by their dates [Hz].
         lag: of the torques; None where the recording is too short to estimate it.
         clock: inertias beside masses; None where the motion does not identify it.
-        other: order or zeros of the joints that explain more than those recorded; None where none is looked for.
+        other: change of the columns with which the masses explain more; None where none does, or is looked for.
         jumps: of positions, in words.
     """
 
@@ -60,7 +54,7 @@ class RecordingSizes:
     rate: float
     lag: Lag | None
     clock: ClockRatio | None = None
-    other: Rearranged | None = None
+    other: Explanation | None = None
     jumps: tuple[str, ...] = ()
 
 
@@ -98,10 +92,10 @@ def compare_sizes(
     return RecordingSizes(case.name, masses, limits, *speed, counted, motion.rate, lag, clock, other, motion.jumps)
 
 
-def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> ReversedSigns | None:
-    """Return which motors' torques of a recording have the wrong sign; arguments and None as of `compare_sizes`."""
+def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
+    """Return which joints have torques of the wrong sign, or count from another joint; arguments as `compare_sizes`."""
     few = take_samples(case, _under(chain, gravity), MAX_SAMPLES)
-    return None if few is None else reversed_signs(few)
+    return None if few is None else wrong_joints(few)
 
 
 def _speed_ratio(

@@ -8,13 +8,15 @@ nearly: for rods between the joints their ratio is known up to 17 % on every rec
 whose last link has no known length, are not looked at: one gave 45. All thresholds are our choice.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
 from scipy.optimize import nnls
 
+from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
@@ -22,9 +24,6 @@ from calib.estimation.whiteness import inflation
 from calib.identification.checks.motion_samples import MotionSamples, basis, drive_columns, left_share
 from calib.identification.rods import rods
 from calib.robot.chain import Chain
-
-# least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
-QUARTERS = (1, 2, 3)  # turns of a joint's zero that are tried [90 deg]
 
 
 @dataclass(frozen=True)
@@ -38,37 +37,6 @@ class ClockRatio:
     def clock(self) -> float:
         """By how many times the stamps are too large."""
         return float(np.sqrt(self.ratio))
-
-
-@dataclass(frozen=True)
-class Rearranged:
-    """Positions rearranged so that the robot's own masses explain more of the torques.
-
-    Attributes:
-        joints: the two, from 0, whose columns are exchanged; or the one whose zero is moved.
-        quarters: by how many right angles that is added to; 0: columns are exchanged.
-        factor: what is left of the torques over what is left as recorded, rms, the geometric mean of all joints.
-        left: largest share of a joint's variance that is left then.
-    """
-
-    joints: tuple[int, ...]
-    quarters: int
-    factor: float
-    left: float
-
-
-@dataclass(frozen=True)
-class ReversedSigns:
-    """Joints whose torques one model of the robot explains with the opposite sign.
-
-    Attributes:
-        joints: these, from 0.
-        before, after: rms shares of their torques that are left: as recorded, and with the signs reversed.
-    """
-
-    joints: tuple[int, ...]
-    before: tuple[float, ...]
-    after: tuple[float, ...]
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
@@ -113,14 +81,34 @@ def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: in
     return alpha, float(np.sqrt(np.sum(weight[:, None] ** 2 * own**2 * np.array(spread)[:, None]))) / power
 
 
-def reversed_signs(samples: MotionSamples) -> ReversedSigns | None:
-    """Return the joints whose torques are explained with the opposite sign, and how well; None where there are none.
+def wrong_joints(samples: MotionSamples) -> Explanation | None:
+    """Return joints whose torques have the opposite sign, or that count from the joint before; None without such.
 
-    One model of all joints is fitted to each choice of signs: bodies and offsets of any size, Ia, Fv and Fc of every
-    drive not negative, since no drive brakes backwards. Signs are reversed one by one, the one that explains most
-    first, as long as the geometric mean of what is left of the joints falls to `max_left` of it. The robot's own
-    masses need not be known.
+    One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
+    negative, since no drive brakes backwards. The robot's own masses need not be known. What is left are shares of the
+    joints' torques.
     """
+    n = samples.q.shape[1]
+    shares = cache(_shares)
+
+    def reversed_(joint: int) -> Callable[[tuple], tuple]:
+        return lambda data: (data[0], data[1] @ reversal(n, joint))
+
+    def counted(matrix: np.ndarray) -> Callable[[tuple], tuple]:
+        return lambda data: (_changed(data[0], matrix), data[1])
+
+    # shares that may be left: sound recordings at hand are left 0.91 and more, and 0.84 by couplings (our choice)
+    max_left, max_left_coupled = 0.8, 0.7
+    table = [Change("torque-sign", reversed_(j), (j,), max_left=max_left) for j in range(n)]
+    table += [
+        Change("axis-coupled", counted(coupling(n, j, k, way)), (j, k), {"way": "+-"[way < 0.0]}, max_left_coupled)
+        for j, k, way in couplings(n)
+    ]
+    return best_changes((samples, np.ones(n)), table, lambda data: shares(data[0])(data[1]), max_changes=n)
+
+
+def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that says what a model leaves of each joint's torque (n,), its variance being 1, by signs."""
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
@@ -139,63 +127,55 @@ def reversed_signs(samples: MotionSamples) -> ReversedSigns | None:
         residual = torque - positive @ nnls(triangle, across.T @ torque)[0]
         return np.maximum((residual.reshape(n, m) ** 2).mean(axis=1), 1e-9)
 
-    signs = np.ones(n)
-    before = now = left(signs)
-    max_left = 0.8  # of what is left as recorded, with a sign reversed: sound recordings at hand are left 0.91 and more
-    while True:
-        tried = [left(np.where(np.arange(n) == j, -signs, signs)) for j in range(n)]
-        factors = [np.exp(0.5 * np.mean(np.log(one / now))) for one in tried]
-        best = int(np.argmin(factors))
-        if factors[best] > max_left:
-            break
-        signs[best], now = -signs[best], tried[best]
-    joints = np.flatnonzero(signs < 0.0)
-    if not len(joints):
-        return None
-    return ReversedSigns(*(tuple(x.tolist()) for x in (joints, np.sqrt(before[joints]), np.sqrt(now[joints]))))
+    return left
 
 
-def rearranged(samples: MotionSamples, chain: Chain) -> Rearranged | None:
+def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
     """Return the exchange of two joints, or the right angles at one's zero, that explain most more; None without such.
 
-    Each joint's torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive
-    and those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
+    The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
     """
-    masses = standard_parameters(chain)
-    order, straight = np.arange(chain.n), np.zeros(chain.n)
-    before = np.maximum(list(_left(samples, masses, order, straight)), 1e-9)
+    n, masses = chain.n, standard_parameters(chain)
+
+    def left(changed: MotionSamples) -> np.ndarray:
+        return np.maximum(list(_left(changed, masses)), 1e-9)
+
+    def exchanged(pair: tuple[int, int]) -> Callable[[MotionSamples], MotionSamples]:
+        return lambda data: replace(_changed(data, exchange(n, *pair)), effort=data.effort @ exchange(n, *pair))
+
+    def turned(joint: int, angle: float) -> Callable[[MotionSamples], MotionSamples]:
+        return lambda data: replace(data, q=data.q + angle * np.eye(n)[joint])
+
     speed = samples.v.std(axis=0)
     max_left = 0.5  # largest share of their torques' variance that is left as recorded
-    min_exchanged_speed = 0.3
-    moves = (speed > min_exchanged_speed * speed.max()) & (before < max_left)
-    tried = [((a, b), 0) for a, b in combinations(np.flatnonzero(moves).tolist(), 2)]
+    min_exchanged_speed = 0.3  # rms, of the fastest joint's: one that hardly moves may have any column
+    moves = np.flatnonzero((speed > min_exchanged_speed * speed.max()) & (left(samples) < max_left)).tolist()
     turning = [j for j, joint in enumerate(chain.joints) if joint.kind != "prismatic"]
-    tried += [((j,), quarters) for j in turning for quarters in QUARTERS]
-    found = None
-    for joints, quarters in tried:
-        now, zero = order.copy(), straight.copy()
-        now[list(joints)] = joints[::-1]
-        zero[list(joints)] = quarters * np.pi / 2
-        after = np.maximum(list(_left(samples, masses, now, zero)), 1e-9)
-        factor = float(np.exp(0.5 * np.mean(np.log(after / before))))
-        if found is None or factor < found.factor:
-            found = Rearranged(joints, quarters, factor, float(after.max()))
-    return found
+    table = [Change("columns-exchanged", exchanged(pair), pair) for pair in combinations(moves, 2)]
+    table += [
+        Change("zero-elsewhere", turned(j, angle), (j,), {"angle": angle})
+        for j in turning
+        for angle in (0.5 * np.pi, np.pi, -0.5 * np.pi)
+    ]
+    return best_changes(samples, table, left)
 
 
-def _left(samples: MotionSamples, masses: np.ndarray, order: np.ndarray, zero: np.ndarray) -> Iterator[float]:
-    """Yield what is left of each recorded joint's torque.
+def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
+    """Return samples with the joints' columns recombined by a matrix (n, n)."""
+    q, v, a = (np.ascontiguousarray(x @ matrix.T) for x in (samples.q, samples.v, samples.a))
+    return replace(samples, q=q, v=v, a=a)
 
-    Args:
-        order: (n,) recorded column that holds each joint.
-        zero: (n,) added to its positions [rad].
+
+def _left(samples: MotionSamples, masses: np.ndarray) -> Iterator[float]:
+    """Yield what is left of each joint's torque, as a share of its variance.
+
+    Each torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive and
+    those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
     """
-    q, v, a = (np.ascontiguousarray(x[:, order]) for x in (samples.q, samples.v, samples.a))
-    q += zero
-    still = inverse_dynamics(samples.bodies, masses, q, np.zeros_like(v), np.zeros_like(a))
-    moving = inverse_dynamics(samples.bodies, masses, q, v, a) - still
-    drives, torque = drive_columns(v, a), samples.torque
-    for joint, recorded in sorted(enumerate(order), key=lambda one: one[1]):
-        beside = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(q), -1)
+    still = inverse_dynamics(samples.bodies, masses, samples.q, np.zeros_like(samples.v), np.zeros_like(samples.a))
+    moving = inverse_dynamics(samples.bodies, masses, samples.q, samples.v, samples.a) - still
+    drives, torque = drive_columns(samples.v, samples.a), samples.torque
+    for joint in range(torque.shape[1]):
+        beside = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(torque), -1)
         columns = np.column_stack([still[:, joint], moving[:, joint], beside])
-        yield float(left_share(basis(columns), torque[None, :, recorded])[0])
+        yield float(left_share(basis(columns), torque[None, :, joint])[0])

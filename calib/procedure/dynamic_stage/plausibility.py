@@ -8,11 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from calib.column_changes import Explanation
 from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.errors import Finding, finding
 from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
-from calib.identification.checks.whole_robot import ClockRatio, Rearranged, ReversedSigns
+from calib.identification.checks.whole_robot import ClockRatio
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import level_of, limit
@@ -27,22 +28,30 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
         speed = list(_speed(each, joints))
         found += [*_limits(each, joints), *_masses(each, joints), *speed]
         found += [] if speed else _clock(each.name, each.clock)
-        found += [*_unlike(each, joints), *_lag(each.name, each.lag, joints), *_other(each.name, each.other, joints)]
+        found += [*_unlike(each, joints), *_lag(each.name, each.lag, joints)]
+        if (other := each.other) is not None:
+            sizes_left = dict(factor=other.factor, gain=1.0 - other.factor, explained=1.0 - max(other.after))
+            found.append(other.finding(joints, file=each.name, **sizes_left))
         found += [finding("position-jump", file=each.name, jump=words) for words in each.jumps]
     return [one for one in found if level_of(one)]
 
 
-def wrong_signs(found: Mapping[str, ReversedSigns | None], joints: Sequence[str]) -> list[Finding]:
-    """Return what it means that recordings, by name, are explained with torques of the opposite sign."""
-    signs = [
-        finding(
-            "torque-sign", file=name, joint=joints[j], before=before, after=after, explained=1.0 - max(each.after) ** 2
-        )
-        for name, each in found.items()
-        if each is not None
-        for j, before, after in zip(each.joints, each.before, each.after)
-    ]
-    return [one for one in signs if level_of(one)]
+def wrong_joints(found: Mapping[str, Explanation | None], joints: Sequence[str]) -> list[Finding]:
+    """Return what it means that joints of recordings, by name, have another sign, or count from another joint."""
+    wrong = []
+    for name, each in found.items():
+        changes = () if each is None else each.changes
+        concerned = sorted({change.joints[0] for change in changes})
+        for change in sorted(changes, key=lambda one: one.joints):
+            j, k = change.joints[0], change.joints[-1]
+            wrong.append(
+                finding(
+                    change.code, file=name, joint=joints[j], other=joints[k], **change.values,
+                    before=np.sqrt(each.before[j]), after=np.sqrt(each.after[j]), gain=1.0 - each.factor,
+                    factor=each.factor, explained=1.0 - max(each.after[concerned]),
+                )
+            )  # fmt: skip
+    return [one for one in wrong if level_of(one)]
 
 
 def impossible(found: Contradiction | None) -> list[Finding]:
@@ -196,15 +205,3 @@ def _clock(name: str, found: ClockRatio | None) -> Iterator[Finding]:
         surely=times * float(np.exp(-2.0 * found.relative_sigma)), stamps=max(found.clock, 1.0 / found.clock),
         way="large" if found.clock > 1.0 else "small",
     )  # fmt: skip
-
-
-def _other(name: str, found: Rearranged | None, joints: Sequence[str]) -> Iterator[Finding]:
-    if found is None:
-        return
-    values = {"file": name, "joints": [joints[j] for j in found.joints], "factor": found.factor}
-    values |= {"gain": 1.0 - found.factor, "explained": 1.0 - found.left}
-    if found.quarters:
-        degrees = (90 * found.quarters + 180) % 360 - 180 or 180
-        yield finding("zero-elsewhere", angle=np.radians(degrees), **values)
-    else:
-        yield finding("columns-exchanged", **values)

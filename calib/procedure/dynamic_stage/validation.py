@@ -156,7 +156,7 @@ def assess(
     odd = plausibility.findings(sizes, inputs.chain.joint_names) + plausibility.impossible(findings.contradiction)
     odd += plausibility.another_loop(findings.unlike) + plausibility.described(inputs.chain)
     signs = {case.name: signs_of(case, inputs.chain, settings.gravity) for case in (*inputs.cases, *inputs.unseen)}
-    odd += plausibility.wrong_signs(signs, inputs.chain.joint_names)
+    odd += plausibility.wrong_joints(signs, inputs.chain.joint_names)
     odd = settle(odd, inputs.options.accept)
     figures, rules = judge(fit, proofs, repeated, excitation, labels)
     if drives := friction_drives(joint + 1 for joint in wrong):

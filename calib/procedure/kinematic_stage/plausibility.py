@@ -12,8 +12,8 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
-from calib.geometry.checks.instrument_scale import Scale, length_factor, mirrored_rms, scale_of
-from calib.geometry.checks.joint_signs import reversed_joints
+from calib.geometry.checks.instrument_scale import Scale, length_factor, scale_of
+from calib.geometry.checks.wrong_columns import wrong_columns
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.result import GeometricFit
@@ -112,9 +112,7 @@ def findings(
     before, after = (errors(cell, blocks, torques).rms for cell in (nominal, fit.cell))
     remains = after if left is None else left
     shown, pulled = _as_positions(blocks, torques)
-    result = _wrong_way(nominal, shown, pulled, before, reach)
-    if not any(one.code == "joint-sign" for one in result):
-        result += _moved(fit, reach)
+    result = _wrong_way(nominal, shown, pulled, before, reach) or _moved(fit, reach)
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
         arm, rms = ("nominal", before) if before < TOO_GOOD else ("calibrated", after)
@@ -148,18 +146,15 @@ def _wrong_way(
     before: float,
     reach: float,
 ) -> list[Finding]:
-    """Return joints or axes whose reversal lets the nominal arm explain the rows; of both, what leaves less."""
+    """Return the change of columns that lets the nominal arm explain the rows."""
     if not before > FLOOR * reach:
         return []
-    signs = reversed_joints(nominal, blocks, torques)
-    mirrored = np.nan
-    if before > limit("unexplained", "share") * reach:
-        mirrored = mirrored_rms(nominal, blocks, torques)
-    result = [finding("left-handed", rms=mirrored, before=before, times=before / np.maximum(mirrored, 1e-300))]
-    if signs is not None and not mirrored < signs.rms:
-        joints, times = [nominal.chain.joint_names[j] for j in signs.joints], signs.before / max(signs.rms, 1e-300)
-        result.insert(0, finding("joint-sign", joints=joints, rms=signs.rms, before=signs.before, times=times))
-    return [one for one in result if level_of(one)][:1]
+    changed = wrong_columns(nominal, blocks, torques, mirrored=before > limit("unexplained", "share") * reach)
+    if changed is None:
+        return []
+    was, rms = (float(np.sqrt(one[0])) for one in (changed.before, changed.after))
+    one = changed.finding(nominal.chain.joint_names, rms=rms, before=was, times=was / max(rms, 1e-300))
+    return [one] if level_of(one) else []
 
 
 def _moved(fit: GeometricFit, reach: float) -> list[Finding]:

@@ -7,6 +7,7 @@ from typing import NoReturn
 import numpy as np
 from scipy.spatial import KDTree
 
+from calib.column_changes import Change
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE
 from calib.data.recordings.recording import Recording
@@ -14,9 +15,8 @@ from calib.errors import Finding, finding, refuse_data
 from calib.geometry.checks.repeatability import drift_between, drift_within, noise_of_difference
 from calib.identification.checks.recorded_motion import (
     DesignedMotion,
-    DifferentMotion,
     LocatedMotion,
-    explain,
+    another_motion,
     locate,
     nominal_share,
 )  # fmt: skip
@@ -79,7 +79,7 @@ def check_motion(
     """
     found = locate(recording, motion)
     if found is None:
-        _refuse(recording, _other_motion(recording, motion, explain(recording, motion, others)))
+        _refuse(recording, _other_motion(recording, motion, another_motion(recording, motion, others)))
     notes = []
     if found.periods < wanted:
         notes.append(finding("repetitions-missing", periods=found.periods, wanted=wanted))
@@ -89,22 +89,21 @@ def check_motion(
     return found, notes
 
 
-def _other_motion(recording: Recording, motion: DesignedMotion, found: DifferentMotion | None) -> Finding:
+def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | None) -> Finding:
     """Return what a recording without the designed motion is."""
     if found is None and recording.duration < motion.period:
         return finding("motion-short", duration=recording.duration, period=motion.period)
     if found is None:
         return finding("motion-unknown")
-    if found.name:
-        return finding("motion-exchanged", motion=found.name)
-    if found.speed != 1.0:
-        return finding("motion-rehearsed", speed=found.speed)
-    names, unit = recording.joint_names, "deg" if found.unit < 1.0 else "rad under a header that says deg"
-    moved = [(names[column], names[j]) for j, column in enumerate(found.order) if column != j]
+    names = recording.joint_names
+    if found.code != "motion-altered":
+        return finding(found.code, joints=[names[j] for j in found.joints], **found.values)
+    unit, order, sign = (found.values[key] for key in ("unit", "order", "sign"))
+    moved = [(names[column], names[j]) for j, column in enumerate(order) if column != j]
     return finding(
-        "motion-altered", unit="" if found.unit == 1.0 else unit,
+        found.code, unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad under a header that says deg",
         swapped=[f"the column of {column} holds {joint}" for column, joint in moved],
-        reversed=[names[j] for j, sign in enumerate(found.sign) if sign < 0],
+        reversed=[names[j] for j, one in enumerate(sign) if one < 0],
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from without_figures import run
 
+from calib.column_changes import coupling
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage import plausibility
@@ -341,7 +342,18 @@ def test_no_sign_and_no_order_of_a_sound_recording_is_called_wrong(data, log):
         (case,) = gather(robot, [f"{data / log}@{part[0]}:{part[1]}"]).cases
         sizes, names = compare_sizes(case, load(robot)), load(robot).joint_names
         assert signs_of(case, load(robot)) is None
-        assert "columns-exchanged" not in {one.code for one in plausibility.findings([sizes], names)}
+        assert not {"columns-exchanged", "zero-elsewhere"} & {one.code for one in plausibility.findings([sizes], names)}
+
+
+@pytest.mark.parametrize(("joint", "way"), [(1, 1.0), (2, 1.0), (2, -1.0), (4, -1.0)])
+def test_a_joint_of_a_panda_that_counts_from_the_one_before_it_is_named(data, joint, way):
+    robot = data / "franka_panda_inria" / "model.urdf"
+    (case,) = gather(robot, [f"{robot.parent / 'traj1_first60pct.npz'}@0:8.5"]).cases
+    matrix = coupling(7, joint, joint - 1, -way)
+    motion = replace(case.motion, **{name: getattr(case.motion, name) @ matrix.T for name in "qva"})
+    found = signs_of(replace(case, motion=motion), load(robot))
+    assert found is not None and (found.code, found.joints) == ("axis-coupled", (joint, joint - 1))
+    assert found.changes[0].values["way"] == ("+" if way > 0 else "-") and found.factor < 0.4
 
 
 @pytest.mark.parametrize("joint", range(7))

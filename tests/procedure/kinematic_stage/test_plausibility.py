@@ -90,6 +90,28 @@ def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, mo
         assert calib("fit", "ur5", "m.csv", "--out", "o", "--model", model, "--options", "a.toml")[0] == 0
 
 
+@pytest.mark.parametrize("model", ["frames", pytest.param("geometry", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("change", "code", "values"),
+    [
+        ({"q3": ("q3", "q2", 1.0)}, "joint-coupled", {"joint": "elbow_joint", "other": "shoulder_lift_joint", "way": "-"}),
+        ({"q3": ("q3", "q2", -1.0)}, "joint-coupled", {"joint": "elbow_joint", "way": "+", "rival": None}),
+        ({"q2": ("q3", "q3", 0.0), "q3": ("q2", "q2", 0.0)}, "joints-exchanged", {"rival": None}),
+    ],
+)  # fmt: skip
+def test_joints_that_count_from_another_or_are_exchanged_are_named(cell, calib, change, code, values, model):
+    rows = cell.measure(COUNT)
+    for row in rows:
+        row |= {name: row[one] + way * row[other] for name, (one, other, way) in change.items()}
+    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
+    done, _, err = calib("fit", "ur5", path, "--out", "o", "--model", model)
+    level, decided, odd = verdict()
+    assert (done, level, decided) == (1, "fail", code) and "moved" not in odd, err
+    found = noticed()[code].values
+    assert set(found["joints"]) == {"elbow_joint", "shoulder_lift_joint"}
+    assert {key: found[key] for key in values} == values
+
+
 @pytest.mark.parametrize("degrees, level", [(90, "fail"), (20, "marginal")])
 def test_a_joint_counted_from_another_zero_is_told(cell, calib, degrees, level):
     rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]

@@ -204,6 +204,12 @@ def reversed_torque_of_joint4(table: np.ndarray, header: list[str]) -> np.ndarra
     return table
 
 
+def counted_from_the_horizontal(table: np.ndarray, header: list[str]) -> np.ndarray:
+    two, three = (next(k for k, name in enumerate(header) if name.startswith(f"q_joint{j}")) for j in (2, 3))
+    table[:, three] += table[:, two]
+    return table
+
+
 def small(table: np.ndarray, header: list[str]) -> np.ndarray:
     table[:, [name.startswith("tau_joint") for name in header]] *= 1e-2
     return table
@@ -223,12 +229,13 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (numbers(slowed), "0.5 times its speed"),
         (numbers(reversed_torques), "reverse their sign"),
         (numbers(reversed_torque_of_joint4), "training.csv: torque of joint4 .* negate the column of joint4"),
+        (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
         (numbers(small), "times those of the nominal masses"),
         (numbers(another), "another motion than the one designed"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
-    ids=["rad", "swapped", "rehearsal", "sign", "one sign", "unit", "another", "stopped", "missing"],
+    ids=["rad", "swapped", "rehearsal", "sign", "one sign", "horizontal", "unit", "another", "stopped", "missing"],
 )
 def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
     path = recorded.path("7-recorded/training.csv")

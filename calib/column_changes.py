@@ -1,0 +1,153 @@
+"""Which small change of columns explains data far better? One search, over a table of changes for each kind of data.
+
+Columns of poses or recordings may not be what they are said to be: a sign, an exchange, a zero, a unit, the hand of the
+axes, a joint that counts from the horizontal instead of from the link before it. Each `Change` of a table is made,
+what the data leave unexplained then is compared with what they leave as recorded, and the best change counts.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from calib.errors import Finding, finding
+
+MAX_APART = 1.2  # what another change leaves, over what the best one leaves, up to which nobody can tell (our choice)
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One way in which columns may not be what they are said to be.
+
+    Attributes:
+        code: of the finding that says it.
+        make: data as recorded → what they are with the change.
+        joints: that it concerns, from 0.
+        values: what else the finding says.
+        max_left: the change counts where it leaves less than this share (rms) of what is left without it.
+    """
+
+    code: str
+    make: Callable[[Any], Any]
+    joints: tuple[int, ...] = ()
+    values: Mapping[str, Any] = field(default_factory=dict)
+    max_left: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Changes that explain data better than these explain themselves.
+
+    Attributes:
+        changes: one or more.
+        before, after: (k,) mean squares that are left without the changes and with them.
+        rival: another change that leaves nearly as little as a single one does; None without.
+    """
+
+    changes: tuple[Change, ...]
+    before: np.ndarray
+    after: np.ndarray
+    rival: Change | None = None
+
+    @property
+    def code(self) -> str:
+        """Of the finding that says it: the first change's."""
+        return self.changes[0].code
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Joints of all changes of the first one's kind; a single change keeps their order."""
+        of_kind = [one.joints for one in self.changes if one.code == self.code]
+        return of_kind[0] if len(of_kind) == 1 else tuple(sorted({joint for joints in of_kind for joint in joints}))
+
+    @property
+    def factor(self) -> float:
+        """What is left with the changes over what is left without, rms."""
+        return _share(self.after, self.before)
+
+    def finding(self, names: Sequence[str], **values: Any) -> Finding:
+        """Return the finding that says it, with the names of the joints and other values."""
+        joints = [names[j] for j in self.joints]
+        rival = self.rival and " at ".join([self.rival.code, *(names[j] for j in self.rival.joints[:1])])
+        places = {"joint": joints[0], "other": joints[-1]} if joints else {}
+        return finding(self.code, joints=joints, **places, rival=rival, **self.changes[0].values, **values)
+
+
+def best_changes(
+    data: Any,
+    table: Iterable[Change],
+    left: Callable[[Any], np.ndarray],
+    at_least: Callable[[Any], np.ndarray] | None = None,
+    max_changes: int = 1,
+) -> Explanation | None:
+    """Make the change that explains most, then the next one beside it, as long as one counts; None where none does.
+
+    Args:
+        data: as recorded.
+        table: the changes to try.
+        left: data → (k,) mean squares that are left unexplained; of several their geometric mean is compared.
+        at_least: data → a lower bound of `left` that is quickly known; spares changes that cannot count.
+        max_changes: to make.
+    """
+    rest, made, rival = list(table), [], None
+    before = now = left(data)
+    while rest and len(made) < max_changes:
+        tried = []
+        for change in rest:
+            changed = change.make(data)
+            if at_least is None or _share(at_least(changed), now) < change.max_left:
+                after = left(changed)
+                tried.append((_share(after, now), change, changed, after))
+        counts = sorted((one for one in tried if one[0] < one[1].max_left), key=lambda one: one[0])
+        if not counts:
+            break
+        share, best, data, now = counts[0]
+        near = [change for other, change, *_ in counts[1:] if other < MAX_APART * share]
+        rival = near[0] if near and not made else None
+        made.append(best)
+        rest.remove(best)
+    return Explanation(tuple(made), before, now, rival) if made else None
+
+
+def reversal(n: int, joint: int) -> np.ndarray:
+    """Return the matrix (n, n) that reverses the sign of one of n columns."""
+    return np.diag(np.where(np.arange(n) == joint, -1.0, 1.0))
+
+
+def exchange(n: int, one: int, other: int) -> np.ndarray:
+    """Return the matrix (n, n) that exchanges two of n columns."""
+    order = np.arange(n)
+    order[[one, other]] = other, one
+    return np.eye(n)[order]
+
+
+def coupling(n: int, joint: int, other: int, way: float) -> np.ndarray:
+    """Return the matrix (n, n) that adds one of n columns, times `way`, to another: a joint that counts from it."""
+    matrix = np.eye(n)
+    matrix[joint, other] = way
+    return matrix
+
+
+def couplings(n: int) -> list[tuple[int, int, float]]:
+    """Return the joints that may count from the one before them: joint, the other one, +1 or -1."""
+    return [(joint, joint - 1, way) for joint in range(1, n) for way in (1.0, -1.0)]
+
+
+def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which column (n,) holds each joint, and with which sign (n,).
+
+    Args:
+        cost: (2, n, n) of column k for joint j, as it is and reversed.
+    """
+    from scipy.optimize import linear_sum_assignment  # slow to load
+
+    order = linear_sum_assignment(cost.min(axis=0))[1]
+    rows = np.arange(len(order))
+    return order, np.where(cost[0, rows, order] <= cost[1, rows, order], 1.0, -1.0)
+
+
+def _share(after: np.ndarray, before: np.ndarray) -> float:
+    """Return the rms share that is left, the geometric mean of several."""
+    with np.errstate(all="ignore"):
+        return float(np.exp(0.5 * np.mean(np.log(np.asarray(after) / before))))
