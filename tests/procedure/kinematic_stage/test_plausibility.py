@@ -94,7 +94,7 @@ def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, mo
 @pytest.mark.parametrize(
     ("change", "code", "values"),
     [
-        ({"q3": ("q3", "q2", 1.0)}, "joint-coupled", {"joint": "elbow_joint", "other": "shoulder_lift_joint", "way": "-"}),
+        ({"q3": ("q3", "q2", 1.0)}, "joint-coupled", {"joint": "elbow_joint", "way": "-", "rival": None}),
         ({"q3": ("q3", "q2", -1.0)}, "joint-coupled", {"joint": "elbow_joint", "way": "+", "rival": None}),
         ({"q2": ("q3", "q3", 0.0), "q3": ("q2", "q2", 0.0)}, "joints-exchanged", {"rival": None}),
     ],
