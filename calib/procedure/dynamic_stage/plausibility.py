@@ -40,9 +40,10 @@ def wrong_joints(found: Mapping[str, Explanation | None], joints: Sequence[str])
     """Return what it means that joints of recordings, by name, have another sign, or count from another joint."""
     wrong = []
     for name, each in found.items():
-        changes = () if each is None else each.changes
-        concerned = sorted({change.joints[0] for change in changes})
-        for change in sorted(changes, key=lambda one: one.joints):
+        if each is None:
+            continue
+        concerned = sorted({change.joints[0] for change in each.changes})
+        for change in sorted(each.changes, key=lambda one: one.joints):
             j, k = change.joints[0], change.joints[-1]
             wrong.append(
                 finding(
