@@ -1,13 +1,133 @@
-"""Which geometric parameters the poses can identify, and what merges with what, in words."""
+"""Which geometric parameters the poses can identify, and findings on those that they cannot.
+
+Rank, parameters that merge with others or stay at their nominal, placements that are hardly determined.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from calib.errors import Finding, finding
 from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe
 from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit
+from calib.robot.kinematics import forward
+
+PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}
+
+
+def unidentified(found: GeometricFit) -> list[Finding]:
+    """Return what a fit's poses could not identify: its rank first, then parameters, then placements."""
+    return [*_rank(found), *_merged(found), *_at_nominal(found), *_loose(found)]
+
+
+def _rank(found: GeometricFit) -> list[Finding]:
+    split = found.split
+    if split is None:
+        return []
+    values = split.singular_values
+    below = float(values[split.rank]) if split.rank < len(values) else None
+    return [
+        finding(
+            "rank",
+            rank=split.rank,
+            parameters=len(values),
+            tolerance=split.tolerance,
+            last=values[split.rank - 1],
+            next=below,
+        )
+    ]
+
+
+def _merged(found: GeometricFit, max_named: int = 4) -> list[Finding]:
+    """Return the arm parameters that are linear combinations of others, by what they merge with.
+
+    `max_named`: parameters by which families of merged ones are distinguished.
+    """
+    split = found.split
+    if split is None:
+        return []
+    table = layout(found.start)
+    families: dict[object, list[str]] = {}
+    kin: dict[object, dict[str, tuple[str, ...]]] = {}
+    for column, dropped in enumerate(split.dropped):
+        if table.group(int(found.candidates[dropped])) != "arm":
+            continue
+        key: object = None
+        if dropped not in split.without_effect:
+            weight = np.abs(split.coefficients[:, column])
+            partners = found.candidates[split.kept[weight > 0.1 * weight.max()]]
+            groups = {table.group(int(k)) for k in partners}
+            arm = tuple(table.names[k] for k in partners if table.group(int(k)) == "arm")
+            key = "station" in groups, "tool" in groups, arm[:max_named], len(arm)
+            frames = [PLACES[group] for group in PLACES if group in groups]
+            kin.setdefault(key, {"into": (*frames, *arm)})
+        families.setdefault(key, []).append(table.names[found.candidates[dropped]])
+    return [
+        finding("no-effect", names=names) if key is None else finding("merged", names=names, **kin[key])
+        for key, names in families.items()
+    ]
+
+
+def _at_nominal(found: GeometricFit) -> list[Finding]:
+    """Return arm parameters that are independent but identified no better than they are known beforehand."""
+    if found.split is None:
+        return []
+    table = layout(found.start)
+    if found.prior is not None:
+        sigma = found.estimate.sigma
+        loose = np.isfinite(found.prior) & (sigma > 0.7 * found.prior) & (found.free < table.arm)
+        held = tuple(table.names[k] for k in found.free[loose])
+        return [finding("near-prior", names=held)] if held else []
+    kept = found.candidates[found.split.kept]
+    left = tuple(table.names[k] for k in np.setdiff1d(kept, found.free) if k < table.arm)
+    return [finding("left-nominal", names=left)] if left else []
+
+
+def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:
+    """Return tools whose placement is hardly determined, and the station that each is confused with.
+
+    `max_placement_sigma`: [m] a placement known no better than this is worth a word (our choice).
+    """
+    estimate = found.estimate
+    index = {name: k for k, name in enumerate(estimate.names)}
+    result: list[Finding] = []
+    min_orientation_range = 45.0  # [deg] below it "the wrist is held still" is the likely reason (our choice)
+    for tool in found.cell.tool_names:
+        own = [index[f"{tool}.{axis}"] for axis in "xyz" if f"{tool}.{axis}" in index]
+        sigma = float(np.linalg.norm(estimate.sigma[own]))
+        if own and sigma >= max_placement_sigma:
+            spread = _orientation_range(found)
+            still = spread if spread is not None and spread < min_orientation_range else None
+            station = _confused(found, own, index)
+            result.append(finding("loose-tool", tool=tool, sigma=sigma, station=station, still=still))
+    return result
+
+
+def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str:
+    """Return the station whose estimate trades with the tool's (canonical correlation above 0.95); empty for none."""
+    covariance = found.estimate.covariance
+    for station in found.cell.station_names:
+        theirs = [k for name, k in index.items() if name.rsplit(".", 1)[0] == station]
+        if not theirs:
+            continue
+        roots = [np.linalg.cholesky(covariance[np.ix_(part, part)]) for part in (own, theirs)]
+        cross = np.linalg.solve(roots[0], covariance[np.ix_(own, theirs)])
+        if np.linalg.norm(np.linalg.solve(roots[1], cross.T), 2) > 0.95:
+            return station
+    return ""
+
+
+def _orientation_range(found: GeometricFit) -> float | None:
+    """Return the 95 % range of the flange's orientation over the poses an instrument saw [deg]; None without any."""
+    q = [block.measured.q for block in found.blocks if block.measured.has_instrument]
+    if not q:
+        return None
+    turns = Rotation.from_matrix(forward(found.cell.chain, np.concatenate(q))[:, :3, :3])
+    return 2.0 * float(np.degrees(np.quantile((turns.mean().inv() * turns).magnitude(), 0.95)))
 
 
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:

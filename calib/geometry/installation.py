@@ -1,18 +1,36 @@
-"""An arm as it stands in the cell: chain, instrument placements, tool placements and joint deflections."""
+"""An arm as it stands in the cell: chain, instrument placements, tool placements and joint deflections.
+
+In ``robot.toml``, besides the calibrated robot itself (`calib.robot.description`, `calib.robot.calibrated`)::
+
+    [[station]]                      # pose of the arm's base in the instrument's frame
+    name = "day1"
+    xyz = [1.0, 0.0, 0.3]            # and rpy; or matrix
+    [[tool]]                         # pose of the target in the tip's frame
+    name = "tool"
+    [[camera]]                       # and [[board]], of images: see `calib.rooms.camera.optics`
+    [provenance]
+    nominal_station = [...]          # and nominal_tool: the frames that let the nominal arm fit best
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.arrays import frozen
 from calib.data.poses.measurements import PoseMeasurements
-from calib.robot.calibrated import Deflection, extra_displacements
+from calib.errors import CalibError, RobotError, refused_as
+from calib.extensions import needed
+from calib.records import read_record
+from calib.robot import calibrated
+from calib.robot.calibrated import Deflection, extra_displacements, nominal_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import Sweep, sweep
+from calib.robot.tables import placement, placement_table
 
 FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -131,3 +149,67 @@ def see(
         point = walked.position + np.einsum("cdm,mc->dm", walked.rotation, placement[:, :3, 3])
         rotation = np.einsum("cdm,mce->edm", walked.rotation, placement[:, :3, :3])
     return Seen(walked, point, rotation)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The tables of stations and tools, each entry with a name and a placement."""
+
+    station: tuple[Mapping[str, Any], ...] = ()
+    tool: tuple[Mapping[str, Any], ...] = ()
+    camera: tuple[Mapping[str, Any], ...] = ()
+    board: tuple[Mapping[str, Any], ...] = ()
+
+
+def frame_tables(cell: Installation) -> dict[str, Any]:
+    """Return the tables ``station`` and ``tool`` of an installation, and those of its cameras and boards."""
+    return {
+        **cell.optics.tables(),
+        "station": [{"name": n, **placement_table(t)} for n, t in zip(cell.station_names, cell.stations)],
+        "tool": [{"name": n, **placement_table(t)} for n, t in zip(cell.tool_names, cell.tools)],
+    }
+
+
+def read(path: str | Path) -> Installation:
+    """Read the installation that a fit has written, deflections included.
+
+    Args:
+        path: the folder of a fit, or its ``robot.toml``; any other robot file gives identity frames.
+    """
+    robot, extra = calibrated.read_whole(path)
+    return _placed(robot.complete, extra, str(path), robot.deflection)
+
+
+def read_arms(path: str | Path) -> tuple[Installation, Installation]:
+    """Return the calibrated arm of a fit as `read` does, and the nominal one.
+
+    The nominal one has the frames that let it fit the same measurements best; of a fit that started from an earlier
+    fit's folder they are not known: then it has no stations and no tools.
+
+    Raises:
+        RobotError: where the file does not say which arm that was.
+    """
+    robot, extra = calibrated.read_whole(path)
+    known = extra.get("provenance", {})
+    frames = {kind: known.get(f"nominal_{kind}", ()) for kind in ("station", "tool")}
+    nominal = _placed(nominal_of(robot), {**extra, **frames}, f"{path}, provenance")
+    if not all(frames.values()):
+        none = np.zeros((0, 4, 4))
+        nominal = replace(nominal, stations=none, station_names=(), tools=none, tool_names=())
+    return _placed(robot.complete, extra, str(path), robot.deflection), nominal
+
+
+def _placed(chain: Chain, tables: Mapping[str, Any], where: str, deflection: Deflection | None = None) -> Installation:
+    """Return a chain with stations and tools as their tables say; identity frames where a list is empty."""
+    with refused_as(RobotError, ValueError, f"{where}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
+        found = read_record(_Frames, tables)
+    given: dict[str, Any] = {"deflection": deflection or Deflection()}
+    for kind, entries in (("station", found.station), ("tool", found.tool)):
+        if entries:
+            given[f"{kind}_names"] = tuple(str(entry.get("name", f"{k}")) for k, entry in enumerate(entries, 1))
+            poses = ({key: value for key, value in entry.items() if key != "name"} for entry in entries)
+            given[f"{kind}s"] = np.array([placement(each, f"{where}, {kind}") for each in poses])
+    if found.camera:
+        with refused_as(RobotError, (CalibError, ValueError), f"{where}: {{}}"):
+            given["optics"] = needed("read_optics")(found.camera, found.board)
+    return Installation(chain, **given)

@@ -1,4 +1,7 @@
-"""The observation matrix of an installation: residual parts and their Jacobian for every block of measurements."""
+"""The observation matrix of an installation: residual parts and their Jacobian for every block of measurements.
+
+With it the covariance of a fit's parameters is propagated to the tool's pose.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +13,7 @@ from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout_counts
 from calib.geometry.residuals import Part, parts
-from calib.robot import calibrated
+from calib.robot.calibrated import evaluate, extra_displacements, target_elements
 from calib.robot.kinematics import element_jacobian
 
 
@@ -48,11 +51,17 @@ def prepare(
         torque = torques[number] if torques is not None else None
         station = _index(cell.station_names, block.station, "station") if block.has_instrument else -1
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
-        bases = calibrated.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
-        known = calibrated.evaluate(cell.known, block.q, torque) if cell.known.terms else None
-        given = calibrated.extra_displacements(cell.chain, cell.known, block.q, known)
-        blocks.append(Block(block, station, tools[block.tool], torque, bases, given))
+        blocks.append(_ready(cell, block, station, tools[block.tool], torque))
     return blocks
+
+
+def _ready(
+    cell: Installation, measured: PoseMeasurements, station: int, tool: np.ndarray, torque: np.ndarray | None
+) -> Block:
+    bases = evaluate(cell.deflection, measured.q, torque) if cell.deflection.terms else None
+    known = evaluate(cell.known, measured.q, torque) if cell.known.terms else None
+    given = extra_displacements(cell.chain, cell.known, measured.q, known)
+    return Block(measured, station, tool, torque, bases, given)
 
 
 def _index(names: tuple[str, ...], name: str, what: str) -> int:
@@ -98,7 +107,7 @@ def target_jacobian(
     if len(in_terms):
         assert bases is not None
         numbers = free[in_terms] - arm - stations - tools - optics
-        targets = calibrated.target_elements(cell.chain, cell.deflection)[numbers]
+        targets = target_elements(cell.chain, cell.deflection)[numbers]
         unique, inverse = np.unique(targets, return_inverse=True)
         moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)
         jacobian[in_terms] = moved[inverse] * bases[numbers][:, None, :]
@@ -128,3 +137,38 @@ def stack(found: Sequence[Part], sigmas: Sequence[np.ndarray]) -> tuple[np.ndarr
     for part, sigma, start, stop in zip(found, sigmas, edges, edges[1:]):
         part.fill(residual[start:stop], matrix[:, start:stop], sigma)
     return residual, matrix.T
+
+
+def pose_sigmas(
+    cell: Installation,
+    q: np.ndarray,
+    free: np.ndarray,
+    covariance: np.ndarray,
+    torque: np.ndarray | None = None,
+    station: int = 0,
+    tool: np.ndarray | int = 0,
+) -> np.ndarray:
+    """Return sigmas (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
+
+    Args:
+        cell: the fitted installation.
+        q: (m, n) [rad or m].
+        free: (f,) positions in the parameter vector (`calib.geometry.parameters`).
+        covariance: (f, f) of steps along them.
+        torque: (m, n) gravity torques [N m], for compliance terms.
+        station: seen from which station; -1 for the arm's base.
+        tool: which of its tools, one or (m,).
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    result = [np.zeros((0, 2))]
+    chunk = 500  # poses at once: the Jacobian has a column per parameter
+    for first in range(0, len(q), chunk):
+        rows = slice(first, first + chunk)
+        own = PoseMeasurements(q[rows], cell.chain.joint_names)
+        pulled = None if torque is None else torque[rows]
+        block = _ready(cell, own, station, np.broadcast_to(tool, len(q))[rows], pulled)
+        jacobian = target_jacobian(cell, predict(cell, block), free, station, block.tool, block.bases)
+        spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(own))
+        result.append(np.sqrt(np.sum(spread**2, axis=(0, 2))).T)
+    return np.concatenate(result)

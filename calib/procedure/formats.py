@@ -39,7 +39,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
     "robot": (
         "robot.toml as calib fit writes it",
-        ("calib.robot.description", "calib.geometry.installation_file", "calib.robot.calibrated"),
+        ("calib.robot.description", "calib.geometry.installation", "calib.robot.calibrated"),
     ),
     "session": ("a session's folder and its session.toml", ("calib.procedure.session.folder",)),
     "limits": (

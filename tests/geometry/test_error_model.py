@@ -48,7 +48,7 @@ def test_95_of_100_unseen_errors_are_within_the_interval_near_and_far(found, rea
 def test_the_covariance_of_the_parameters_alone_would_be_far_too_small(found):
     model, cell = found
     block = measured(2, 400, 1.6, 5e-4)
-    from calib.geometry.uncertainty.spread import pose_sigmas
+    from calib.geometry.observation import pose_sigmas
 
     alone = pose_sigmas(cell, block.q, model.free, model.covariance)[:, 0]
     assert np.mean(errors(cell, [block]).main < model.discrepancy.radius * alone) < 0.8

@@ -11,9 +11,9 @@ from planted import cell, load, measure, perturb, random_joints
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import Finding
 from calib.geometry.checks.diagnosis import diagnose, neighbour_floor
-from calib.geometry.checks.unidentified import PLACES, unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
+from calib.geometry.identifiability import PLACES, unidentified
 from calib.geometry.installation import Installation, see
 from calib.robot.calibrated import Deflection, Term
 

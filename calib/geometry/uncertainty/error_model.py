@@ -26,10 +26,9 @@ from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.observation import observe, prepare
+from calib.geometry.observation import observe, pose_sigmas, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.left_out import LeftOut, Profile, unevenness
-from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward

@@ -26,12 +26,12 @@ import numpy as np
 from calib import files
 from calib.data.poses.pose_lists import Targets
 from calib.errors import UsageError
-from calib.geometry import installation_file, inverse
+from calib.geometry import installation, inverse
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
+from calib.geometry.observation import pose_sigmas
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.error_model import Discrepancy, ErrorModel, outside
-from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.calibrated import Deflection
@@ -120,7 +120,7 @@ def read(folder: str | Path) -> Fitted:
     fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
     if not fit.robot.is_file():
         raise UsageError(f"{fit.path} holds no robot.toml; give the folder that `calib fit --out` has written")
-    cell, nominal = installation_file.read_arms(fit.path)
+    cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
     own = fit.metrics()
     judged = proof.metrics() if proof.judged.is_file() else own

@@ -13,9 +13,9 @@ from calib.errors import Finding, NotConverged, finding
 from calib.extensions import offered
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
-from calib.geometry.checks.unidentified import unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
+from calib.geometry.identifiability import unidentified
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import ModelSelection, select_model

@@ -15,7 +15,7 @@ from calib import files
 from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import CERTIFICATE, METRICS, REPORT, check_target, write_staged
-from calib.geometry import installation_file
+from calib.geometry import installation
 from calib.geometry.installation import Installation
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
@@ -115,7 +115,7 @@ class FitFolder:
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
         chosen = settings.combine(loss=self.findings().loss or settings.loss)
-        cell = installation_file.read(self.path)
+        cell = installation.read(self.path)
         rigid = calibrated.read(self.path).chain
         return Arms(nominal_arm(inputs, chosen), cell, rigid, self._expected(cell, inputs))
 
@@ -221,7 +221,7 @@ def write_folder(
 def _write_all(outcome: Outcome, folder: Path) -> None:
     fit, chain = outcome.selection.fit, outcome.inputs.chain
     robot, origin = outcome.robot, f"calibrated from {outcome.inputs.source}"
-    calibrated.write(folder, robot, installation_file.frame_tables(fit.cell), _record(outcome), origin)
+    calibrated.write(folder, robot, installation.frame_tables(fit.cell), _record(outcome), origin)
     urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
         urdfs[CORRECTED_URDF] = robot.corrections.chain
@@ -259,7 +259,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
     """Return what the provenance says of how the robot was calibrated, besides from what."""
     inputs = outcome.inputs
     again = inputs.earlier is not None and inputs.earlier.nominal is not None
-    frames = {} if again else installation_file.frame_tables(outcome.selection.nominal.cell)
+    frames = {} if again else installation.frame_tables(outcome.selection.nominal.cell)
     return {
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],

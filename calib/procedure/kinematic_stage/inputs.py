@@ -13,9 +13,8 @@ from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import needed
-from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated, repeated_rows
-from calib.geometry.first_guess import check_scale
+from calib.geometry.first_guess import check_orientations, check_scale
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection

@@ -15,7 +15,7 @@ from calib.data.poses.pose_lists import read_poses
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.estimate_files import read_estimate
 from calib.folders import CERTIFICATE
-from calib.geometry import installation_file
+from calib.geometry import installation
 from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import dynamics_steps, steps
@@ -146,7 +146,7 @@ def _results(session: Session) -> tuple[tuple[str, str], ...]:
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     """Compare a session's result with the cell's truth, print and write the errors; return those of the tool [mm]."""
-    found = installation_file.read(session.fit.path)
+    found = installation.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
         f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "

@@ -15,7 +15,7 @@ from calib.data.csv_table import Table, read_table
 from calib.data.poses.pose_lists import read_poses
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refuse_option, require
-from calib.geometry import installation_file
+from calib.geometry import installation
 from calib.geometry.installation import Installation, see
 from calib.identification import model_file
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
@@ -208,7 +208,7 @@ def _chosen(path: Path, chain: Chain) -> np.ndarray:
 
 def _measured(place: Path) -> Measured:
     """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
-    after, before = installation_file.read_arms(place)
+    after, before = installation.read_arms(place)
     with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
         known = set(map(shielded, after.station_names))
         rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in known]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.geometry import installation_file
+from calib.geometry import installation
 from calib.robot import calibrated
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
@@ -54,12 +54,12 @@ def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
     file = cell.write("day1.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
-    installation = installation_file.read("done")
-    poses = installation.stations[0] @ forward(installation.chain, q) @ installation.tools[0]
+    placed = installation.read("done")
+    poses = placed.stations[0] @ forward(placed.chain, q) @ placed.tools[0]
     rows = cell.measure(60)
     seen = np.array([[row[axis] for axis in "xyz"] for row in rows])
     fitted = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in rows])
-    predicted = installation.stations[0] @ forward(installation.chain, fitted) @ installation.tools[0]
+    predicted = placed.stations[0] @ forward(placed.chain, fitted) @ placed.tools[0]
     assert np.linalg.norm(predicted[:, :3, 3] - seen, axis=1).max() < 2e-4
     again = urdf.read("done/robot.urdf")
     assert np.abs(forward(again, q) - forward(load("done"), q)).max() < 1e-9
@@ -139,11 +139,11 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
 def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
     assert calib("fit", "ur5", file, other, "--model", "geometry", "--out", "each")[0] == 0
-    assert installation_file.read("each").station_names == ("a", "b")
+    assert installation.read("each").station_names == ("a", "b")
     assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "geometry", "--out", "one")[0] == 0
-    assert installation_file.read("one").station_names == ("station",)
+    assert installation.read("one").station_names == ("station",)
     assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "geometry", "--out", "tools")[0] == 0
-    assert installation_file.read("tools").tool_names == ("a tool", "b tool")
+    assert installation.read("tools").tool_names == ("a tool", "b tool")
 
 
 def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
@@ -209,16 +209,16 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
 def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
     file = cell.write("a.csv", cell.measure(90))
     assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] == 0
-    installation = installation_file.read("done")
+    placed = installation.read("done")
     rows = read_rows(Path("done/joint_corrections.csv"))
-    assert len(rows) == len(installation.deflection.terms) > 0
+    assert len(rows) == len(placed.deflection.terms) > 0
     assert "coefficient * b(q)" in Path("done/joint_corrections.txt").read_text()
     metrics = json.loads(Path("done/metrics.json").read_text())
     q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in cell.measure(90)])
     from calib.geometry.installation import see
 
     seen = np.array([[row[axis] for axis in "xyz"] for row in cell.measure(90)])
-    size = np.linalg.norm(see(installation, q).point.T - seen, axis=1)
+    size = np.linalg.norm(see(placed, q).point.T - seen, axis=1)
     assert np.isclose(1e3 * np.sqrt(np.mean(size**2)), metrics["fit"]["calibrated"]["position_mm"]["rms"], rtol=1e-6)
     # a URDF alone is the best rigid geometry, beside the one that the corrections belong to
     alone = metrics["fit"]["urdf_alone"]["position_mm"]["rms"]

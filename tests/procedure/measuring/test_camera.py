@@ -182,8 +182,8 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
+    from calib.geometry.observation import pose_sigmas
     from calib.geometry.parameters import layout
-    from calib.geometry.uncertainty.spread import pose_sigmas
     from calib.procedure.measuring.prediction import predicted as foretold
     from calib.robot.chain import random_joints
     from calib.rooms.camera.camera_guess import complete_camera

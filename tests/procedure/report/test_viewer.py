@@ -13,7 +13,7 @@ import pytest
 
 from calib import cli
 from calib.errors import UsageError
-from calib.geometry import installation_file
+from calib.geometry import installation
 from calib.robot.collision import visuals
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
@@ -102,7 +102,7 @@ def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
         assert sizes == pytest.approx([float(row[column]) for row in table], rel=1e-4)
     turns = [[float(row[f"dr{axis} [deg]"]) for axis in "xyz"] for row in table]
     assert np.degrees(measured.turned) == pytest.approx(np.array(turns))
-    tool = installation_file.read(fitted).tools[0]
+    tool = installation.read(fitted).tools[0]
     at = (forward(load(fitted), measured.q) @ tool)[:, :3, 3]
     assert np.abs(at - measured.calibrated).max() < 1e-9  # in the base of the arm that is drawn
 
