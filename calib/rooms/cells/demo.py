@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.pose_lists import read_poses
+from calib.data.poses.choices import IMAGES
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.estimate_files import read_estimate
 from calib.folders import CERTIFICATE
@@ -24,8 +24,8 @@ from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open
 from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.load import load
-from calib.rooms.camera.pixels import Pixels
-from calib.rooms.cells import camera_files, measured_files
+from calib.rooms.cells import measured_files
+from calib.rooms.cells.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
 from calib.rooms.cells.cell import Cell, measure, wandering
 from calib.rooms.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
 from calib.rooms.cells.virtual_arm import REST, MovingArm, moving_arm, play, record
@@ -90,9 +90,9 @@ def run(
     motion = MOTION if dynamics else {}
     begun = partial(begin, folder, robot, instrument, FIT, VALIDATION, seed, dynamics=dynamics, motion=motion)
     if instrument == "camera":
-        seen = camera_files.seen_by_camera(cell)
+        seen = seen_by_camera(cell)
         cell = seen.cell
-        with camera_files.limits_of(seen) as limits:
+        with limits_of(seen) as limits:
             session = begun(limits=limits)
     else:
         session = begun()
@@ -192,7 +192,8 @@ def simulate_next(folder: Path, say: Say) -> None:
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
         if waiting is None:
-            _compare_with_truth(session, _cell_of(session), say)
+            seen = _camera_of(session)
+            _compare_with_truth(session, _cell_of(session) if seen is None else seen.cell, say)
             return
         if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: {command_line('next', folder)}")
@@ -202,18 +203,22 @@ def simulate_next(folder: Path, say: Say) -> None:
 
 def _cell_of(session: Session) -> Cell:
     """Return the virtual cell of a session of the demonstration."""
-    cell = virtual_cell(session.settings.robot.given, session.settings.seed)
-    return camera_files.seen_by_camera(cell).cell if session.settings.instrument.measures == Pixels.kind else cell
+    return virtual_cell(session.settings.robot.given, session.settings.seed)
+
+
+def _camera_of(session: Session) -> CameraCell | None:
+    """Return the same with a camera, where the session's instrument is one."""
+    return seen_by_camera(_cell_of(session)) if session.settings.instrument.measures == IMAGES else None
 
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
     """Let the simulated cell do what a step waits for."""
-    seed = session.settings.seed
-    cell = virtual_cell(session.settings.robot.given, seed)
-    if step in ("measure", "validate") and session.settings.instrument.measures == Pixels.kind:
-        found = camera_files.seen_by_camera(cell)
-        _mark(session, found.cell.note)
-        camera_files.bring_images(session.folder, found, seed, progress)
+    seed, cell, seen = session.settings.seed, _cell_of(session), _camera_of(session)
+    if step in ("measure", "validate") and seen is not None:
+        _mark(session, seen.cell.note)
+        for number, name, q in measured_files.planned(session.folder, cell.nominal):
+            tell = partial(_rendering, progress, name)
+            take_pictures(seen, q, session.path(f"3-measured/{name}"), seed=seed + number, say=tell)
         say("    (the simulated camera takes an image at every pose of both lists)")
     elif step in ("measure", "validate"):
         simulate_measurements(session, cell, seed)
@@ -225,6 +230,10 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda wor
         raise SessionError(f"the demonstration cannot bring what {step} needs")
 
 
+def _rendering(progress: Say, name: str, image: str) -> None:
+    progress(f"rendering {name}/{image}")
+
+
 def arm_of(session: Session, cell: Cell) -> MovingArm:
     """Return the arm of a session's simulated cell as it moves."""
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
@@ -233,12 +242,10 @@ def arm_of(session: Session, cell: Cell) -> MovingArm:
 def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
     _mark(session, cell.note)
-    kinds = [joint.kind for joint in cell.nominal.joints]
-    for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
-        q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
+    for number, name, q in measured_files.planned(session.folder, cell.nominal):
         seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
         measured_files.write(seen, session.path(f"3-measured/{name}.csv"))
-        if plan == "poses":
+        if name == "measured":
             again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
             measured_files.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 

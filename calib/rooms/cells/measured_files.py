@@ -1,13 +1,24 @@
 """What an engineer brings from the cell: a measured block, or a log, as the CSV files that `calib` reads."""
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from calib import files
 from calib.data.poses.measurements import Poses, Positions
+from calib.data.poses.pose_lists import read_poses
 from calib.data.recordings.recording import Recording
+from calib.robot.chain import Chain
+
+
+def planned(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
+    """Yield the lists of poses that a session in `folder` planned for an arm: number, name when measured, q (m, n)."""
+    kinds = [joint.kind for joint in arm.joints]
+    for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
+        if (path := folder / f"2-poses/{plan}.csv").exists():
+            yield number, name, read_poses(path, arm.joint_names, kinds=kinds)
 
 
 def write(measured: Positions, path: str | Path, degrees: bool = True) -> Path:

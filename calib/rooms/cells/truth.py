@@ -12,10 +12,10 @@ from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.estimate_files import StoredEstimate
+from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
-from calib.geometry.installation import Installation, see
-from calib.robot.calibrated import evaluate
+from calib.geometry.installation import Installation
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells.cell import Cell, true_poses
 from calib.rooms.cells.unmodelled import WARM_TIME
@@ -39,21 +39,19 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
     """
     q = random_joints(cell.nominal, TRUTH, 12345)
     true = true_poses(cell, q)
-    points = true[:, :3, 3]
-    block = Poses(q, cell.nominal.joint_names, points, to_quaternion(true))
+    block = Poses(
+        q, cell.nominal.joint_names, true[:, :3, 3], to_quaternion(true), station=calibrated.station_names[0],
+        tool_names=calibrated.tool_names[:1],
+    )  # fmt: skip
     nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, urdf))
-    before, after, bare = (_rms(arm, q, points) for arm in (nominal, calibrated, alone))
+    before, after, bare = (_rms(arm, block) for arm in (nominal, calibrated, alone))
     return before, after, bare
 
 
-def _rms(arm: Installation, q: np.ndarray, points: np.ndarray) -> float:
-    bases = None
-    if arm.deflection.terms:
-        reference = arm.deflection.reference or arm.chain
-        torque = None if reference.inertias is None else gravity_torques(reference, q)
-        bases = evaluate(arm.deflection, q, torque)
-    error = see(arm, q, bases=bases).point.T - points
-    return float(1e3 * np.sqrt(np.mean(np.sum(error**2, axis=1))))
+def _rms(arm: Installation, block: Poses) -> float:
+    reference = arm.deflection.reference or arm.chain
+    torque = None if reference.inertias is None else gravity_torques(reference, block.q)
+    return 1e3 * errors(arm, [block], [torque]).rms
 
 
 @dataclass(frozen=True, eq=False)

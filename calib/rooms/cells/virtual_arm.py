@@ -15,6 +15,7 @@ from calib.data.recordings.recording import Recording
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.pseudo_inertia import from_standard, to_standard
 from calib.dynamics.torque_rows import LINK
 from calib.errors import CalibError
 from calib.robot import library
@@ -184,43 +185,26 @@ def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the true drive parameters (n, 7) in the order of `robots.SIDED`, and where they come from."""
-    n, zero = chain.n, np.zeros(chain.n)
+    source = "drives as published for the type"
     if library.path(f"{robot}_truth").exists():
-        known = known_robots.truth(robot)["drives"]
-        if "Fvl" in known:
-            return np.column_stack([known[name] for name in known_robots.SIDED]), "drives as published for the type"
-        rows = {"Ia": known["Ia"], "Fvm": known["Fv"], "Fcm": known["Fc"]}
-        return np.column_stack(
-            [rows.get(name, zero) for name in known_robots.SIDED]
-        ), "drives as published for the type"
-    speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
-    bare = Plant(bodies_of(chain), (), standard_parameters(chain))
-    rows = {
-        "Ia": 0.5 * bare.inertia_diagonal(random_joints(chain, 200, 0)),
-        "Fvm": 0.05 * effort / speed,
-        "Fcm": 0.05 * effort,
-    }
-    return np.column_stack(
-        [rows.get(name, np.zeros(n)) for name in known_robots.SIDED]
-    ), "drives made up from its limits"
+        rows = known_robots.truth(robot)["drives"]
+        if "Fvl" not in rows:
+            rows = {"Ia": rows["Ia"], "Fvm": rows["Fv"], "Fcm": rows["Fc"]}
+    else:
+        source = "drives made up from its limits"
+        speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
+        bare = Plant(bodies_of(chain), (), standard_parameters(chain))
+        inertia = bare.inertia_diagonal(random_joints(chain, 200, 0))
+        rows = {"Ia": 0.5 * inertia, "Fvm": 0.05 * effort / speed, "Fcm": 0.05 * effort}
+    return np.column_stack([rows.get(name, np.zeros(chain.n)) for name in known_robots.SIDED]), source
 
 
 def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return ten standard parameters of a body that is stretched, shifted and heavier or lighter.
 
-    T P Tᵀ of the pseudo-inertia P = [[Σ, h], [hᵀ, m]] is positive definite where P is (Wensing et al. 2018).
+    T P Tᵀ of the pseudo-inertia P (`calib.dynamics.pseudo_inertia`) is positive definite where P is.
     """
-    xx, xy, xz, yy, yz, zz, mx, my, mz, m = parameters
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    pseudo = np.zeros((4, 4))
-    pseudo[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    pseudo[:3, 3] = pseudo[3, :3] = mx, my, mz
-    pseudo[3, 3] = m
     turn = np.eye(4)
     turn[:3, :3] += STRETCH * rng.standard_normal((3, 3))
     turn[:3, 3] = SHIFT * rng.standard_normal(3)
-    pseudo = (1.0 + MASS * rng.standard_normal()) ** 2 * turn @ pseudo @ turn.T
-    spread = pseudo[:3, :3]
-    inertia = np.trace(spread) * np.eye(3) - spread
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    return np.array([*(inertia[r, s] for r, s in pairs), *pseudo[:3, 3], pseudo[3, 3]])
+    return to_standard((1.0 + MASS * rng.standard_normal()) ** 2 * turn @ from_standard(parameters) @ turn.T)

@@ -28,7 +28,6 @@ from calib.rooms.camera.pictures.boards import make
 from calib.rooms.camera.pictures.corner_file import Detection, Found
 from calib.rooms.camera.pictures.image_bags import ImageBag, write_image_folder
 from calib.rooms.cells import camera_cell as camera
-from calib.rooms.cells import camera_files
 from calib.rooms.cells.cell import SimulatedInstrument
 from calib.rooms.cells.virtual_cells import rigid, virtual_cell
 from calib.transforms import from_xyz_rpy, pose
@@ -40,12 +39,12 @@ SILENT = partial(lambda *words: None)
 @pytest.fixture(scope="module")
 def cell() -> camera.CameraCell:
     arm = rigid(virtual_cell("lwr4plus", instrument=SimulatedInstrument(encoder_sigma=1e-5)))
-    return camera.camera_cell(arm, lens=camera_files.LENS, reach_of_arm=0.75)
+    return camera.camera_cell(arm, lens=camera.DEMO_LENS, reach_of_arm=0.75)
 
 
 def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
     """Against the projection of every corner; the places in the file are rounded to centimetres."""
-    with camera_files.limits_of(cell) as path:
+    with camera.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
     view = limits.camera
     assert view is not None and "the whole board in the camera's view, its range and its tilt" in limits.checked
@@ -63,7 +62,7 @@ def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
 
 @pytest.mark.slow
 def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
-    with camera_files.limits_of(cell) as path:
+    with camera.limits_of(cell) as path:
         chosen = selection.choose("lwr4plus", 15, SelectionSettings(candidates=120), constraints=path)
         limits = read_limits(path, targets_of(cell.cell.nominal))
     assert chosen.parameters == 42  # 34 of the arm with both placements, 8 of the lens
@@ -75,7 +74,7 @@ def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
 
 @pytest.mark.slow
 def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
-    with camera_files.limits_of(cell) as path:
+    with camera.limits_of(cell) as path:
         path.write_text(path.read_text().replace("tilt", "# tilt").replace("stands = {xyz = [0", "stands = {xyz = [9"))
         with pytest.raises(UsageError, match="sees the board at hardly any posture"):
             selection.choose("lwr4plus", 15, SelectionSettings(candidates=60), constraints=path)
@@ -87,7 +86,7 @@ def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
 def test_a_camera_as_told_is_held_against_its_view_or_said_not_to_be(cell, tmp_path):
     """A camera looks along its z, a board's z goes into it; what is unknown is named in what is unchecked."""
     arm = targets_of(cell.cell.nominal)
-    with camera_files.limits_of(cell) as path:
+    with camera.limits_of(cell) as path:
         told = {
             "mounting": "in-hand", "lens": str(path.parent / "camera.yaml"), "board": str(path.parent),
             "carried": "0.04,0.02,0.06", "stands": "0.46,0,0 facing z",
@@ -155,7 +154,7 @@ def shots(cell, q, seed, folder):
 
 @pytest.mark.slow
 def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
-    with camera_files.limits_of(cell) as path:
+    with camera.limits_of(cell) as path:
         begin(tmp_path / "s", "lwr4plus", "camera", 30, 10, 0, limits=path, dynamics=False)
     said: list[str] = []
     stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
@@ -188,7 +187,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     from calib.robot.chain import random_joints
     from calib.rooms.camera.camera_guess import complete_camera
 
-    with camera_files.limits_of(cell) as path:
+    with camera.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
     q, everywhere = camera.views(cell, 40, 5), random_joints(cell.cell.nominal, 200, 1)
     seen = limits.camera.observation(limits.lower, limits.upper)
