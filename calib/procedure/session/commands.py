@@ -24,12 +24,13 @@ from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
+from calib.procedure.report import console
 from calib.procedure.session import steps
 from calib.procedure.session.folder import UNSEEN, VERDICT, WAYS, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import NOTHING, SessionSettings
-from calib.procedure.session.steps import WAITING, State
+from calib.procedure.session.steps import DONE, KEPT, WAITING, State
 from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
 from calib.robot.load import load, resolve
@@ -168,13 +169,18 @@ Say = Callable[[str], None]
 LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
 HEAD = "# What the cell is like, as stated to calib new; calib formats limits says what may stand here.\n"
-COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
+COLOURS = {
+    **console.COLOURS, "done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow",
+    "waits": "yellow", "after": "dim", "failed": "red",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Stop:
-    """Where `go_on` stopped: lines that say what to do now, and the verdict once there is one."""
+    """Where `go_on` stopped: the step that waits, lines that say what to do now, and the verdict at the end."""
 
+    session: Session
+    waiting: State | None
     lines: tuple[str, ...]
     verdict: str = ""
 
@@ -255,8 +261,8 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)
     if state is not None:
-        return _Stop(("", *asks(session, state)))
-    return _Stop(_ending(session), session.verdicts().level)
+        return _Stop(session, state, ("", *asks(session, state)))
+    return _Stop(session, None, _ending(session), session.verdicts().level)
 
 
 def _ending(session: Session) -> tuple[str, ...]:
@@ -279,10 +285,10 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
     for number, state in enumerate(found, 1):
         table.add_row(str(number), state.step.name, Text(state.kind, COLOURS[state.kind]), Text(state.words))
     yield table
-    ahead = next((state for state in found if state.kind not in (steps.DONE, steps.KEPT)), None)
+    ahead = next((state for state in found if state.kind not in (DONE, KEPT)), None)
     if ahead is None:
         yield f"certificate: {session.path(CERTIFICATE)}"
-    elif ahead.kind == steps.WAITING:
+    elif ahead.kind == WAITING:
         yield from asks(session, ahead)
     else:
         yield f"next: {command_line('next', folder)}"

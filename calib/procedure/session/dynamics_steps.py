@@ -7,13 +7,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NoReturn
 
 import numpy as np
 
 from calib import files
+from calib.column_changes import Change
+from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import CalibError
+from calib.errors import CalibError, Finding, finding, refuse_data
+from calib.identification.checks.recorded_motion import (
+    DesignedMotion,
+    LocatedMotion,
+    another_motion,
+    locate,
+    nominal_share,
+)  # fmt: skip
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
@@ -22,13 +32,15 @@ from calib.procedure.dynamic_stage.validation import Assessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
-from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.records import read_json
+from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
 Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
+MIN_TRACKED_SHARE = 0.98  # of the motion, explained by a recorded period; below it is noted
+MAX_TORQUE_RATIO = 10.0  # a factor between measured and nominal torques that no wrong mass explains
 VALIDATION_PERIOD = 0.8  # of the validation motion, over the training motion's (our choice)
 VALIDATION_SEED = 3  # added to the seed for the validation motion
 
@@ -120,19 +132,91 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]
     notes += [f"{path.name}: {note}" for note in recording.notes]
     if not own.payload:  # the nominal masses hold no payload
-        arrival.check_torques(recording, chain)
+        check_torques(recording, chain)
     motions = designed_motions(session)
     if name not in motions:
         whole = [float(recording.t[0]), float(recording.t[-1])]
         return whole if session.settings.dynamics.holdout else None, notes
     others = {other: motion for other, motion in motions.items() if other != name}
-    found, loose = arrival.check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
+    found, loose = check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
     worst = max(found.tracking)
     notes.append(
         f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
         f"{1e3 * worst:.2g} mrad rms"
     )
     return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in lines_of(loose)]
+
+
+def check_motion(
+    recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], wanted: int
+) -> tuple[LocatedMotion, list[Finding]]:
+    """Find the designed motion in a recording, and return what is worth a note.
+
+    Args:
+        recording: of n joints.
+        motion: the one that was to be played.
+        others: the session's other motions by name, to say if one of them was played instead.
+        wanted: how many repetitions were asked for.
+
+    Raises:
+        MeasurementError: where it is not there, with what explains the recording.
+    """
+    found = locate(recording, motion)
+    if found is None:
+        _refuse(recording, _other_motion(recording, motion, another_motion(recording, motion, others)))
+    notes = []
+    if found.periods < wanted:
+        notes.append(finding("repetitions-missing", periods=found.periods, wanted=wanted))
+    if found.likeness < MIN_TRACKED_SHARE:
+        joint = recording.joint_names[found.loosest]
+        notes.append(finding("tracking-loose", share=found.likeness, joint=joint))
+    return found, notes
+
+
+def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | None) -> Finding:
+    """Return what a recording without the designed motion is."""
+    if found is None and recording.duration < motion.period:
+        return finding("motion-short", duration=recording.duration, period=motion.period)
+    if found is None:
+        return finding("motion-unknown")
+    names = recording.joint_names
+    if found.code != "motion-altered":
+        return finding(found.code, joints=[names[j] for j in found.joints], **found.values)
+    unit, order, sign = (found.values[key] for key in ("unit", "order", "sign"))
+    moved = [(names[column], names[j]) for j, column in enumerate(order) if column != j]
+    return finding(
+        found.code, unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad under a header that says deg",
+        swapped=[f"the column of {column} holds {joint}" for column, joint in moved],
+        reversed=[names[j] for j, one in enumerate(sign) if one < 0],
+    )  # fmt: skip
+
+
+def check_torques(recording: Recording, chain: Chain) -> None:
+    """Compare recorded torques with those of the nominal masses: reversed signs, other units.
+
+    Raises:
+        MeasurementError: where the torques of joints that carry much are reversed, or of another size.
+    """
+    if chain.inertias is None or recording.kind != "torque":
+        return
+    share = nominal_share(recording, chain)
+    sure = np.flatnonzero(np.isfinite(share))
+    if not len(sure):
+        return
+    joints, size = [recording.joint_names[j] for j in sure], np.abs(share[sure])
+    if (size > MAX_TORQUE_RATIO).all() or (size < 1 / MAX_TORQUE_RATIO).all():
+        ratio = float(np.median(size))
+        code = "torques-too-small" if ratio < 1 else "torques-too-large"
+        _refuse(recording, finding(code, joints=joints, ratio=ratio))
+    turned = [recording.joint_names[j] for j in sure if share[j] < 0]
+    if turned:
+        _refuse(
+            recording, finding("torques-reversed" if turned == joints else "torque-of-joint-reversed", joints=turned)
+        )
+
+
+def _refuse(recording: Recording, found: Finding) -> NoReturn:
+    refuse_data(recording.file, lines_of([found])[0])
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:

@@ -14,14 +14,13 @@ from rich.text import Text
 from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, complaint, require
 from calib.procedure.findings import LEVELS
-from calib.procedure.report import console
-from calib.procedure.session import commands, steps
-from calib.procedure.session.folder import SETTINGS, locked, open_session
+from calib.procedure.session.commands import COLOURS, go_on
+from calib.procedure.session.folder import SETTINGS
+from calib.procedure.session.steps import DONE
 from calib.workers import Workers
 
 LOG = "run.log"
-DONE, WAITS, FAILED = "done", "waits", "failed"
-COLOURS = {**console.COLOURS, DONE: "green", WAITS: "yellow", FAILED: "red"}
+WAITS, FAILED = "waits", "failed"  # what a session comes to, or `DONE`
 
 
 @dataclass(frozen=True)
@@ -110,16 +109,13 @@ def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> Fle
 
 
 def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) -> FleetRow:
-    session = open_session(folder, plots)
-    with locked(session, say):
-        waiting = steps.run_next(session, say, lambda words: None, command)
-    if waiting is not None:
-        asks = tuple(commands.asks(session, waiting))
-        for words in asks:
+    stop = go_on(folder, say, lambda words: None, command, plots=plots)
+    session = stop.session
+    if stop.waiting is not None:
+        for words in stop.lines[1:]:
             say(words)
-        words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
-        return FleetRow(str(folder), WAITS, words=words, asks=asks)
-    verdict = session.verdicts().level
+        words = f"{stop.waiting.words} (step {stop.waiting.step.name}); {LOG} says what to bring"
+        return FleetRow(str(folder), WAITS, words=words, asks=stop.lines[1:])
     found = session.validation.metrics() if session.geometric else None
     sets = found.validation.values() if found else ()
     pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in sets if found]
@@ -128,7 +124,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
     if session.dynamic:
         unseen = session.identification.unseen.read()
         torque = max((one.raw.total for one in (unseen.validation or unseen.fit).values()), default=None)
-    return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
+    return FleetRow(str(folder), DONE, stop.verdict, "", *errors, torque, code=1 if stop.verdict == "fail" else 0)
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:

@@ -1,4 +1,7 @@
-"""What each step of a session does. The same functions as the scriptable commands; only the files are the session's."""
+"""What each step of a session does. The same functions as the scriptable commands; only the files are the session's.
+
+Which poses a session asks for: chosen ones for the fit, random ones within the same limits for validation.
+"""
 
 import shutil
 from collections.abc import Callable, Sequence
@@ -6,35 +9,125 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from calib import files
 from calib.data.poses.choices import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.data.poses.pose_lists import check_against, filled_in, read_poses
-from calib.errors import CalibError, UsageError
+from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE, check_against, filled_in, read_poses, write_poses
+from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import needed
 from calib.folders import write_staged
+from calib.geometry.checks.repeatability import drift_between, drift_within, noise_of_difference
+from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import UNJUDGED, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
-from calib.procedure.kinematic_stage import inputs
-from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.kinematic_stage import inputs, selection
+from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 from calib.procedure.kinematic_stage.validation import assess
+from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
+from calib.procedure.measuring.pose_limits import read_limits
+from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.measuring.selection_prediction import beside
 from calib.procedure.measuring.selection_prediction import read as read_prediction
+from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.geometry_section import error_words, parameter_words
-from calib.procedure.session import arrival
-from calib.procedure.session.folder import POSES, POSES_CHECKED, SUMMARY, UNSEEN, VERDICT, Session
+from calib.procedure.session.folder import (
+    POSES,
+    POSES_CHECKED,
+    PREDICTED,
+    SELECTION,
+    SUMMARY,
+    UNSEEN,
+    VERDICT,
+    WAYS,
+    Session,
+)
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.load import load_calibrated
 from calib.units import JOINT
+from poses.candidates import draw_candidates
+from poses.space import is_feasible
 
+HOW = "state [camera] in the limits file: calib formats constraints"
+
+
+def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[str]:
+    """Choose and write the poses that ``session.toml`` asks for, the run through them, and predicted sigmas."""
+    settings, robot_file = session.settings, session.robot_file
+    wanted, instrument = settings.poses, settings.instrument
+    base, tip = session.links(chain)
+    sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
+    choice = SelectionSettings(
+        kind=_seen_as(instrument.measures), tools=(instrument.tool,), index=wanted.index, method=wanted.method,
+        sigmas=sigmas if instrument.sigma_position else None, seed=settings.seed,
+    )  # fmt: skip
+    chosen = selection.choose(
+        robot_file, wanted.fit, choice, constraints=session.named(wanted.constraints), base=base, tip=tip,
+        progress=lambda done, total, what: say(f"choosing poses: {what}"),
+    )  # fmt: skip
+    said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
+    if instrument.measures == IMAGES and not chosen.by_images and not said:
+        chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{VIEW_UNCHECKED} ({HOW})"))
+    found, q = chosen.selection, chosen.selection.joints
+    if found.interrupted:  # a session is resumed, not gone on with half a search
+        raise KeyboardInterrupt
+    gain = found.random_baseline / found.value if found.index == "cond" else found.value / found.random_baseline
+    words = (
+        f"{len(q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
+        f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
+    )
+    unseen = _unseen(session, robot_file, chain, wanted.validation)
+    sets = {POSES: q, UNSEEN: unseen} if wanted.validation else {POSES: q}
+    for name, joints in sets.items():
+        write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, unit="deg", kinds=joint_kinds(chain))
+    write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
+    if chosen.prediction is not None:
+        write_prediction(chosen.prediction, session.path(f"2-poses/{POSES}"))
+    outlook = chosen.outlook.poses
+    if session.plots and np.isfinite(outlook.rms):
+        from calib.procedure.report.charts import picture
+        from calib.procedure.report.geometry_figures import predicted_map
+
+        chart = predicted_map(outlook.points, outlook.spread)
+        files.write(session.path(PREDICTED), picture(chart, "").png)
+    record = {"words": words, **selection.record(chosen), "seed": settings.seed}
+    files.write_json(session.path(SELECTION), record)
+    notes = [f"{len(q)} poses for the fit: {words}"]
+    notes += [f"{len(unseen)} poses for validation, at random"] if wanted.validation else []
+    numbers = (f"{words}: {number}" for words, number in selection.predicted_rows(chosen))
+    return [*notes, *chosen.kept(), *numbers, *record["notes"]]
+
+
+def _seen_as(measures: str) -> str:
+    """Return the kind of measurement that poses are chosen for: an image determines a pose."""
+    return "pose" if measures == IMAGES else measures
+
+
+def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
+    """Return random poses within limits and constraints (count, n), from another stream than the candidates'."""
+    if not count:
+        return np.zeros((0, chain.n))
+    cell = targets_of(chain, [session.settings.instrument.tool])
+    limits = read_limits(session.named(session.settings.poses.constraints), cell, robot_file)
+    jacobian = observation(cell, _seen_as(session.settings.instrument.measures))
+    space = limits.space(jacobian)
+    stream = np.random.default_rng([session.settings.seed, 1])
+    if limits.camera is not None:
+        return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
+    q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
+    return same_turn(chain, q, limits.lower, limits.upper)
+
+
+MIN_READBACK_DIFFERENCE = 1e-8  # [rad or m] closer to the commanded joints they were not read back
 Say = Callable[[str], None]
 
 
@@ -83,8 +176,6 @@ def describe(session: Session, say: Say) -> list[str]:
 
 def select(session: Session, say: Say) -> list[str]:
     """Choose poses for the fit, and others at random for validation."""
-    from calib.procedure.session.pose_plan import choose
-
     chain = chain_of(session)
     for path in (session.path(f"2-poses/{name}") for name in (POSES, UNSEEN)):
         if path.exists() and filled_in(path, chain.n):
@@ -93,7 +184,7 @@ def select(session: Session, say: Say) -> list[str]:
                 f"{session.path('3-measured')}, and put the plain list back or remove it"
             )
     say("choosing poses")
-    return choose(session, chain, say)
+    return _choose(session, chain, say)
 
 
 def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
@@ -137,10 +228,44 @@ def check_file(
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:
             notes += [
-                f"{path.name}: {note}"
-                for note in (*check_against(plan, block), *lines_of(arrival.readback(plan, block)))
+                f"{path.name}: {note}" for note in (*check_against(plan, block), *lines_of(readback(plan, block)))
             ]
     return notes
+
+
+def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
+    """Return how far the joints read back are from those commanded (m, n) [rad or m]; nothing of other poses."""
+    distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
+    close = distance <= MAX_JOINT_DIFFERENCE
+    if not close.any():
+        return []
+    off = np.abs(measured.q[close] - plan[index[close]])
+    if off.max() < MIN_READBACK_DIFFERENCE:
+        return [finding("readback-copied")]
+    joint = measured.joint_names[int(np.argmax(off.max(axis=0)))]
+    return [finding("readback", rms=np.sqrt(np.mean(off**2)), largest=off.max(), joint=joint)]
+
+
+def drift(
+    chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
+) -> list[Finding]:
+    """Return how far repeated poses differ: from those measured again at the end, and within each block.
+
+    Args:
+        chain: the nominal arm.
+        blocks: measured for the fit.
+        again: files whose name starts with drift.
+        sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
+    """
+    pairs = [(later.file, "again at the end", drift_between(chain, blocks, later)) for later in again]
+    pairs += [(block.file, "more than once", drift_within(chain, block)) for block in blocks]
+    return [
+        finding(
+            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat", file=Path(file).name, when=when,
+            poses=found.poses, rms=found.rms, noise=noise_of_difference(sigma) if sigma else None,
+        )
+        for file, when, found in pairs if found is not None
+    ]  # fmt: skip
 
 
 def _drifts(session: Session, chain: Chain) -> list[str]:
@@ -150,7 +275,7 @@ def _drifts(session: Session, chain: Chain) -> list[str]:
         [block for path in paths for block in inputs.read_file(path, chain, options)]
         for paths in (session.brought("measured"), session.brought("drift"))
     )
-    return lines_of(arrival.drift(chain, first, again, session.settings.instrument.sigma_position))
+    return lines_of(drift(chain, first, again, session.settings.instrument.sigma_position))
 
 
 def _fit_settings(session: Session) -> FitSettings:

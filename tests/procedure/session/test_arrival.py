@@ -11,12 +11,11 @@ from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import take
 from calib.errors import Finding, MeasurementError, UsageError
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.session import arrival
 from calib.procedure.session.answers import CAMERA, Answers
 from calib.procedure.session.commands import begin
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
-from calib.procedure.session.geometry_steps import chain_of, check_file
+from calib.procedure.session.geometry_steps import chain_of, check_file, drift, readback
 from calib.procedure.session.questions import QUESTIONS, checked, with_answer
 from calib.robot.chain import random_joints
 from calib.rooms.cells.cell import measure, wandering
@@ -26,10 +25,10 @@ CELL = virtual_cell("lwr4plus")
 Q = random_joints(CELL.nominal, 30, 3)
 
 
-def repeated(drift: float, seed: int) -> list[Finding]:
-    first = wandering(measure(CELL, Q, seed), drift, seed)
-    again = wandering(measure(CELL, Q[:4], seed + 100), drift, seed, begin=1.0)
-    return arrival.drift(CELL.nominal, [first], [replace(again, file="drift.csv")], 60e-6)
+def repeated(size: float, seed: int) -> list[Finding]:
+    first = wandering(measure(CELL, Q, seed), size, seed)
+    again = wandering(measure(CELL, Q[:4], seed + 100), size, seed, begin=1.0)
+    return drift(CELL.nominal, [first], [replace(again, file="drift.csv")], 60e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -39,15 +38,15 @@ def test_drift_is_told_from_noise(seed: int) -> None:
 
 def test_a_pose_measured_twice_in_one_file_counts() -> None:
     found = measure(CELL, np.concatenate([Q, Q[:3]]), 1)
-    (repeats,) = arrival.drift(CELL.nominal, [found], [], 60e-6)
+    (repeats,) = drift(CELL.nominal, [found], [], 60e-6)
     assert (repeats.code, repeats.values["poses"], repeats.values["when"]) == ("poses-repeat", 3, "more than once")
-    assert arrival.drift(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
+    assert drift(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
 
 
 def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:
     found = measure(CELL, Q, 1)
-    assert arrival.readback(Q, found)[0].values["rms"] == pytest.approx(9.1e-6, rel=0.01)
-    assert arrival.readback(Q, replace(found, q=Q))[0].code == "readback-copied"
+    assert readback(Q, found)[0].values["rms"] == pytest.approx(9.1e-6, rel=0.01)
+    assert readback(Q, replace(found, q=Q))[0].code == "readback-copied"
 
 
 def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:

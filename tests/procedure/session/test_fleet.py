@@ -14,7 +14,7 @@ from sessions import edit
 from without_figures import run
 
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
-from calib.procedure.session import fleet
+from calib.procedure.session import fleet, steps
 from calib.workers import Workers, workers
 
 
@@ -48,7 +48,7 @@ def test_a_failing_verdict_is_code_1(cells: Path) -> None:
 
 
 def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fleet.steps, "run_next", lambda *given: 1 / 0)
+    monkeypatch.setattr(steps, "run_next", lambda *given: 1 / 0)
     one = fleet.run_one(cells / "a")
     assert one.state == fleet.FAILED and one.code == 4 and "ZeroDivisionError" in one.words
     (report,) = (cells / "a").glob("calib-bug-*.txt")
