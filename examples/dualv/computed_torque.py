@@ -141,8 +141,8 @@ def _parameters(model: ParallelModel, values: np.ndarray, carried: Collection[st
         drives[joint, _SIMULATED[one.shape]] += value
         if one.shape == "sign":
             drives[joint, 4] = max(one.settings[0], 1e-9)
-    legs = zip(model.leg_bodies, model.leg_parameters(values))
-    own = [rigid_body.kernel_parameters(bodies, parameters) for bodies, parameters in legs]
+    legs = zip(model.legs, model.leg_parameters(values))
+    own = [rigid_body.kernel_parameters(bodies, parameters) for (bodies, *_), parameters in legs]
     return _stacked(own), model.platform_parameters(values, carried), drives
 
 
@@ -156,10 +156,9 @@ def _platform_inertia(
     robot, J = model.known.robot, motion.jacobians
     drives = added_inertia(model.terms, values[model.inertial :], int(robot.starts[-1]))
     result = J.joints.transpose(0, 2, 1) @ drives @ J.joints
-    parts = zip(model.leg_bodies, model.leg_parameters(values), robot.starts, robot.starts[1:])
-    for bodies, parameters, a, b in parts:
-        own = J.joints[:, a:b]
-        result += own.transpose(0, 2, 1) @ rigid_body.mass_matrix(bodies, parameters, motion.posture.q[:, a:b]) @ own
+    for (bodies, joints, _), parameters in zip(model.legs, model.leg_parameters(values)):
+        own, q = J.joints[:, joints], motion.posture.q[:, joints]
+        result += own.transpose(0, 2, 1) @ rigid_body.mass_matrix(bodies, parameters, q) @ own
     fixed, still = model.platform_parameters(values, carried), np.zeros_like(motion.twist)
     for i in range(robot.r):
         need = wrench_regressor(motion.posture.pose, still, J.platform[:, :, i], np.zeros(3)) @ fixed

@@ -167,14 +167,14 @@ def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     return np.concatenate(rows, axis=1)
 
 
-def _check_postures(known: ClosedRobot, posture: Posture, links: Sequence[LegLinks] | None = None) -> None:
+def _check_postures(known: ClosedRobot, posture: Posture) -> None:
     """Refuse postures in a singularity, or beyond one.
 
     Raises:
         NoPosture: naming the sample, the leg or the platform, and the type: 1 (a leg is stretched or folded), 2 (the
             actuators do not hold the platform).
     """
-    links = leg_links(known.robot, posture) if links is None else links
+    links = leg_links(known.robot, posture)
     home, signs = leg_links(known.robot, known.home), _determinants(known, links)
     for k, (leg, one, at_home) in enumerate(zip(known.robot.legs, links, home)):
         weak = _leg_rcond(one, at_home) < SINGULAR
@@ -274,7 +274,7 @@ def _from_readings(
         )
     A = np.concatenate([row for row, _ in rows], axis=1)
     right = right + np.concatenate([own for _, own in rows], axis=1) - times(A, t)
-    return _least_squares(A @ D, right)
+    return times(pseudo_inverse(A @ D), right)
 
 
 def _from_coordinates(
@@ -284,10 +284,6 @@ def _from_coordinates(
     target = _pose_of(known, wanted)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
-
-
-def _least_squares(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return times(pseudo_inverse(A), b)
 
 
 def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:

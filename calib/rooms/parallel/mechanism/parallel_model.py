@@ -27,56 +27,39 @@ from calib.errors import CalibError, UsageError, require
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, cross, loop_jacobians, of_platform, of_readings
-from calib.transforms import pose as assembled
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def wrench_regressor(
-    pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gravity: np.ndarray, placement: np.ndarray | None = None
-) -> np.ndarray:
+def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gravity: np.ndarray) -> np.ndarray:
     """Return the regressor (N, 6, 10) of force and moment at the platform's origin, in the base's axes.
 
     Args:
         pose: (N, 4, 4) of the platform.
         twist, change: (N, 6) velocity of its origin and angular velocity, and their derivatives.
         gravity: (3,) [m/s²].
-        placement: (4, 4) frame of the body's parameters in the platform's; None: the same.
     """
-    R, lever = _frame(pose, placement)
-    turn, turning = twist[:, 3:], change[:, 3:]
-    linear = change[:, :3] - gravity + cross(turning, lever) + cross(turn, cross(turn, lever))
-    a, w, b = (np.einsum("nji,nj->ni", R, x) for x in (linear, turn, turning))
+    R = pose[:, :3, :3]
+    a, w, b = (np.einsum("nji,nj->ni", R, x) for x in (change[:, :3] - gravity, twist[:, 3:], change[:, 3:]))
     own = np.zeros((len(R), 6, 10))
     spin = _skew(w)
     own[:, :3, 9] = a
     own[:, :3, 6:9] = _skew(b) + spin @ spin
     own[:, 3:, 6:9] = -_skew(a)
-    inertia = _inertia_columns(b) + spin @ _inertia_columns(w)
-    own[:, 3:, :6] = inertia
-    force = R @ own[:, :3]
-    return np.concatenate([force, R @ own[:, 3:] + _skew(lever) @ force], axis=1)
+    own[:, 3:, :6] = _inertia_columns(b) + spin @ _inertia_columns(w)
+    return np.concatenate([R @ own[:, :3], R @ own[:, 3:]], axis=1)
 
 
-def energy_columns(
-    pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray, placement: np.ndarray | None = None
-) -> np.ndarray:
+def energy_columns(pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray) -> np.ndarray:
     """Return kinetic and potential energy (N, 10) per unit of each standard parameter; arguments as above."""
-    R, lever = _frame(pose, placement)
-    turn = twist[:, 3:]
-    u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3] + cross(turn, lever), turn))
+    R = pose[:, :3, :3]
+    u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3], twist[:, 3:]))
     result = np.empty((len(R), 10))
     result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, _inertia_columns(w))
     down = np.einsum("nji,j->ni", R, gravity)
     result[:, 6:9] = cross(u, w) - down  # u · (w × s) = s · (u × w)
-    result[:, 9] = 0.5 * np.sum(u**2, axis=1) - (pose[:, :3, 3] + lever) @ gravity
+    result[:, 9] = 0.5 * np.sum(u**2, axis=1) - pose[:, :3, 3] @ gravity
     return result
-
-
-def _frame(pose: np.ndarray, placement: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the body's rotation (N, 3, 3), and the lever (N, 3) to its origin, in the base's axes."""
-    placement = assembled() if placement is None else placement
-    return pose[:, :3, :3] @ placement[:3, :3], pose[:, :3, :3] @ placement[:3, 3]
 
 
 def _skew(x: np.ndarray) -> np.ndarray:
@@ -161,9 +144,14 @@ class ParallelModel:
         return self.torque_rows.count(self.n)
 
     @cached_property
-    def leg_bodies(self) -> tuple[Bodies, ...]:
-        """The legs as trees of their own."""
-        return tuple(bodies_of(leg.chain) for leg in self.known.robot.legs)
+    def legs(self) -> tuple[tuple[Bodies, slice, slice], ...]:
+        """Each leg as a tree of its own, its joints among those of all legs, and the columns of its bodies."""
+        robot = self.known.robot
+        ends = 10 * np.cumsum([0, *(leg.bodies for leg in robot.legs)])
+        return tuple(
+            (bodies_of(leg.chain), slice(*robot.starts[k : k + 2]), slice(*ends[k : k + 2]))
+            for k, leg in enumerate(robot.legs)
+        )
 
     def regressor(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, load: np.ndarray | None = None,
@@ -189,14 +177,12 @@ class ParallelModel:
         """Return W (N, r, p) on the platform's coordinates; its memory is ordered (p, r, N)."""
         robot, J = self.known.robot, motion.jacobians
         out = np.zeros((self.p, robot.r, len(motion.v)))
-        first = 0
-        for leg, bodies, a, b in zip(robot.legs, self.leg_bodies, robot.starts, robot.starts[1:]):
-            W = rigid_body.regressor(bodies, motion.posture.q[:, a:b], motion.v[:, a:b], motion.a[:, a:b])
-            count = 10 * leg.bodies
-            out[first : first + count] = np.einsum("njr,njc->crn", J.joints[:, a:b], W[:, :, :count], optimize=True)
-            first += count
+        for bodies, joints, columns in self.legs:
+            W = rigid_body.regressor(bodies, motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints])
+            W = W[:, :, : columns.stop - columns.start]
+            out[columns] = np.einsum("njr,njc->crn", J.joints[:, joints], W, optimize=True)
         own = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
-        self._fill_platform(out, first, (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0), carried)
+        self._fill_platform(out, (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0), carried)
         motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
         for k, one in enumerate(self.terms):
             for joint, column in one.acting(motions, np.zeros((0, len(motion.v)))):
@@ -216,12 +202,11 @@ class ParallelModel:
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the torques (N, n_t) of the opened legs with their drives, the platform taken off."""
-        robot, parts = self.known.robot, []
         own = [motion.posture.q, motion.v, motion.a]
-        for bodies, parameters, a, b in zip(
-            self.leg_bodies, self.leg_parameters(values), robot.starts, robot.starts[1:]
-        ):
-            parts.append(rigid_body.inverse_dynamics(bodies, parameters, *(x[:, a:b] for x in own)))
+        parts = [
+            rigid_body.inverse_dynamics(bodies, parameters, *(x[:, joints] for x in own))
+            for (bodies, joints, _), parameters in zip(self.legs, self.leg_parameters(values))
+        ]
         result = np.concatenate(parts, axis=1)
         for one, value in zip(self.terms, values[self.inertial :]):
             for joint, column in one.acting([*(x.T for x in own), None], np.zeros((0, len(result)))):
@@ -230,19 +215,15 @@ class ParallelModel:
 
     def leg_parameters(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the parameters of each leg's bodies, zero for a last link that is the platform."""
-        result, first = [], 0
-        for leg in self.known.robot.legs:
-            own = np.zeros(10 * leg.chain.n)
-            own[: 10 * leg.bodies] = values[first : first + 10 * leg.bodies]
-            result.append(own)
-            first += 10 * leg.bodies
-        return result
+        return [
+            np.append(values[columns], np.zeros(10 * bodies.count + columns.start - columns.stop))
+            for bodies, _, columns in self.legs
+        ]
 
     def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the ten parameters of the platform with what it carries."""
-        first = 10 * (len(self.labels) - len(self.payloads) - 1)
-        own = values[first : self.inertial].reshape(-1, 10)
-        present = [True, *(self._carries(label, carried) for label in self.payloads)]
+        own = values[self.legs[-1][2].stop : self.inertial].reshape(-1, 10)
+        present = [True, *(carried is None or label in carried for label in self.payloads)]
         return own[present].sum(axis=0)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
@@ -251,21 +232,20 @@ class ParallelModel:
 
     def energies(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the columns h (N, p) of kinetic and potential energy; zero for friction (eq. 3 of the power paper)."""
-        robot = self.known.robot
-        out, first = np.zeros((self.p, len(motion.v))), 0
-        for leg, bodies, a, b in zip(robot.legs, self.leg_bodies, robot.starts, robot.starts[1:]):
-            own = rigid_body.energies(bodies, motion.posture.q[:, a:b], motion.v[:, a:b])
-            out[first : first + 10 * leg.bodies] = own[:, : 10 * leg.bodies].T
-            first += 10 * leg.bodies
-        self._fill_platform(out, first, energy_columns(motion.posture.pose, motion.twist, robot.gravity).T, carried)
+        out = np.zeros((self.p, len(motion.v)))
+        for bodies, joints, columns in self.legs:
+            own = rigid_body.energies(bodies, motion.posture.q[:, joints], motion.v[:, joints])
+            out[columns] = own[:, : columns.stop - columns.start].T
+        platform = energy_columns(motion.posture.pose, motion.twist, self.known.robot.gravity)
+        self._fill_platform(out, platform.T, carried)
         drives.fill_energies(self.terms, out[self.inertial :], motion.v.T)
         return out.T
 
-    def _fill_platform(self, out: np.ndarray, first: int, own: np.ndarray, carried: Collection[str] | None) -> None:
+    def _fill_platform(self, out: np.ndarray, own: np.ndarray, carried: Collection[str] | None) -> None:
         """Write the platform's ten columns, and the same for each payload on board."""
-        for k, label in enumerate(("", *self.payloads)):
-            if not label or self._carries(label, carried):
-                out[first + 10 * k : first + 10 * k + 10] = own
+        for first, label in zip(range(self.legs[-1][2].stop, self.inertial, 10), (None, *self.payloads)):
+            if label is None or carried is None or label in carried:
+                out[first : first + 10] = own
 
     def acting(self) -> np.ndarray:
         states = self.sample(4, np.random.default_rng(0))
@@ -276,8 +256,8 @@ class ParallelModel:
 
         Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
         """
-        order = np.concatenate([bodies.order[: leg.bodies] for leg, bodies in self._pairs()])
-        kinds = np.concatenate([bodies.kinds[: leg.bodies] for leg, bodies in self._pairs()])
+        own = [(bodies, (columns.stop - columns.start) // 10) for bodies, _, columns in self.legs]
+        order, kinds = (np.concatenate([getattr(b, key)[:k] for b, k in own]) for key in ("order", "kinds"))
         ranks: dict[str, list[int]] = {"moments": [], "inertias": [], "late": []}
         for i, (own, kind) in enumerate(zip(order, kinds)):
             last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
@@ -310,12 +290,6 @@ class ParallelModel:
         if len(parts) < len(robot.legs) or robot.platform is None:
             return None
         return np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
-
-    def _pairs(self) -> list:
-        return list(zip(self.known.robot.legs, self.leg_bodies))
-
-    def _carries(self, label: str, carried: Collection[str] | None) -> bool:
-        return carried is None or label in carried
 
     def _on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return rows (N, rows, p) of those on the platform's coordinates."""
