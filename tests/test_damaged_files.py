@@ -14,6 +14,7 @@ import planted_motion as planted
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from option_files import FILES
 from strategies import damaged
 
 from calib.data.poses.fit_options import read_options
@@ -29,19 +30,11 @@ from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.session.folder import Session, read_state
-from calib.procedure.session.settings import (
-    DynamicsSection,
-    FitSection,
-    InstrumentSection,
-    PosesSection,
-    RobotSection,
-    SessionSettings,
-    read_settings,
-    written,
-)
+from calib.procedure.session.settings import read_settings
 from calib.robot import description
 from calib.robot.formats import urdf_write
 from calib.robot.load import load
+from calib.robot.tables import dumps
 from calib.rooms.camera.board import Board, read_board, write_board
 from calib.rooms.camera.camera_info import read_lens, write_lens
 from calib.rooms.camera.lens import pinhole
@@ -77,14 +70,9 @@ def log() -> bytes:
     return "\n".join([head, *(",".join(f"{x:.7g}" for x in row) for row in table), ""]).encode()
 
 
-FIT_OPTIONS = (
-    b'kind = "position"\n[sigma]\nposition = [1e-5, 1e-5, 2e-5]\n[prior]\ntheta2 = 1e-3\n[where]\ntool = ["a"]\n'
-)
-IDENTIFY_OPTIONS = b"gains = [1.0, 2.0, 3.0]\n[filter]\ncutoff = 20.0\n[payload.tool]\nmass = 2.8\ncom = [0, 0, 0.05]\n"
-TRAJECTORY = (
-    b'robot = "ur5"\nfamily = "fourier"\nperiod = 20.0\nrate = 1000.0\nrepeat = 5\n'
-    b'[[joint]]\nname = "a"\nq0 = 0.1\na = [0.1]\nb = [0.2]\n'
-)
+def documented(kind: str, write: Callable[[Any], str] = dumps) -> Callable[[Path], bytes]:
+    table = {key: value for key, value in FILES[kind][0].items() if key != "camera"}  # which is a file beside it
+    return lambda tmp: write(table).encode()
 
 
 def in_folder(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
@@ -131,28 +119,8 @@ def look(path: Path) -> None:
 
 
 TURNED = b"q1,q2,q3,x,y,z,qx,qy,qz,qw\n" + b"0.1,0.2,0.3,0.4,0.5,0.6,0,0,0,1\n0.2,0.1,0.3,0.4,0.5,0.6,0,0,0,1\n" * 4
-SESSION = SessionSettings(
-    "a", "2026-11-22", 0, RobotSection("r.toml"), InstrumentSection("tracker", "position"), PosesSection(),
-    FitSection(), DynamicsSection(),
-)  # fmt: skip
 
 
-STATE = json.dumps(
-    {
-        "schema": 2, "running": "fit",
-        "steps": {"poses": {
-            "finished": "2026-11-22", "inputs": {"robot.toml": "ab"}, "outputs": {"2-poses/poses.csv": "cd"},
-            "seconds": 1.5, "command": "calib select", "seed": 3, "notes": ["said"],
-        }},
-    }
-).encode()  # fmt: skip
-LIMITS = (
-    b'[joints]\nmargin = 0.02\n[[obstacle]]\nname = "wall"\nkind = "box"\nsize = [0.1, 1, 1]\nxyz = [1, 0, 0]\n'
-    b'[instrument]\nxyz = [3, 0, 1]\nsight = "40 deg"\n[target]\nfacing = [0, 0, 1]\nheight = [0.2, 1.5]\n'
-)
-MOTION_LIMITS = (
-    b"[velocity]\nall = 1.0\n[acceleration]\nall = 8.0\n[torque]\nmargin = 0.1\n[frequency]\nresonance = 5.0\n"
-)
 BOARD = Board(columns=5, rows=4, marker=0.02)
 ARM = load("ur5")
 KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], Any]]] = {
@@ -168,19 +136,21 @@ KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], Any]]] = {
     "plan": ("p.csv", lambda tmp: poses("joint1,joint2,joint3"), lambda path: read_poses(path, JOINTS)),
     "log": ("l.csv", lambda tmp: log(), lambda path: read_recording(path, Joints(JOINTS))),
     "archive": ("l.npz", lambda tmp: archive(), lambda path: read_recording(path, Joints(JOINTS))),
-    "fit options": ("o.toml", lambda tmp: FIT_OPTIONS, read_options),
-    "identify options": ("o.toml", lambda tmp: IDENTIFY_OPTIONS, identify_options.read_options),
+    "fit options": ("o.toml", documented("options"), read_options),
+    "identify options": ("o.toml", documented("identify-options"), identify_options.read_options),
     "robot.toml": ("r.toml", robot_toml, lambda path: load(path)),
     "urdf": ("r.urdf", lambda tmp: urdf_write.write_new(ARM).encode(), lambda path: load(path)),
-    "trajectory": ("trajectory.toml", lambda tmp: TRAJECTORY, in_folder(coefficients.read)),
+    "trajectory": ("trajectory.toml", documented("trajectory"), in_folder(coefficients.read)),
     "waypoints": (
         "w.csv", lambda tmp: poses("q1,q2,q3,q4,q5,q6"), lambda path: read_waypoints(path, ARM, ARM.lower, ARM.upper),
     ),
     "targets": ("t.csv", lambda tmp: poses("x,y,z,q1,q2,q3"), lambda path: read_targets(path, JOINTS)),
-    "session.toml": ("session.toml", lambda tmp: written(SESSION).encode(), read_settings),
-    "state.json": ("state.json", lambda tmp: STATE, lambda path: read_state(Session(path.parent, SESSION))),
-    "constraints": ("c.toml", lambda tmp: LIMITS, lambda path: read_limits(path, targets_of(ARM))),
-    "motion limits": ("l.toml", lambda tmp: MOTION_LIMITS, lambda path: read_motion_limits(path, ARM)),
+    "session.toml": ("session.toml", documented("session"), read_settings),
+    "state.json": (
+        "state.json", documented("state", json.dumps), in_folder(lambda folder: read_state(Session(folder, None))),
+    ),
+    "constraints": ("c.toml", documented("constraints"), lambda path: read_limits(path, targets_of(ARM))),
+    "motion limits": ("l.toml", documented("limits"), lambda path: read_motion_limits(path, ARM)),
     "image": ("i.png", picture, look),
     "corners": ("corners.csv", corner_table, lambda path: read_corners(path, BOARD)),
     "board": ("board.toml", lambda tmp: write_board(BOARD, tmp / "made_board.toml").read_bytes(), read_board),
