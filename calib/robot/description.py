@@ -43,8 +43,21 @@ import numpy as np
 from calib import files
 from calib.errors import RobotError, refuse_robot, require
 from calib.robot import mdh
-from calib.robot.chain import GRAVITY, Chain, Element, Joint
-from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector, word
+from calib.robot.chain import Chain, Element, Joint
+from calib.robot.tables import (
+    LIMITS,
+    chain_head,
+    chain_table,
+    check_keys,
+    dumps,
+    finite_limits,
+    load,
+    number,
+    placement,
+    placement_table,
+    vector,
+    word,
+)
 from calib.words import listing
 
 TURNS = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
@@ -74,15 +87,11 @@ def unstated_limits(chain: Chain) -> tuple[str, ...]:
 
 def _turns(chain: Chain) -> tuple[str, ...]:
     """Return in words the limits of revolute joints beyond two turns either way."""
-    wide = {joint.name: _furthest(joint) for joint in chain.joints if joint.unit != "m"}
+    wide = {joint.name: max(-joint.lower, joint.upper) for joint in chain.joints if joint.unit != "m"}
     wide = {name: angle for name, angle in wide.items() if TURNS < angle < np.inf}
     if not wide:
         return ()
     return (f"{listing(wide, 4)}: limits up to {max(wide.values()):g} rad in the robot's description; degrees?",)
-
-
-def _furthest(joint: Joint) -> float:
-    return max(-joint.lower, joint.upper)
 
 
 def _massless(chain: Chain) -> tuple[str, ...]:
@@ -146,8 +155,7 @@ def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_exc
 
 EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
 _TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
-_LIMITS = ("lower", "upper", "velocity", "effort")
-_JOINT = ("name", "kind", *_LIMITS, "link", "inertia")
+_JOINT = ("name", "kind", *LIMITS, "link", "inertia")
 _ELEMENT = tuple(field.name for field in fields(Element))
 
 
@@ -198,18 +206,11 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None
         extra: tables by name, of `EXTRA`, kept as they are.
         source: where the numbers come from.
     """
-    return files.write(path, _text(chain, extra, source))
-
-
-def _text(chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> str:
-    """Return what `write` writes."""
     check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
-    as_rows = mdh.is_table(chain) and not chain.links
-    table = mdh.to_table(chain) if as_rows else _to_elements(chain)
+    table = mdh.to_table(chain) if mdh.is_table(chain) and not chain.links else _to_elements(chain)
     head = {key: value for key, value in table.items() if not isinstance(value, (list, dict)) or key == "gravity"}
-    if source:
-        head["source"] = source
-    return dumps({**head, **{key: value for key, value in table.items() if key not in head}, **(extra or {})})
+    head |= {"source": source} if source else {}
+    return files.write(path, dumps(head | table | dict(extra or {})))
 
 
 def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
@@ -218,27 +219,19 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
     for index, entry in enumerate(_tables(table, "joint", where)):
         place = f"{where}, [[joint]] number {index + 1}"
         check_keys(entry, _JOINT, place)
-        limits: dict[str, Any] = {key: number(entry[key], f"{place}, {key}") for key in _LIMITS if key in entry}
+        limits: dict[str, Any] = {key: number(entry[key], f"{place}, {key}") for key in LIMITS if key in entry}
         joints.append(Joint(word(entry, "name", place), word(entry, "kind", place, "revolute"), **limits))
         inertias.append(vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
         links.append(word(entry, "link", place) if "link" in entry else None)
     if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
         refuse_robot(where, "some joints have an inertia and some have none")
-    entries = _tables(table, "element", where)
+    elements = enumerate(_tables(table, "element", where), 1)
     return Chain(
-        name=word(table, "name", where),
         joints=tuple(joints),
-        elements=tuple(
-            _element(entry, len(joints), f"{where}, [[element]] number {index + 1}")
-            for index, entry in enumerate(entries)
-        ),
-        base=word(table, "base", where, "base"),
-        tip=word(table, "tip", where, "tip"),
-        tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else np.eye(4),
+        elements=tuple(_element(one, len(joints), f"{where}, [[element]] number {i}") for i, one in elements),
         inertias=None if inertias[0] is None else np.array(inertias),
-        gravity=vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity"),
         links=tuple(links) if all(links) else (),
-        floor=number(table.get("floor", 0.0), f"{where}, floor", "length"),
+        **chain_head(table, where),
     )
 
 
@@ -266,29 +259,21 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
 
 
 def _to_elements(chain: Chain) -> dict[str, Any]:
-    table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
-    table["gravity"] = chain.gravity.tolist()
-    table |= {"floor": chain.floor} if chain.floor else {}
-    table["joint"], table["element"] = [], []
+    joints, elements = [], []
     for index, joint in enumerate(chain.joints):
-        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind}
-        entry |= {key: getattr(joint, key) for key in _LIMITS if np.isfinite(getattr(joint, key))}
+        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind, **finite_limits(joint)}
         if chain.links:
             entry["link"] = chain.links[index]
         if chain.inertias is not None:
-            entry["inertia"] = chain.inertias[index].tolist()
-        table["joint"].append(entry)
+            entry["inertia"] = chain.inertias[index]
+        joints.append(entry)
     for element in chain.elements:
-        entry = {"name": element.name, "axis": element.axis, "value": element.value, "owner": element.owner}
-        if element.joint is not None:
-            entry["joint"] = element.joint
+        entry = {key: getattr(element, key) for key in ("name", "axis", "value", "owner", "joint")}
         entry |= {key: getattr(element, key) for key in ("ratio", "sign") if getattr(element, key) != 1.0}
         if element.placement is not None:
             entry["placement"] = placement_table(element.placement)
-        table["element"].append(entry)
-    if not np.array_equal(chain.tail, np.eye(4)):
-        table["tail"] = placement_table(chain.tail)
-    return table
+        elements.append(entry)
+    return chain_table(chain, joint=joints, element=elements)
 
 
 def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:

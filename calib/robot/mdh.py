@@ -43,20 +43,18 @@ The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.errors import RobotError, one_of, refuse_robot, require
-from calib.robot.chain import GRAVITY, Chain, Element, Joint
-from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector, word
+from calib.robot.chain import Chain, Element, Joint
+from calib.robot.tables import LIMITS, chain_head, chain_table, check_keys, finite_limits, number, spelled, vector, word
 
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
 TOP = ("name", "base", "tip", "gravity", "floor", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
-_LIMITS = ("lower", "upper", "velocity", "effort")
-_ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *_LIMITS, "inertia")
+_ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *LIMITS, "inertia")
 _ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
 
 
@@ -82,15 +80,6 @@ class Row:
         one_of(self.kind, KINDS, f"row '{self.name}': kind", RobotError)
 
 
-def read(path: str | Path, propose_beta: bool = True) -> Chain:
-    """Read an MDH table from a TOML file (schema above).
-
-    Raises:
-        RobotError: naming the row, the key and what is wrong with it.
-    """
-    return from_table(load(path), str(path), propose_beta)
-
-
 def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
     check_keys(table, TOP, where)
@@ -101,36 +90,16 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
     for position, entry in enumerate(table["joint"]):
         rows.append(_row(entry, rows[-1].index + 1 if rows else 1, f"{where}, [[joint]] number {position + 1}"))
-    return chain(
-        word(table, "name", where),
-        rows,
-        base=word(table, "base", where, "base"),
-        tip=word(table, "tip", where, "tip"),
-        tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else None,
-        gravity=vector(table["gravity"], 3, f"{where}, gravity") if "gravity" in table else None,
-        floor=number(table.get("floor", 0.0), f"{where}, floor", "length"),
-        propose_beta=propose_beta and proposed,
-    )
+    return chain(rows=rows, propose_beta=propose_beta and proposed, **chain_head(table, where))
 
 
-def chain(
-    name: str,
-    rows: Sequence[Row],
-    base: str = "base",
-    tip: str = "tip",
-    tail: np.ndarray | None = None,
-    gravity: np.ndarray | None = None,
-    floor: float = 0.0,
-    propose_beta: bool = True,
-) -> Chain:
+def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **more: Any) -> Chain:
     """Return the chain of MDH rows.
 
     Args:
         rows: base to tip.
-        tail: (4, 4), what follows the last row.
-        gravity: (3,) in the base frame [m/s²].
-        floor: see `Chain`.
         propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the moving one before.
+        more: other fields of `Chain`: base, tip, tail, gravity, floor.
     """
     moving = [row for row in rows if row.kind != "fixed"]
     require(moving, f"robot '{name}': every row is fixed; at least one has to be revolute or prismatic", RobotError)
@@ -144,17 +113,9 @@ def chain(
     known = [row.inertia is not None for row in moving]
     if any(known) and not all(known):
         refuse_robot(f"robot '{name}'", f"row '{moving[known.index(False)].name}' has no inertia while others have")
-    return Chain(
-        name=name,
-        joints=tuple(Joint(row.name, row.kind, row.lower, row.upper, row.velocity, row.effort) for row in moving),
-        elements=tuple(elements),
-        base=base,
-        tip=tip,
-        tail=np.eye(4) if tail is None else tail,
-        inertias=np.array([row.inertia for row in moving], dtype=float) if all(known) else None,
-        gravity=np.array(GRAVITY) if gravity is None else gravity,
-        floor=floor,
-    )
+    joints = tuple(Joint(row.name, row.kind, row.lower, row.upper, row.velocity, row.effort) for row in moving)
+    inertias = np.array([row.inertia for row in moving], dtype=float) if all(known) else None
+    return Chain(name, joints, tuple(elements), inertias=inertias, **more)
 
 
 def rows(chain: Chain) -> tuple[Row, ...]:
@@ -190,13 +151,8 @@ def is_table(chain: Chain) -> bool:
 
 def to_table(chain: Chain) -> dict[str, Any]:
     """Return the table (schema above) that `from_table` reads back exactly."""
-    table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
-    table |= {"gravity": chain.gravity.tolist(), "propose_beta": False}
-    table |= {"floor": chain.floor} if chain.floor else {}
-    table["joint"] = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
-    if not np.array_equal(chain.tail, np.eye(4)):
-        table["tail"] = placement_table(chain.tail)
-    return table
+    entries = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
+    return chain_table(chain, propose_beta=False, joint=entries)
 
 
 def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
@@ -251,7 +207,7 @@ def _row(entry: Any, index: int, where: str) -> Row:
     quantity |= {"velocity": "angular speed", "effort": "torque"}
     if kind == "prismatic":
         quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
-    if kind == "fixed" and (extra := [key for key in (*_LIMITS, "inertia") if key in entry]):
+    if kind == "fixed" and (extra := [key for key in (*LIMITS, "inertia") if key in entry]):
         refuse_robot(where, f"a fixed row has no '{extra[0]}'")
     numbers = {key: number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
     inertia = tuple(vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
@@ -267,7 +223,7 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     position = moved[0].joint or 0
     joint = chain.joints[position]
     inertia = None if chain.inertias is None else tuple(chain.inertias[position].tolist())
-    limits = {key: getattr(joint, key) for key in _LIMITS}
+    limits = {key: getattr(joint, key) for key in LIMITS}
     return Row(name=joint.name, index=index, kind=joint.kind, inertia=inertia, **values, **limits)
 
 
@@ -281,7 +237,7 @@ def _entry(row: Row, expected: int) -> dict[str, Any]:
     for key in ("alpha", "d", "beta", "theta", "r"):
         if (value := getattr(row, key)) is not None:
             entry[key] = spelled(value) if AXES[key][0] == "r" else value
-    entry |= {key: getattr(row, key) for key in _LIMITS if np.isfinite(getattr(row, key))}
+    entry |= finite_limits(row)
     if row.inertia is not None:
         entry["inertia"] = list(row.inertia)
     return entry

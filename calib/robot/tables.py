@@ -15,9 +15,12 @@ import tomlkit
 from calib import config, config_types
 from calib.config_types import shown
 from calib.errors import RobotError, refuse_robot
+from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 _PI = {math.pi: "pi", -math.pi: "-pi", math.pi / 2: "pi/2", -math.pi / 2: "-pi/2"}
+
+LIMITS = ("lower", "upper", "velocity", "effort")
 
 load = partial(config.read_toml, error=RobotError)
 check_keys = partial(config.check_keys, error=RobotError)
@@ -75,6 +78,29 @@ def placement_table(transform: np.ndarray) -> dict[str, list]:
 def spelled(angle: float) -> float | str:
     """Return pi and pi/2 as a person writes them, and any other number as it is."""
     return _PI.get(angle, angle)
+
+
+def chain_head(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return what of a `Chain` a robot's table states beside its joints: name, ends, tail, gravity, floor."""
+    head: dict[str, Any] = {"name": word(table, "name", where)}
+    head |= {key: word(table, key, where) for key in ("base", "tip") if key in table}
+    if "tail" in table:
+        head["tail"] = placement(table["tail"], f"{where}, [tail]")
+    if "gravity" in table:
+        head["gravity"] = vector(table["gravity"], 3, f"{where}, gravity")
+    return head | {"floor": number(table.get("floor", 0.0), f"{where}, floor", "length")}
+
+
+def chain_table(chain: Chain, **rows: Any) -> dict[str, Any]:
+    """Return the table that `chain_head` reads back exactly, with `rows` before its tail."""
+    table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
+    table |= {"gravity": chain.gravity.tolist(), **({"floor": chain.floor} if chain.floor else {}), **rows}
+    return table if np.array_equal(chain.tail, np.eye(4)) else {**table, "tail": placement_table(chain.tail)}
+
+
+def finite_limits(joint: Any) -> dict[str, float]:
+    """Return the limits of a joint, or of its row, that are known, by their names."""
+    return {key: value for key in LIMITS if np.isfinite(value := getattr(joint, key))}
 
 
 def _plain(value: Any) -> Any:

@@ -30,7 +30,6 @@ class Heights(PoseMeasurements):
 
     kind: ClassVar[str] = "height"
     has_instrument: ClassVar[bool] = True
-    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "height", "sigma")
 
 
 @parts.register

@@ -47,7 +47,7 @@ def test_calibrated_tables_round_trip_as_tables(name, tmp_path):
     path = description.write(tmp_path / "robot.toml", chain)
     assert same(description.read(path), chain) and same(load(tmp_path), chain)
     assert "[[joint]]" in path.read_text() and "[[element]]" not in path.read_text()
-    assert same(mdh.read(path), chain)
+    assert same(description.read(path), chain)
 
 
 def test_any_chain_round_trips(tmp_path):
@@ -58,7 +58,7 @@ def test_any_chain_round_trips(tmp_path):
 
 
 def test_a_table_without_proposed_beta_stays_so(tmp_path):
-    chain = mdh.read(library.path("ur10"), propose_beta=False)
+    chain = description.read(library.path("ur10"), propose_beta=False)
     path = description.write(tmp_path / "robot.toml", chain)
     assert description.read(path).names == chain.names
     assert "beta3" in description.read(library.path("ur10")).names

@@ -8,10 +8,10 @@ from differences import check
 from robot_oracle import axis, joint, robot
 
 from calib.errors import RobotError
-from calib.robot import library, mdh
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.kinematics import forward, jacobian, joint_frames, tip_jacobian
+from calib.robot.load import load
 from calib.transforms import rotation_vector
 
 ZOO = robot(
@@ -24,7 +24,7 @@ ZOO = robot(
     joint("e", "fixed", "four", "tip", "", "0.1 0.2 0.3", "0.4 0.5 0.6"),
     links="base one two three four tip",
 )
-CHAINS = [mdh.read(library.path("ur10")), mdh.read(library.path("lwr4plus")), urdf.parse(ZOO, "zoo", "base", "tip")]
+CHAINS = [load("ur10"), load("lwr4plus"), urdf.parse(ZOO, "zoo", "base", "tip")]
 
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda chain: chain.name)

@@ -7,7 +7,7 @@ import pytest
 from robot_oracle import pinocchio_poses
 
 from calib.errors import RobotError
-from calib.robot import mdh
+from calib.robot import description, mdh
 from calib.robot.chain import random_joints
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward, joint_frames
@@ -188,6 +188,6 @@ def test_toml_syntax_is_complained_about_with_the_line(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text('name = "x"\n[[joint]\n')
     with pytest.raises(RobotError, match=r"bad\.toml: is no TOML: .*line 2"):
-        mdh.read(path)
+        description.read(path)
     with pytest.raises(RobotError, match=r"absent\.toml: cannot be read: No such file"):
-        mdh.read(tmp_path / "absent.toml")
+        description.read(tmp_path / "absent.toml")

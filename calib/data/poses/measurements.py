@@ -7,7 +7,7 @@ residual function registered for the type in `calib.geometry.residuals`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -34,7 +34,6 @@ class PoseMeasurements:
         kind: its name in files.
         has_instrument: whether rows are seen from a station whose placement matters.
         placing: rank among kinds in how well they place instrument and target, the best ones 0.
-        per_row: fields that hold one entry per row (None where not stated), of whole numbers in `_COUNTS`.
     """
 
     q: np.ndarray
@@ -51,7 +50,6 @@ class PoseMeasurements:
     kind: ClassVar[str] = ""
     has_instrument: ClassVar[bool] = False
     placing: ClassVar[int] = 4
-    per_row: ClassVar[tuple[str, ...]] = ("q", "tool", "rows")
 
     def __post_init__(self) -> None:
         m = len(self.q)
@@ -89,6 +87,11 @@ class PoseMeasurements:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def per_row(self) -> list[str]:
+        """The fields with one entry per row (None where not stated): all arrays; of whole numbers in `_COUNTS`."""
+        return [field.name for field in fields(self) if "ndarray" in str(field.type)]
 
     @property
     def together(self) -> np.ndarray:
@@ -130,7 +133,6 @@ class Positions(PoseMeasurements):
     kind: ClassVar[str] = "position"
     has_instrument: ClassVar[bool] = True
     placing: ClassVar[int] = 2
-    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "position", "sigma")
 
     @property
     def measured(self) -> np.ndarray:
@@ -153,7 +155,6 @@ class Poses(Positions):
 
     kind: ClassVar[str] = "pose"
     placing: ClassVar[int] = 0
-    per_row: ClassVar[tuple[str, ...]] = (*Positions.per_row, "quaternion", "sigma_rotation")
 
     @property
     def measured(self) -> np.ndarray:
@@ -175,8 +176,6 @@ class GroupedMeasurements(PoseMeasurements):
     group_names: tuple[str, ...] = ()
     sigma: np.ndarray | None = None
 
-    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "group", "sigma")
-
     @property
     def measured(self) -> np.ndarray:
         return self.group[:, None].astype(float)
@@ -193,7 +192,6 @@ class Distances(GroupedMeasurements):
     distance: np.ndarray
 
     kind: ClassVar[str] = "distance"
-    per_row: ClassVar[tuple[str, ...]] = (*GroupedMeasurements.per_row, "distance")
 
     @property
     def together(self) -> np.ndarray:
@@ -215,7 +213,6 @@ class Bars(GroupedMeasurements):
     distance: np.ndarray
 
     kind: ClassVar[str] = "bar"
-    per_row: ClassVar[tuple[str, ...]] = (*GroupedMeasurements.per_row, "distance")
 
     @property
     def measured(self) -> np.ndarray:

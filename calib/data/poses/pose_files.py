@@ -226,19 +226,17 @@ def read_measurements(
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
     options = options or FileOptions()
-    if options.format == "three_smr":
-        table, options, notes = robodk.read_three_smr(path, len(joints), options)
-    elif options.format == "robodk" or (not options.format and robodk.recognises(read_header(path)[0])):
-        table, options, notes = robodk.read_robodk(path, len(joints), options)
-    else:
-        table, notes = read_table(path), ()
-    sheet = _select_rows(Sheet(table, options))
+    form = options.format or ("robodk" if robodk.recognises(read_header(path)[0]) else "csv")
+    table, notes = None, ()
+    if form in robodk.FORMS:
+        table, options, notes = robodk.FORMS[form](path, len(joints), options)
+    sheet = _select_rows(Sheet(table or read_table(path), options))
     layout = find_layout(sheet, joints)
     q, _ = sheet.joints(joints)
     notes = (*notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, joints, kinds, limits))
     block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
-    station = options.station or Path(table.file).stem
+    station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
 
 

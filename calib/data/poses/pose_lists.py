@@ -58,9 +58,8 @@ from calib.data.poses.plausible import Limits
 from calib.data.schema import BOUNDS
 from calib.errors import MeasurementError
 from calib.units import ANGLES, LENGTHS
+from calib.words import listing
 
-DIGITS = 9  # of one number or more in a row that was computed: values typed by a person have fewer (our choice)
-_DIGIT = re.compile(r"\d")
 MAX_JOINT_DIFFERENCE = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
 
 
@@ -139,9 +138,9 @@ def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX
     notes = []
     if not (hit := _matched(q, plan, near)).all():
         missing = np.flatnonzero(~hit) + 1
-        notes.append(f"{len(missing)} of {len(plan)} planned poses were not measured: {_listed(missing)}")
+        notes.append(f"{len(missing)} of {len(plan)} planned poses were not measured: {listing(missing, 10)}")
     if not matched.all():
-        notes.append(f"{int((~matched).sum())} rows were not planned: {_listed(rows[~matched])}")
+        notes.append(f"{int((~matched).sum())} rows were not planned: {listing(rows[~matched], 10)}")
     return tuple(notes)
 
 
@@ -201,10 +200,6 @@ def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
                 missed = KDTree(sign * q[:, k : k + 1]).query(plan[:, j : j + 1])[0]
                 cost[s, j, k] = np.minimum(taken, 1.0).mean() + np.minimum(missed, 1.0).mean() + 1e-9 * s
     return assigned(cost)
-
-
-def _listed(numbers: np.ndarray) -> str:
-    return ", ".join(str(number) for number in numbers[:10]) + (", ..." if len(numbers) > 10 else "")
 
 
 SUFFIXES = ("", "_target")

@@ -19,7 +19,7 @@ columns of padding, joints [deg] last; 18 to 21 columns for six joints. A reflec
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +28,9 @@ import numpy as np
 from calib.arrays import frozen
 from calib.data.csv_table import Table, read_header, read_table, row_width
 from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.plausible import turns
 from calib.errors import MeasurementError, refuse_data, require
+from calib.units import DEG
 
-QUATERNION = ("qx", "qy", "qz", "qw")
 _POSE_MARKS = ("w", "rx", "r", "a")
 
 Read = tuple[Table, FileOptions, tuple[str, ...]]
@@ -55,21 +54,28 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
     require(joints == 6, f"RoboDK's form has 6 joints, the robot has {joints}", MeasurementError, path)
     pose = len(found) == 18 or (len(found) == 12 and _plain(found[9]) in _POSE_MARKS)
     if len(found) not in (9, 12, 18):
-        message = f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18"
-        refuse_data(path, message)
+        refuse_data(path, f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18")
     raw = read_table(path, doubles=True)
     measured = 12 if pose else 9
     tcp = tuple(f"TCP {name}" for name in "xyzwpr"[: len(found) - measured])
     names = (*found[:6], *"xyzwpr"[: measured - 6], *tcp)
-    units = tuple(unit or ("deg" if i < 6 else "mm" if i < 9 else "") for i, unit in enumerate(raw.units))
-    table, notes = _with_tools(Table(raw.file, names, units, raw.cells, raw.rows), tcp, options)
-    if pose:
-        table, more = _with_quaternion(table, options)
-        notes += more
+    silent = pose and not options.units.get("orientation") and not any(raw.units[9:12])
+    usual = ("deg",) * 6 + ("mm",) * 3 + ("deg" if silent else "",) * 3 + ("",) * 6
+    table = replace(raw, header=names, units=tuple(own or unit for own, unit in zip(raw.units, usual)))
+    table, notes = _with_tools(table, tcp, options)
     columns = {**options.columns, **{f"q{i + 1}": name for i, name in enumerate(names[:6])}}
-    kind = options.kind or ("pose" if pose else "position")
+    kind, euler = options.kind or ("pose" if pose else "position"), options.euler
+    if pose:
+        columns |= {"rx": "w", "ry": "p", "rz": "r"}
+        euler = euler or "wpr"
+        meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}
+        notes += (f"w p r are taken as {meaning.get(euler, euler)}; other conventions: euler in the options",)
+        if silent and max(np.abs(table.numbers(name, "angle")).max() for name in "wpr") < 1.001 * np.pi * DEG:
+            message = "all angles are within ±3.15: deg as RoboDK's manual says, or rad as its macro takes them?"
+            message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
+            table.fail(message, "w", 0)
     read = f"read as RoboDK's {kind}s: joints in deg, positions in mm where the header says nothing else"
-    return table, replace(options, columns=columns, kind=kind), (read, *notes)
+    return table, replace(options, columns=columns, kind=kind, euler=euler), (read, *notes)
 
 
 def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
@@ -78,8 +84,7 @@ def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
     width = row_width(path)
     padding = width - 9 - joints
     if padding < 0:
-        message = f"has {width} columns; three reflectors and {joints} joints need {9 + joints}"
-        refuse_data(path, message)
+        refuse_data(path, f"has {width} columns; three reflectors and {joints} joints need {9 + joints}")
     names = (*targets, *(f"padding {i + 1}" for i in range(padding)), *(f"q{i + 1}" for i in range(joints)))
     raw = read_table(path, header=names)
     cells = list(raw.cells)
@@ -87,37 +92,12 @@ def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
         triple = [raw.numbers(name, gaps=True) for name in targets[k : k + 3]]
         unseen = np.all([values == 0 for values in triple], axis=0)
         cells[k : k + 3] = [frozen(np.where(unseen, np.nan, values)) for values in triple]
-    table = Table(raw.file, names, ("mm",) * 9 + ("",) * padding + ("deg",) * joints, tuple(cells), raw.rows)
+    table = replace(raw, units=("mm",) * 9 + ("",) * padding + ("deg",) * joints, cells=tuple(cells))
     return table, options, (f"read as three reflectors, {padding} columns of padding, {joints} joints",)
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-def _with_quaternion(table: Table, options: FileOptions) -> tuple[Table, tuple[str, ...]]:
-    """Return the table with w p r (columns 9 to 11) replaced by a quaternion."""
-    unit = options.units.get("orientation", "")
-    angles = np.stack([table.numbers(name, "angle", unit) for name in ("w", "p", "r")], axis=1)
-    if not unit and not any(table.units[9:12]):
-        if np.abs(angles).max() < 1.001 * np.pi:
-            message = "all angles are within ±3.15: deg as RoboDK's manual says, or rad as its macro takes them?"
-            message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
-            table.fail(message, "w", 0)
-        angles = np.deg2rad(angles)
-    euler = options.euler or "wpr"
-    meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}.get(euler, euler)
-    quaternion = tuple(frozen(column) for column in turns(angles, table, ("w", "p", "r"), euler).T)
-    return (
-        Table(
-            table.file,
-            (*table.header[:9], *QUATERNION, *table.header[12:]),
-            (*table.units[:9], "", "", "", "", *table.units[12:]),
-            (*table.cells[:9], *quaternion, *table.cells[12:]),
-            table.rows,
-        ),
-        (f"w p r are taken as {meaning}; other conventions: euler in the options",),
-    )
 
 
 def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple[Table, tuple[str, ...]]:
@@ -128,9 +108,11 @@ def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple
     labels = {triple: f"{options.tool} {k + 1}" for k, triple in enumerate(dict.fromkeys(triples))}
     if len(labels) == 1:
         return table, ()
-    told = "; ".join(f"{label}: {', '.join(f'{value:g}' for value in triple)}" for triple, label in labels.items())
+    values = "; ".join(f"{label}: {', '.join(f'{value:g}' for value in triple)}" for triple, label in labels.items())
     cells = (*table.cells, np.array([labels[triple] for triple in triples], dtype=object))
-    return (
-        Table(table.file, (*table.header, "tool"), (*table.units, ""), cells, table.rows),
-        (f"{len(labels)} different TCPs, hence as many tools ({told})",),
-    )
+    table = replace(table, header=(*table.header, "tool"), units=(*table.units, ""), cells=cells)
+    return table, (f"{len(labels)} different TCPs, hence as many tools ({values})",)
+
+
+FORMS: dict[str, Callable[[str | Path, int, FileOptions], Read]] = {"robodk": read_robodk, "three_smr": read_three_smr}
+"""The readers of the options' ``format``; other files are plain tables."""

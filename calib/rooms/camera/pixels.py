@@ -46,7 +46,6 @@ class Pixels(PoseMeasurements):
     kind: ClassVar[str] = IMAGES
     placing: ClassVar[int] = 1
     has_instrument: ClassVar[bool] = True
-    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "pixel", "sigma")
 
     @property
     def seen(self) -> np.ndarray:
