@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from calib.api.dynamic import DynamicsModel, identify_dynamics, methods
-    from calib.api.exporting import export
+    from calib.api.exporting import export, validate
     from calib.api.kinematic import GeometryFit, JointCommands, PoseSelection, compensate, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
     from calib.api.sessions import new_session, run_sessions
-    from calib.api.validating import validate
     from calib.errors import CalibError
     from calib.identification.identify_options import IdentifySettings
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
@@ -40,8 +39,7 @@ _HOMES = {
     "api.kinematic": ("select_poses", "fit_geometry", "compensate", "PoseSelection", "GeometryFit", "JointCommands"),
     "api.motions": ("design_excitation", "plan_motion", "ExcitationDesign", "MotionPlan"),
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
-    "api.validating": ("validate",),
-    "api.exporting": ("export",),
+    "api.exporting": ("validate", "export"),
     "api.sessions": ("new_session", "run_sessions"),
     "robot.calibrated": ("CalibratedChain",),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from calib.api.given import listed, optional, progress_shown
-from calib.api.rendering import Judged, data_frame
+from calib.api.rendering import Judged, data_frame, listed, optional, progress_shown
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require

@@ -1,17 +1,57 @@
-"""What leaves the toolkit: calibrated geometry and identified dynamics in the forms other programs read."""
+"""What leaves the toolkit: calibrated geometry and identified dynamics in the forms other programs read.
+
+Results held against measurements they have not seen.
+"""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, overload
 
-from calib.api.dynamic import DynamicsModel
-from calib.api.given import optional, saved
-from calib.api.kinematic import GeometryFit
+from calib.api.dynamic import DynamicsModel, Recorded
+from calib.api.kinematic import GeometryFit, Measured, Several
+from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
-from calib.errors import CalibWarning, RobotError, UsageError, refused_as
+from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
+from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.export import delivery, geometry
 from calib.procedure.export.identified import is_identified
+from calib.procedure.kinematic_stage import fit as arm_fit
+from calib.procedure.kinematic_stage import inputs as measured
 from calib.procedure.robot_kinds import MechanismResult, stage_of
 from calib.robot.load import resolve
+
+
+@overload
+def validate(result: GeometryFit, unseen: Several) -> GeometryFit: ...
+@overload
+def validate(result: DynamicsModel, unseen: Recorded | Sequence[Recorded]) -> DynamicsModel: ...
+@overload
+def validate(result: MechanismResult, unseen: Any) -> Any: ...
+@checked
+def validate(
+    result: GeometryFit | DynamicsModel | MechanismResult,
+    unseen: Measured | Recorded | Sequence[Measured | Recorded | Sequence[Measured]],
+) -> Any:
+    """Hold a result against poses or motion it has not seen, and judge it anew.
+
+    Args:
+        result: a fit or an identification; nothing is fitted again.
+        unseen: measurements or recordings, files or in memory, beside those it was judged on before.
+
+    Returns:
+        The same result with the errors on all unseen rows and the verdict that follows.
+
+    Raises:
+        MeasurementError: for files that cannot be right, naming row and column.
+    """
+    given = listed(unseen)
+    require(given, "validate: unseen: nothing is given to validate on", UsageError)
+    if isinstance(result, GeometryFit):
+        return arm_fit.assessed(result, measured.with_unseen(result.inputs, given, result.options, result.settings))
+    if not isinstance(result, DynamicsModel):
+        return result.with_unseen(given)
+    return arm_identify.assessed(result, result.inputs.with_unseen(given))
 
 
 @checked

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib import files
-from calib.api.given import listed, optional, progress_shown, saved
-from calib.api.rendering import Judged, data_frame
+from calib.api.rendering import Judged, data_frame, listed, optional, progress_shown, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -22,7 +21,7 @@ from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
-from calib.procedure.measuring import selection_prediction
+from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import plain
@@ -274,9 +273,7 @@ def fit_geometry(
     """
     progress = progress_shown(progress)
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
-    prediction = (
-        poses.prediction if isinstance(poses, PoseSelection) else poses and selection_prediction.read(Path(poses))
-    )
+    expected = poses.prediction if isinstance(poses, PoseSelection) else poses and prediction.read(Path(poses))
     if (stage := stage_of(robot, "fit", base, tip)) is not None:
         return stage.run(
             listed(measured), listed(validate), settings=settings, options=chosen, poses=poses, progress=progress
@@ -288,7 +285,7 @@ def fit_geometry(
     )
     if on_read is not None:
         on_read(given)
-    return GeometryFit(**vars(fit.run(given, chosen, settings, progress, prediction or None)))
+    return GeometryFit(**vars(fit.run(given, chosen, settings, progress, expected or None)))
 
 
 def read_fitted(folder: str | Path) -> compensation.Fitted:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, cast
 
-from calib.api.given import optional
+from calib.api.rendering import optional
 from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.api.given import listed, optional
+from calib.api.rendering import listed, optional
 from calib.arguments import checked
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import commands, fleet

@@ -15,7 +15,7 @@ import typer
 from typer.main import get_command
 
 import calib
-from calib.cli import dynamics, geometry, motion, session
+from calib.cli import dynamics, geometry, session
 from calib.extensions import offered
 from calib.workers.threads import limit_process
 
@@ -53,7 +53,7 @@ _FLAGS = (
 )
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
-for _group in (geometry.app, dynamics.app, motion.app, session.app, *offered("commands")):
+for _group in (geometry.app, dynamics.app, session.app, *offered("commands")):
     app.add_typer(_group)
 
 

@@ -40,7 +40,7 @@ def fit(
         selection: CSV of calib select, or its folder: what it predicted is held against what is found
     """
     from calib.api.kinematic import fit_geometry
-    from calib.cli.destination import check_destination
+    from calib.cli.shared import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import geometry_section
 

@@ -1,8 +1,8 @@
 """Designing exciting motions: a robot's regressor and limits handed to the package `trajectories`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +13,6 @@ from calib.errors import UsageError
 from calib.procedure.excitation.goals import SCALINGS, NamedGoal, objectives_of, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits, located
-from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings
@@ -31,8 +30,52 @@ from trajectories.design.verify import Verification, dense_motion, ensured
 from trajectories.errors import NothingFeasible
 from trajectories.fourier import fourier_family
 
+
+@dataclass(frozen=True)
+class DesignCondition:
+    """Condition number of the observation matrix, in its units and with columns of unit norm.
+
+    Where motions before count, too: of this motion alone, and of those before it.
+    """
+
+    raw: float
+    normalised: float
+    raw_alone: float | None = None
+    normalised_alone: float | None = None
+    raw_before: float | None = None
+    normalised_before: float | None = None
+
+    def table(self) -> dict[str, float]:
+        """Return the entry of ``metrics.json``."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class _DesignSetting:
+    """What was asked for: period [s], the columns to identify, and how many instants were verified."""
+
+    period: float
+    columns: tuple[str, ...]
+    instants_verified: int
+
+
+@dataclass(frozen=True)
+class _LimitMargin:
+    """What is left of a limit, as a share of its scale."""
+
+    share: float
+
+
+@dataclass(frozen=True)
+class DesignMetrics:
+    """The content of ``metrics.json``: condition number, what was asked for, the smallest margin of each limit."""
+
+    condition_number: DesignCondition
+    setting: _DesignSetting
+    margins: Mapping[str, _LimitMargin]
+
+
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
-OUTLOOK_EVALUATIONS = 240  # evaluations for a motion of another period, which is only looked at (our choice)
 INSTANTS = 1000  # over the period, at which condition numbers are reported
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
@@ -144,7 +187,8 @@ def search_motion(
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
     outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
-        outlook, predicted = _outlook(given, settings, problem, found, say)
+        say("what other periods would identify")
+        outlook, predicted = foretell(given, settings, problem, found, partial(_problem_of_period, given, settings))
     pairs = zip(problem.goals, found.values)
     reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
@@ -156,24 +200,9 @@ def search_motion(
     )  # fmt: skip
 
 
-def _outlook(
-    given: ExcitationInputs,
-    settings: ExcitationSettings,
-    problem: ExcitationProblem,
-    found: SearchResult,
-    say: Progress,
-) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return what a motion is predicted to identify, and what others of other periods would."""
-
-    def problem_of(period: float) -> ExcitationProblem:
-        return _excitation_problem(given, replace(settings, period=period, shortest=None))[0]
-
-    look = settings.outlook and not found.interrupted
-    say("what other periods would identify")
-    evaluations = min(OUTLOOK_EVALUATIONS, settings.evaluations // 4) if look else 0
-    return foretell(
-        given, problem, found, settings.repeat, settings.noise, problem_of, evaluations, settings.seed
-    )  # fmt: skip
+def _problem_of_period(given: ExcitationInputs, settings: ExcitationSettings, period: float) -> ExcitationProblem:
+    """Return the problem of another period [s], which is kept."""
+    return _excitation_problem(given, replace(settings, period=period, shortest=None))[0]
 
 
 def _excitation_problem(

@@ -15,8 +15,9 @@ from calib.folders import METRICS, check_target, write_staged
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.design import INSTANTS, Designed
-from calib.procedure.excitation.motion_bounds import MotionBounds
+from calib.procedure.excitation.limits import MotionBounds
 from calib.procedure.excitation.planning import Planned
+from calib.procedure.excitation.playback import Playback
 from calib.records import plain
 from calib.robot.tables import dumps
 from calib.units import motion_units
@@ -58,12 +59,15 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         period, played = one_period(designed), designed.playback
         chain, bounds = designed.inputs.chain, designed.inputs.limits.bounds
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
-        series = coefficients.table(_periodic(designed), chain.name, bounds.lines())
-        files.write(folder / coefficients.NAME, dumps(series))
-        longer = played.approach is not None or played.repeat > 1
-        _write_optional(played.run if longer else None, bounds, folder / coefficients.RUN)
-        _write_optional(played.approach, bounds, folder / "approach.csv")
-        _write_optional(played.rehearsal, bounds, folder / REHEARSAL)
+        settings, family = designed.settings, designed.family
+        motion = Periodic(
+            tuple(chain.joint_names), designed.period, settings.rate, settings.repeat, settings.family,
+            tuple(family.coefficients(designed.found.x)), getattr(family, "degree", 5),
+        )  # fmt: skip
+        files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, chain.name, bounds.lines())))
+        if played.approach is not None or played.repeat > 1:
+            _write_setpoints(played.run, bounds, folder / coefficients.RUN)
+        _write_besides(played, bounds, folder)
         _write_messages(played.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
             draw(designed, folder)
@@ -87,8 +91,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
     def write(folder: Path) -> None:
         _write_setpoints(planned.track, planned.bounds, folder / coefficients.PLANNED)
         _write_messages(planned.track, planned.bounds, folder)
-        _write_optional(planned.approach, planned.bounds, folder / "approach.csv")
-        _write_optional(planned.rehearsal, planned.bounds, folder / REHEARSAL)
+        _write_besides(planned, planned.bounds, folder)
         if draw is not None:
             draw(planned, folder)
         files.write_json(folder / METRICS, plan_metrics(planned))
@@ -104,9 +107,11 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
     return files.write_numbers(path, header, np.column_stack([track.times, *parts.values()]), notes=bounds.lines())
 
 
-def _write_optional(track: Setpoints | None, bounds: MotionBounds, path: Path) -> None:
-    if track is not None:
-        _write_setpoints(track, bounds, path)
+def _write_besides(played: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
+    """Write approach and rehearsal, where asked for."""
+    for name, track in (("approach.csv", played.approach), (REHEARSAL, played.rehearsal)):
+        if track is not None:
+            _write_setpoints(track, bounds, folder / name)
 
 
 def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every: int = 1) -> None:
@@ -123,15 +128,6 @@ def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
     times = np.arange(count + 1) * (designed.period / count)
     motion = dense_motion(designed.family, designed.found.x, times, designed.found.factor)
     return Setpoints(count / designed.period, motion.q, motion.v, motion.a)
-
-
-def _periodic(designed: Designed) -> Periodic:
-    """Return the motion by its coefficients."""
-    settings = designed.settings
-    return Periodic(
-        tuple(designed.inputs.chain.joint_names), designed.period, settings.rate, settings.repeat, settings.family,
-        tuple(designed.family.coefficients(designed.found.x)), getattr(designed.family, "degree", 5),
-    )  # fmt: skip
 
 
 def design_metrics(designed: Designed) -> dict[str, Any]:
@@ -167,12 +163,17 @@ def _seconds(track: Setpoints | None) -> float | None:
 def design_lines(designed: Designed) -> list[str]:
     """Return what a person wants to read at the end."""
     found, cond = designed.found, designed.condition
-    columns = len(designed.inputs.columns.names)
+    columns, prior = len(designed.inputs.columns.names), designed.inputs.prior
+    together = [] if prior is None else [
+        f"together with {', '.join(prior.names)} ({prior.seconds:.1f} s), which alone has "
+        f"{cond.raw_before:.4g} raw, {cond.normalised_before:.4g} normalised; this motion alone "
+        f"{cond.raw_alone:.4g} and {cond.normalised_alone:.4g}"
+    ]  # fmt: skip
     result = [
         *(["interrupted: this is the best motion found until then"] if found.interrupted else []),
         f"condition number of {columns} columns: {cond.raw:.4g} raw, {cond.normalised:.4g} normalised "
         f"({designed.settings.family}, period {designed.period:g} s)",
-        *_together(designed),
+        *together,
         *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
         f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
         f"every limit is kept, at {designed.proof.instants} instants and between them; smallest margins:",
@@ -188,18 +189,6 @@ def design_lines(designed: Designed) -> list[str]:
     result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
     result += [] if designed.outlook is None else prediction.lines(designed.outlook)
     return [*result, *designed.inputs.limits.bounds.lines(), *(f"note: {note}" for note in designed.notes)]
-
-
-def _together(designed: Designed) -> list[str]:
-    """Return what motions before have, and this one alone."""
-    prior, cond = designed.inputs.prior, designed.condition
-    if prior is None:
-        return []
-    return [
-        f"together with {', '.join(prior.names)} ({prior.seconds:.1f} s), which alone has "
-        f"{cond.raw_before:.4g} raw, {cond.normalised_before:.4g} normalised; this motion alone "
-        f"{cond.raw_alone:.4g} and {cond.normalised_alone:.4g}"
-    ]
 
 
 def plan_metrics(planned: Planned) -> dict[str, Any]:

@@ -19,8 +19,7 @@ from calib.errors import RobotError, UsageError, require
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.torque_uncertainty import Uncertainty, read_uncertainty
-from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
-from calib.procedure.excitation.motion_bounds import MotionBounds
+from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
@@ -29,7 +28,6 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, tip_jacobian
 from trajectories.basis import SampledMotion
-from trajectories.constraints import BoxLimit
 from trajectories.setpoints import Setpoints, joined, slowed
 from trajectories.timing.limits import TimingLimits
 from trajectories.timing.lines import line
@@ -116,7 +114,8 @@ def plan(
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
     say = progress or (lambda words: None)
-    _check(settings)
+    words = "shorten changes the path between waypoints; straight lines (--line) leave nothing to change"
+    require(not (settings.shorten and settings.lines), words, UsageError)
     if settings.payloads and model is None:
         raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
     chain, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
@@ -133,14 +132,19 @@ def plan(
     shaped = None
     if settings.shorten:
         timer = partial(_duration, limits=bounds, law=law, lower=lower, upper=upper, known=known)
-        words = lambda done, best: say(f"shaping the path: {best:.4f} s after {done} timings")  # noqa: E731
-        shaped = shorten(points, timer, settings.shorten, settings.stray, words)
+        report = lambda done, best: say(f"shaping the path: {best:.4f} s after {done} timings")  # noqa: E731
+        shaped = shorten(points, timer, settings.shorten, settings.stray, report)
         paths = [shaped.path]
     margins = np.min([check_within(path, lower, upper) for path in paths], axis=0)
     for path in paths:
         _check_places(path, known)
     say("timing")
-    timings, bounds, sigma = _timed(paths, bounds, law, uncertain, known.deviations, chain, settings.rate)
+    timed = partial(time_optimal, law=law, rate=settings.rate)
+    timings, sigma = tuple(timed(path, bounds) for path in paths), None
+    if uncertain is not None and known.deviations > 0:
+        sigma = np.max([uncertain.sigma(one.sampled) for one in timings], axis=0)
+        bounds = _guarded(bounds, known.deviations * sigma, chain)
+        timings = tuple(timed(path, bounds) for path in paths)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
     known.bounds.check(motion)
@@ -151,24 +155,6 @@ def plan(
         chain, known.bounds, bounds, lower, upper, timings, motion, (*known.notes, *notes, *remarks), margins,
         deviation, shaped, lead, slowed(motion, settings.slower) if settings.slower != 1 else None, sigma,
     )  # fmt: skip
-
-
-def _timed(
-    paths: Sequence[JointPath],
-    bounds: TimingLimits,
-    law: PathDynamics | None,
-    uncertain: Uncertainty | None,
-    deviations: float,
-    chain: Chain,
-    rate: float,
-) -> tuple[tuple[Timing, ...], TimingLimits, np.ndarray | None]:
-    """Return the fastest timings, their limits, and the torques' sigmas (n,) for which these were narrowed."""
-    timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
-    if uncertain is None or not deviations > 0:
-        return timings, bounds, None
-    sigma = np.max([uncertain.sigma(one.sampled) for one in timings], axis=0)
-    bounds = _guarded(bounds, deviations * sigma, chain)
-    return tuple(time_optimal(path, bounds, law, rate=rate) for path in paths), bounds, sigma
 
 
 def _read_drives(given: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
@@ -186,21 +172,8 @@ def _check_places(path: JointPath, known: MotionLimits) -> None:
     """
     s = np.linspace(0, path.length, 500)
     still = np.zeros((len(s), path.n))
-    for one in known.constraints:
-        if isinstance(one, BoxLimit):
-            continue
-        values = one.values(SampledMotion(s, path(s), still, still, still))
-        if values.max() > 0:
-            k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
-            raise UsageError(
-                f"{one.name}: {one.labels[column]} is broken by {values[k, column]:.3g} {one.unit} at "
-                f"{s[k] / path.length:.0%} of the path; move or add waypoints"
-            )
-
-
-def _check(settings: PlanSettings) -> None:
-    words = "shorten changes the path between waypoints; straight lines (--line) leave nothing to change"
-    require(not (settings.shorten and settings.lines), words, UsageError)
+    for _, words, k in known.broken(SampledMotion(s, path(s), still, still, still)):
+        raise UsageError(f"{words} at {s[k] / path.length:.0%} of the path; move or add waypoints")
 
 
 def _law(

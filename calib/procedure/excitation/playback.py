@@ -11,13 +11,12 @@ import numpy as np
 from calib.dynamics.base import BaseModel
 from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
-from calib.procedure.excitation.limits import MotionLimits
-from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
+from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.chain import Chain
 from trajectories.approach import straight_approach
 from trajectories.basis import Family, SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint
+from trajectories.constraints import BoxLimit
 from trajectories.design.search import SearchResult
 from trajectories.design.verify import dense_motion
 from trajectories.places import Clearance
@@ -120,8 +119,17 @@ def approach_to(
         for order, factor in ((2, APPROACH_RISE), (3, APPROACH_JERK))
     )
     found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
-    notes = [_place(one, found) for one in known.constraints if not isinstance(one, BoxLimit)]
-    return found, tuple(note for note in notes if note)
+    rows = np.unique(np.linspace(0, len(found) - 1, 500).astype(int))
+    parts = (found.times, found.q, found.v, found.a, np.zeros(found.q.shape))
+    notes = []
+    for limit, broken, k in known.broken(SampledMotion(*(x[rows] for x in parts))):
+        words = f"on the straight way from start, {broken} at t = {found.times[rows[k]]:.3g} s"
+        if isinstance(limit, Clearance):
+            raise UsageError(
+                f"{words}: move the robot to another pose before, or reach the start of the motion by hand"
+            )
+        notes.append(f"{words}: watch the approach, or start from another pose")
+    return found, tuple(notes)
 
 
 def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
@@ -131,20 +139,3 @@ def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
     for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):
         if not lower <= value <= upper:
             raise UsageError(f"start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
-
-
-def _place(limit: MotionConstraint, track: Setpoints) -> str:
-    """Return a note where an approach leaves the workspace, which a robot may; refuse one that comes too near."""
-    rows = np.unique(np.linspace(0, len(track) - 1, 500).astype(int))
-    parts = (track.times, track.q, track.v, track.a, np.zeros(track.q.shape))
-    values = limit.values(SampledMotion(*(x[rows] for x in parts)))
-    if values.max() <= 0:
-        return ""
-    k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
-    words = (
-        f"on the straight way from start, {limit.name} ({limit.labels[column]}) is broken by "
-        f"{values[k, column]:.3g} {limit.unit} at t = {track.times[rows[k]]:.3g} s"
-    )
-    if isinstance(limit, Clearance):
-        raise UsageError(f"{words}: move the robot to another pose before, or reach the start of the motion by hand")
-    return f"{words}: watch the approach, or start from another pose"

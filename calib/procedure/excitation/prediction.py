@@ -24,9 +24,10 @@ from calib.errors import UsageError, require
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
-from calib.procedure.excitation.motion_bounds import DEFAULT_RISE
+from calib.procedure.excitation.limits import DEFAULT_RISE
+from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import sentence
-from calib.procedure.measuring.selection_prediction import sigma_ratio
+from calib.procedure.measuring.prediction import sigma_ratio
 from calib.records import Array, read_json, read_rows
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
@@ -35,6 +36,7 @@ from trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
 DEFAULT_NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
+OUTLOOK_EVALUATIONS = 240  # for a motion of another period, which is only looked at (our choice)
 PERIODS = (5.0, 10.0, 20.0, 40.0)
 PERIOD_SAMPLES = 500  # over a period
 TASK_STATES = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
@@ -84,34 +86,27 @@ class MotionOutlook:
 
 def foretell(
     given: ExcitationInputs,
+    settings: ExcitationSettings,
     problem: ExcitationProblem,
     found: SearchResult,
-    repeat: int,
-    noise: float | None,
     problem_of: Callable[[float], ExcitationProblem],
-    evaluations: int,
-    seed: int,
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
     """Return what a motion is to identify, of torques and of parameters; None where a joint has no torque limit.
 
     Args:
-        given, problem, found: the robot, what was solved, and the motion.
-        repeat: periods that are run.
-        noise: share of the torque limits; None: `DEFAULT_NOISE`.
+        given, settings, problem, found: the robot, what was asked for, what was solved, and the motion.
         problem_of: a period [s] -> the problem with it.
-        evaluations: for each of the other periods; 0: none are looked at.
-        seed: of the typical task.
     """
-    limits, share = given.limits.torque, DEFAULT_NOISE if noise is None else noise
+    limits, share = given.limits.torque, DEFAULT_NOISE if settings.noise is None else settings.noise
     if not np.isfinite(limits).all():
         return None, ()
     sigmas = share * limits
-    task = _task(given, seed)
+    task = _task(given, settings.seed)
     tell = partial(_prediction, given, sigmas, task)
-    own, spread = tell(problem.family, found.x, found.factor, repeat)
-    others = []
+    own, spread = tell(problem.family, found.x, found.factor, settings.repeat)
+    others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
     own_period = problem.family.period * found.factor
-    for period in PERIODS if evaluations else ():
+    for period in PERIODS if settings.outlook and evaluations and not found.interrupted else ():
         if period >= own_period - 1e-9:
             others.append(tell(problem.family, found.x, found.factor, period / own_period)[0])
             continue

@@ -31,7 +31,7 @@ from calib.procedure.kinematic_stage.metrics import Findings, Outlier
 from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
-from calib.procedure.measuring.selection_prediction import SelectionPrediction, compared_with_fit
+from calib.procedure.measuring.prediction import SelectionPrediction, compared_with_fit
 from calib.robot.calibrated import CalibratedChain
 
 Progress = Callable[[str], None]

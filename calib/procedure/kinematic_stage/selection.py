@@ -17,15 +17,13 @@ from calib.errors import UsageError, require
 from calib.geometry.observability import Observation, observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-from calib.procedure.measuring.drivable import Drivable, Exchange, drivable
 from calib.procedure.measuring.pose_limits import Limits, read_limits
-from calib.procedure.measuring.prediction import Prediction, by_count
+from calib.procedure.measuring.prediction import Prediction, SelectionPrediction, beside, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
-from calib.procedure.measuring.run import Run, RunSettings
+from calib.procedure.measuring.prediction import write as write_prediction
+from calib.procedure.measuring.run import Drivable, Exchange, Run, RunSettings, drivable
 from calib.procedure.measuring.run import lines as ways
-from calib.procedure.measuring.selection_prediction import SelectionPrediction, beside
-from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from poses.candidates import draw_candidates
@@ -72,7 +70,6 @@ class Chosen:
         checked, unchecked: what the poses were held against, and what they could not be, in words.
         notes: what else a user should know.
         outlook: predicted accuracy with these poses and with others.
-        prediction: the same, as kept next to the poses; None where a parameter is not identifiable.
         by_images: whether the poses are those at which a camera sees its board.
         run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
     """
@@ -88,7 +85,11 @@ class Chosen:
     run: Run
     driven: RunSettings
     by_images: bool
-    prediction: SelectionPrediction | None
+
+    @property
+    def prediction(self) -> SelectionPrediction | None:
+        """What is kept next to the poses; None where a parameter is not identifiable."""
+        return self.outlook.poses if np.isfinite(self.outlook.poses.rms) else None
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -172,7 +173,7 @@ def choose(
     outlook = _outlook(jacobian, limits, search, m, driven.q, candidates, before, comparable)
     return Chosen(
         chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
-        settings.run, view is not None, _prediction(jacobian, outlook),
+        settings.run, view is not None,
     )  # fmt: skip
 
 
@@ -223,14 +224,6 @@ def _outlook(
     others = by_count(seen, space.jacobian(candidates), typical, before)
     own = foretold(seen, np.concatenate([rows, past]), typical, m)
     return PoseOutlook(own, typical, others, blind, comparable)
-
-
-def _prediction(seen: Observation, outlook: PoseOutlook) -> SelectionPrediction | None:
-    """Return what is kept of an outlook; None where a parameter is not identifiable."""
-    own = outlook.poses
-    if not np.isfinite(own.rms):
-        return None
-    return SelectionPrediction(seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()))
 
 
 def _typical_poses(limits: Limits, seen: Observation, seed: int) -> np.ndarray:

@@ -29,6 +29,7 @@ from calib.procedure.measuring.constraints_file import (
     CameraTable,
     CollisionTable,
     ConstraintsFile,
+    InstrumentTable,
     TargetTable,
     rising,
 )
@@ -180,25 +181,19 @@ def limits_of(
 
 def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
     """Return in words what poses (motions where they are not `seen`) are not held against."""
-    table, names = stated.instrument, []
-    if "joint-margin" in absent:
-        names.append("margin to the joint limits (switched off)")
-    if "self-collision" in absent:
-        names.append("self-collision (switched off)")
-    if "floor" in absent and (stated.collision is None or stated.collision.floor is None):
-        names.append("floor (switched off)")
-    if not seen:
-        pass
-    elif table is None or not table.stated:
-        names += [] if "instrument" in absent else ["line of sight (the instrument's place is not known)"]
-    else:
-        names += [] if table.sight is not None else ["cone of acceptance of the target (not known)"]
-        names += [] if "view" not in absent else ["links in the line of sight (switched off)"]
-    if stated.collision is None or stated.collision.box is None:
-        names += [] if "box" in absent else ["walls of the cell (not known)"]
-    if not stated.obstacle and "obstacles" not in absent:
-        names.append("obstacles (not known)")
-    return tuple(names)
+    table, collision = stated.instrument or InstrumentTable(), stated.collision or CollisionTable()
+    placed = bool(table.stated)
+    missing = {
+        "margin to the joint limits (switched off)": "joint-margin" in absent,
+        "self-collision (switched off)": "self-collision" in absent,
+        "floor (switched off)": "floor" in absent and collision.floor is None,
+        "line of sight (the instrument's place is not known)": seen and not placed and "instrument" not in absent,
+        "cone of acceptance of the target (not known)": seen and placed and table.sight is None,
+        "links in the line of sight (switched off)": seen and placed and "view" in absent,
+        "walls of the cell (not known)": collision.box is None and "box" not in absent,
+        "obstacles (not known)": not stated.obstacle and "obstacles" not in absent,
+    }
+    return tuple(words for words, holds in missing.items() if holds)
 
 
 def _joint_margin(spans: Mapping[str, Any], where: str) -> float:

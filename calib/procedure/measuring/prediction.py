@@ -3,41 +3,67 @@
 With W the whitened observation Jacobian of the poses, C = (WᵀW)⁻¹ is the covariance that the fit will state if the
 measurements are as noisy as said and the model is the geometry that the poses were chosen for; a tool's position then
 has the variance tr(J C Jᵀ), J its Jacobian. Effects that the fit adds, and errors that no parameter holds, add to it.
+
+``calib select --out poses.csv`` leaves ``poses_prediction.json``; ``calib fit --selection poses.csv`` reads it.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib import files
+from calib.errors import Finding, UsageError, finding, require
 from calib.geometry.observability import Observation
 from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit
+from calib.records import Array, read_json
 from poses.design import Pool
 from poses.errors import NotIdentifiable, TooFewCandidates
 from poses.exchange import greedy
 from poses.information import prepared
 
+SUFFIX = "_prediction.json"
 COUNTS = (10, 20, 40, 80)
 WORST = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """What a fit of m poses will know.
+class SelectionPrediction:
+    """What a selection predicts.
 
     Attributes:
-        poses: m.
-        points, spread: (s, 3), (s,) where the tool is at typical poses, and sigma of its position there [m]; infinite
-            where a parameter is not identifiable.
+        joints: (n,) of the robot, by name.
+        poses: how many were chosen.
         names, units, sigmas: (p,) of the parameters [m, rad].
     """
 
+    joints: tuple[str, ...]
     poses: int
-    points: np.ndarray
-    spread: np.ndarray
     names: tuple[str, ...]
     units: tuple[str, ...]
-    sigmas: np.ndarray
+    sigmas: Array
+
+    def check_robot(self, joints: Sequence[str]) -> None:
+        """Refuse, before any work is done, the selection of another robot."""
+        if self.joints != tuple(joints):
+            ours, theirs = ", ".join(joints), ", ".join(self.joints)
+            raise UsageError(f"the selection is one of another robot: its joints are {theirs}, here they are {ours}")
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction(SelectionPrediction):
+    """What a fit of m poses will know, and where the tool will be known how well.
+
+    Attributes:
+        points, spread: (s, 3), (s,) where the tool is at typical poses, and sigma of its position there [m]; infinite
+            where a parameter is not identifiable.
+    """
+
+    points: np.ndarray
+    spread: np.ndarray
 
     @property
     def rms(self) -> float:
@@ -68,10 +94,9 @@ def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, pos
     root = (vt.T / s) / scale[:, None] if identifiable else np.full((rows.shape[1], 1), np.inf)
     points, slopes = seen.position(typical)
     spread = np.sqrt(((slopes @ root) ** 2).sum((1, 2))) if identifiable else np.full(len(typical), np.inf)
-    return Prediction(
-        count, points, spread, tuple(names[k] for k in seen.free), tuple(units[k] for k in seen.free),
-        np.linalg.norm(root, axis=1),
-    )  # fmt: skip
+    free_names, free_units = (tuple(each[k] for k in seen.free) for each in (names, units))
+    sigmas = np.linalg.norm(root, axis=1)
+    return Prediction(seen.cell.chain.joint_names, count, free_names, free_units, sigmas, points, spread)
 
 
 def by_count(
@@ -122,3 +147,64 @@ def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, st
         sizes = " / ".join(f"{1e3 * each.rms:.3g}" for each in others)
         rows.append((f"σ of the tool with {numbers} poses", f"{sizes} mm rms"))
     return rows
+
+
+def beside(poses: Path) -> Path:
+    """Return where the prediction of a CSV of chosen poses lies."""
+    return poses.parent / (poses.stem + SUFFIX)
+
+
+def write(prediction: SelectionPrediction, poses: Path) -> Path:
+    """Write what a selection predicts next to its CSV."""
+    return files.write_json(
+        beside(poses), {each.name: getattr(prediction, each.name) for each in fields(SelectionPrediction)}
+    )
+
+
+def read(selection: Path) -> SelectionPrediction:
+    """Read what a selection predicts.
+
+    Args:
+        selection: the CSV that `calib select` wrote, or a folder with the prediction of one (``2-poses`` of a session).
+
+    Raises:
+        UsageError: where there is none, or several, or it cannot be read.
+    """
+    path = selection
+    if not selection.is_dir():
+        path = beside(selection)
+    else:
+        found = sorted(selection.glob(f"*{SUFFIX}"))
+        require(len(found) <= 1, f"{selection} holds {len(found)} predictions: name one CSV of poses", UsageError)
+        path = found[0] if found else selection / f"*{SUFFIX}"
+    words = f"there is no {path}: give the CSV that calib select wrote, its prediction next to it, or their folder"
+    require(path.is_file(), words, UsageError)
+    return read_json(path, "choose the poses again", SelectionPrediction)
+
+
+def compared_with_fit(prediction: SelectionPrediction, fit: GeometricFit) -> Finding | None:
+    """Return how the σ that a fit estimates compare with those predicted when its poses were chosen."""
+    names = layout(fit.cell).names
+    estimated = {names[k]: float(sigma) for k, sigma in zip(fit.free, fit.estimate.sigma)}
+    return sigma_ratio(dict(zip(prediction.names, prediction.sigmas)), estimated)
+
+
+def sigma_ratio(
+    predicted: Mapping[str, float],
+    estimated: Mapping[str, float],
+    residual: float | None = None,
+    assumed: float | None = None,
+) -> Finding | None:
+    """Return estimated over predicted σ of parameters, by name; None where they have no name in common.
+
+    Args:
+        predicted, estimated: name -> σ.
+        residual, assumed: of the torque, as shares of the limits, where it is known.
+    """
+    common = [name for name in predicted if estimated.get(name, 0.0) > 0.0 and predicted[name] > 0.0]
+    if not common:
+        return None
+    low, median, high = np.quantile([estimated[name] / predicted[name] for name in common], [0.1, 0.5, 0.9])
+    return finding(
+        "sigma-ratio", count=len(common), median=median, low=low, high=high, residual=residual, assumed=assumed
+    )

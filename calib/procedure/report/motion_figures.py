@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
-from calib.procedure.excitation.metrics import DesignMetrics
 from calib.procedure.report.charts import Chart, Panel, level, line, picture, save_all, text
 from calib.procedure.report.geometry_figures import outlook_figure
 from calib.procedure.report.page import Picture
@@ -174,6 +173,8 @@ def _profile_figure(planned: Planned) -> Chart:
 
 def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
     """Return a designed motion of joints from its folder, and how well it identifies the parameters."""
+    from calib.procedure.excitation.design import DesignMetrics
+
     motion = coefficients.read(folder)
     t = np.linspace(0.0, motion.period, DRAWN)
     q, v, _ = motion.orders(t)

@@ -19,8 +19,7 @@ from calib.procedure.excitation import coefficients, folder
 from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.design import GUARD, INSTANTS, search_motion
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, IdentifiableColumns
-from calib.procedure.excitation.limits import MotionLimits
-from calib.procedure.excitation.motion_bounds import MotionBounds
+from calib.procedure.excitation.limits import MotionBounds, MotionLimits
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT

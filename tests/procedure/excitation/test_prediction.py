@@ -73,16 +73,8 @@ def test_longer_motion_tells_more_and_the_figures_are_in_the_folder(designed, mo
 
 
 def test_sigmas_go_with_the_noise(designed):
-    more, rows = prediction.foretell(
-        designed.inputs,
-        designed.problem,
-        designed.found,
-        SHORT.repeat,
-        0.03,
-        lambda period: designed.problem,
-        0,
-        SHORT.seed,
-    )
+    noisy, motion = replace(SHORT, noise=0.03, outlook=False), (designed.problem, designed.found)
+    more, rows = prediction.foretell(designed.inputs, noisy, *motion, lambda period: designed.problem)
     assert [row.sigma for row in rows] == pytest.approx([3 * row.sigma for row in designed.predicted])
     assert more.by_period == ()
 

@@ -9,8 +9,7 @@ import pytest
 
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.measuring import run as measuring
-from calib.procedure.measuring.drivable import Exchange, drivable
-from calib.procedure.measuring.run import RunSettings, plan_run, turns
+from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_run, turns
 from calib.robot.load import load
 
 CHAIN = load("ur5")
