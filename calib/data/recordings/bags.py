@@ -8,7 +8,8 @@ Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux 
 imported when a bag is read (75 ms). Memory grows with the joint states alone, time with their number.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,48 +24,65 @@ JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
     """Return the joint states of a bag, unchecked but for their shapes."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    damaged = "cannot be read as a ROS bag ({}): was it closed properly?"  # whatever it makes of others' readers
-    with (
-        refused_as(MeasurementError, Exception, damaged, path),
-        AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
-    ):
-        names, parts, skipped = _collect(reader, _connections(reader, options, path), joints, path)
+    with opened(path) as reader:
+        connections = connections_of(
+            reader, JOINT_STATE, options.topic, path, "joint states", "topic = '...'", "/joint_states"
+        )  # fmt: skip
+        names, parts, skipped = joint_states(reader, connections, joints, path)
     for ours, what in (("q", "positions"), ("effort", "efforts")):
         require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
     notes = [f"{skipped} messages lack one of the joints; left out"] if skipped else []
-    stamps = parts["header"]
-    if not stamps.any():
-        stamps = parts["logged"]
+    if not parts["header"].any():
         notes.append("the headers have no stamps; the times of logging are used, which jitter more")
     return Recording(
-        (stamps - stamps[0]) * 1e-9, parts["q"], parts["effort"], options.kind or "torque", names,
+        (parts["stamp"] - parts["stamp"][0]) * 1e-9, parts["q"], parts["effort"], options.kind or "torque", names,
         v=parts["v"] if parts["v"].size else None, file=str(path), notes=tuple(notes),
     )  # fmt: skip
 
 
-def _connections(reader: Any, options: RecordingOptions, path: Path) -> list[Any]:
-    """Return the connections of the one topic of joint states, or of the one the options name."""
-    found = {c.topic for c in reader.connections if c.msgtype in JOINT_STATE}
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Yield a reader of a bag; what others' readers raise of it is raised as `MeasurementError`."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    damaged = "cannot be read as a ROS bag ({}): was it closed properly?"
+    with (
+        refused_as(MeasurementError, Exception, damaged, path),
+        AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
+    ):
+        yield reader
+
+
+def connections_of(
+    reader: Any, kinds: Sequence[str], topic: str, path: Path, what: str, option: str, usual: str = ""
+) -> list[Any]:
+    """Return a bag's connections of one topic whose messages are of some kinds.
+
+    Args:
+        topic: the one that is asked for; empty: the only one there is, or the `usual` one.
+        what, option: for messages: what such topics hold, and how to ask for one.
+
+    Raises:
+        MeasurementError: without such a topic, or with several of which none is asked for.
+    """
+    found = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
     if not found:
         topics = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)) or "none"
-        refuse_data(path, f"has no topic of sensor_msgs/JointState; found: {topics}")
-    topic = options.topic or (min(found) if len(found) == 1 else "/joint_states")
-    if topic not in found:
-        known = ", ".join(sorted(found))
-        message = f"there are joint states on {known}: say which (topic = '...')"
-        if options.topic:
-            message = f"has no joint states on '{topic}'{suggestion(topic, sorted(found))}; found: {known}"
+        refuse_data(path, f"has no topic of {what} ({', '.join(kinds)}); found: {topics}")
+    chosen = topic or (found[0] if len(found) == 1 else usual)
+    if chosen not in found:
+        message = f"there are {what} on {', '.join(found)}: say which ({option})"
+        if topic:
+            message = f"has no {what} on '{topic}'{suggestion(topic, found)}; found: {', '.join(found)}"
         refuse_data(path, message)
-    return [c for c in reader.connections if c.topic == topic and c.msgtype in JOINT_STATE]
+    return [c for c in reader.connections if c.topic == chosen and c.msgtype in kinds]
 
 
-def _collect(
+def joint_states(
     reader: Any, connections: list[Any], joints: Joints | None, path: Path
 ) -> tuple[tuple[str, ...], dict[str, np.ndarray], int]:
-    """Return the joints' names, arrays of stamps, q, v and effort, and the number of messages left out."""
+    """Return the joints' names, arrays of stamps [ns], q, v and effort, and the number of messages left out."""
     names = joints.names if joints else ()
     order: dict[tuple[str, ...], list[int] | None] = {}
     rows: dict[str, list[Any]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
@@ -79,13 +97,19 @@ def _collect(
         if place is None:
             skipped += 1
             continue
-        rows["header"].append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        rows["header"].append(header_stamp(message))
         rows["logged"].append(logged)
         for ours, values in (("q", message.position), ("v", message.velocity), ("effort", message.effort)):
             rows[ours].append(values[place] if len(values) == len(own) else None)
     if not rows["q"]:
         _refuse_joints(names, list(order), path)
-    return names, {ours: _stack(values, ours, path) for ours, values in rows.items()}, skipped
+    found = {ours: _stack(values, ours, path) for ours, values in rows.items()}
+    return names, found | {"stamp": found["header" if found["header"].any() else "logged"]}, skipped
+
+
+def header_stamp(message: Any) -> int:
+    """Return the stamp of a message's header [ns]; 0 where it has none."""
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:

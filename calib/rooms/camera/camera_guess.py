@@ -70,8 +70,7 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
 
         if not block.size[0]:
             raise MeasurementError("neither the images' size nor a lens (camera.yaml) is known", block.file)
-        guess = estimate_lens(block.board, block.pixel, block.size, block.model, block.file)
-        block = replace(block, lens=guess.lens)
+        block = replace(block, lens=estimate_lens(block.board, block.pixel, block.size, block.model, block.file))
     arm = forward(chain, block.q)
     found = place_camera(block, arm)
     _check_square(block, arm[found.rows], found)

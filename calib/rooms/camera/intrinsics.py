@@ -6,7 +6,6 @@ six columns is a least-squares problem in the lens alone. The focal length start
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,24 +21,9 @@ BENT = 0.5  # reprojection error from which on the other model is tried [px], an
 WRONG = 50.0  # reprojection error of no lens [px]
 
 
-@dataclass(frozen=True, eq=False)
-class LensGuess:
-    """A lens found from images.
-
-    Attributes:
-        lens: see there.
-        rms: reprojection error per coordinate [px].
-        focal_sigma: of fx and fy, relative.
-    """
-
-    lens: Lens
-    rms: float
-    focal_sigma: float
-
-
 def estimate_lens(
     board: Board, pixel: np.ndarray, size: tuple[int, int], model: str = "pinhole", file: str = ""
-) -> LensGuess:
+) -> Lens:
     """Return the lens that images (m, K, 2) [px] of a flat board determine.
 
     Args:
@@ -86,7 +70,7 @@ def estimate_lens(
             "directions; tilt it (or the camera) by 20 to 45° both ways in a dozen images, or give the lens "
             "(camera.yaml)",
         )
-    return LensGuess(found, rms, loose)
+    return found
 
 
 def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) -> tuple[Lens, float, np.ndarray]:

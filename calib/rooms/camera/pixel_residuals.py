@@ -291,16 +291,9 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     depth = np.sqrt(np.abs(np.prod(view.lens.values[:2]))) / point[:, 2]
     carried = np.tile(np.eye(6), (len(measured), 1, 1))
     if in_hand:  # ω × (o - c): the camera turns about itself, and the board's origin swings
-        carried[:, :3, 3:] = -_cross_matrix(origin)
+        carried[:, :3, 3:] = np.cross(origin[:, None], np.eye(3))
     axes = -turn.transpose(0, 2, 1) if in_hand else np.tile(np.eye(3), (len(measured), 1, 1))
     return [PixelPart("pixel", value, shared, sigma, 0, image, local, corner, depth, axes, carried)]
-
-
-def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Return [v]× (m, 3, 3) of vectors (m, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros(len(vectors))
-    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
 
 
 def _twist_of_board(jacobian: np.ndarray, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:

@@ -15,7 +15,8 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.choices import BOARD, CORNERS, JOINTS
-from calib.errors import MeasurementError, refuse_data, require, suggestion
+from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
+from calib.errors import MeasurementError, require
 from calib.rooms.camera import board as boards
 from calib.rooms.camera.board import Board
 from calib.rooms.camera.pictures import corner_file
@@ -23,8 +24,6 @@ from calib.rooms.camera.pictures.corner_file import Found
 from calib.rooms.camera.pictures.detection import detected
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
-JOINT = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
-Say = Callable[[int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,65 +63,24 @@ def read_image_bag(
     Raises:
         MeasurementError: where it cannot be read, a topic is missing, or no image was taken at rest.
     """
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
-
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            names, stamps, q = _joints(reader, _topic(reader, JOINT, joint_topic, "joint states", path), path)
-            connections = _topic(reader, IMAGE, image_topic, "images", path)
-            chosen, own, notes = _at_rest(_image_stamps(reader, connections), stamps, q)
-            require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
-            images = _images(reader, connections, set(chosen.tolist()))
-            labels = [f"image {k + 1}" for k in chosen]
-            found = detected(
-                zip(labels, images), board, len(labels), None if say is None else lambda k, _, name: say(k, name)
-            )
-    except MeasurementError:
-        raise
-    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
-        raise MeasurementError(f"cannot be read as a ROS bag ({error}): was it closed properly?", path) from error
+    with opened(path) as reader:
+        states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")
+        names, parts, _ = joint_states(reader, states, None, path)
+        few = f"{len(parts['q'])} joint states are too few to pair images with"
+        require(len(parts["q"]) >= 2, few, MeasurementError, path)
+        order = np.argsort(parts["stamp"], kind="stable")
+        connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")
+        chosen, own, notes = _at_rest(_image_stamps(reader, connections), parts["stamp"][order], parts["q"][order])
+        require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
+        labels = [f"image {k + 1}" for k in chosen]
+        images = zip(labels, _images(reader, connections, set(chosen.tolist())))
+        found = detected(images, board, len(labels), None if say is None else lambda k, _, name: say(k, name))
     return ImageBag(tuple(labels), names, own, found, tuple(notes))
 
 
-def _topic(reader: Any, kinds: tuple[str, ...], wanted: str, what: str, path: Path) -> list[Any]:
-    """Return the connections of the one topic of some kinds, or of the one wanted."""
-    known = sorted({c.topic for c in reader.connections if c.msgtype in kinds})
-    if not known:
-        refuse_data(path, f"has no topic of {what} ({' or '.join(kinds[:2])})")
-    if wanted and wanted not in known:
-        refuse_data(path, f"has no {what} on '{wanted}'{suggestion(wanted, known)}; on {', '.join(known)}")
-    if not wanted and len(known) > 1:
-        refuse_data(path, f"has {what} on {', '.join(known)}: say on which (--image-topic, --joint-topic)")
-    return [c for c in reader.connections if c.topic == (wanted or known[0]) and c.msgtype in kinds]
-
-
-def _stamp(message: Any, logged: int) -> int:
-    own = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-    return own or logged
-
-
-def _joints(reader: Any, connections: list[Any], path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    names, stamps, rows = (), [], []
-    for connection, logged, raw in reader.messages(connections=connections):
-        message = reader.deserialize(raw, connection.msgtype)
-        names = names or tuple(message.name)
-        if set(names) <= set(message.name):
-            order = [list(message.name).index(name) for name in names]
-            stamps.append(_stamp(message, logged))
-            rows.append(np.asarray(message.position)[order])
-    require(len(rows) >= 2, f"{len(rows)} joint states are too few to pair images with", MeasurementError, path)
-    place = np.argsort(stamps, kind="stable")
-    return names, np.array(stamps)[place], np.array(rows)[place]
-
-
 def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
-    return np.array(
-        [
-            _stamp(reader.deserialize(raw, c.msgtype), logged)
-            for c, logged, raw in reader.messages(connections=connections)
-        ]
-    )
+    messages = reader.messages(connections=connections)
+    return np.array([header_stamp(reader.deserialize(raw, c.msgtype)) or logged for c, logged, raw in messages])
 
 
 def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
