@@ -13,6 +13,7 @@ from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, UsageError, finding
 from calib.identification.cases import Case
+from calib.identification.friction.passivity import MIN_ENERGY_SHARE
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.methods.method import Method
@@ -41,7 +42,6 @@ from calib.workers.threads import one_blas_thread
 
 OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # settings
 MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
-DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.MIN_ENERGY_SHARE`
 
 Recorded = str | Path | Recording
 
@@ -141,25 +141,16 @@ def _driven_joints(
 ) -> tuple[str, ...]:
     """Return names of joints whose friction gives energy, as a share of all that the actuators move."""
     joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
-    rubbing = [
-        (one, value) for one, value in zip(model.terms, found.dynamics.values[model.inertial :])
-        if one.form.dissipative and value != 0.0 and one.joint is not None
-    ]  # fmt: skip
-    taken, moved = np.zeros(len(joints)), 0.0
+    friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.terms])
+    values, taken, moved = np.where(friction, found.dynamics.values, 0.0), np.zeros(len(joints)), 0.0
     for case in cases:
         every = max(1, len(case.motion) // (10 * MAX_SAMPLES))
         q, v, a = (getattr(case.motion, key)[::every] for key in "qva")
         motion, target = model.moved(q, v, a), case.target[::every]
-        if case.torque_rows.name == PLATFORM:
-            target = target * motion.rate
-        elif target.shape[1] == model.n:
-            target = target * v
-        moved += np.abs(target.sum(axis=1)).sum()
-        for one, value in rubbing:
-            speed = motion.v[:, one.joint]
-            size = one.settings[0] if one.shape == "sign" else 0.0
-            taken[one.joint] += value * np.sum(speed * (np.tanh(speed / max(size, 1e-9)) if size else speed))
-    return tuple(name for name, own in zip(joints, taken) if own < DRIVEN * moved)
+        speeds = motion.rate if case.torque_rows.name == PLATFORM else v if target.shape[1] == model.n else 1.0
+        moved += np.abs((target * speeds).sum(axis=1)).sum()
+        taken += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
+    return tuple(name for name, own in zip(joints, taken) if own < MIN_ENERGY_SHARE * moved)
 
 
 def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:

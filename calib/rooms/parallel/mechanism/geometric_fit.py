@@ -22,8 +22,8 @@ from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed, coordinates_of
-from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links, times
-from calib.rooms.parallel.mechanism.parallel_robot import Leg, ParallelRobot
+from calib.rooms.parallel.mechanism.leg_links import Posture, leg_links, links_of, times
+from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians, preload_directions
 from calib.transforms import displace
 
@@ -32,7 +32,6 @@ OPENS = 1e-6  # of a parameter's effect on a gap that no joint and no freedom ca
 LIMIT = 30
 SPREAD = 0.01  # standard deviation of a parameter before anything is measured [m or rad] (our choice)
 TOLERANCE = 1e-6  # of a column that no other explains, at unit norm: counts what the poses could tell
-PLACE = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -168,16 +167,12 @@ def _observed(
     first = np.concatenate([[0], np.cumsum([len(leg.actuated) for leg in robot.legs])]).astype(int)
     for p, one in enumerate(parameters):
         rows = slice(first[one.leg], first[one.leg + 1])
-        W[:, rows, p] = _reading_slope(robot, posture, links[one.leg], one)
+        inverse = links[one.leg].inverse[:, list(robot.legs[one.leg].actuated)]
+        W[:, rows, p] = -times(inverse, _gap_slope(robot, posture, one))
     if coordinates is None:
         across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
         residual, W = times(across, residual), across @ W
     return residual.ravel(), W.reshape(-1, len(parameters))
-
-
-def _reading_slope(robot: ParallelRobot, posture: Posture, links: LegLinks, one: LoopParameter) -> np.ndarray:
-    actuated = list(robot.legs[one.leg].actuated)
-    return -times(links.inverse[:, actuated], _gap_slope(robot, posture, one))
 
 
 def _gap_slope(robot: ParallelRobot, posture: Posture, one: LoopParameter) -> np.ndarray:
@@ -186,15 +181,7 @@ def _gap_slope(robot: ParallelRobot, posture: Posture, one: LoopParameter) -> np
     ends = []
     for step in (STEP, -STEP):
         leg = _changed_leg(robot.legs[one.leg], one, step)
-        alone = ParallelRobot(
-            robot.name,
-            (replace(leg, actuated=tuple(range(leg.chain.n))),),
-            ("x",),
-            robot.home,
-            np.array([-1.0]),
-            np.array([1.0]),
-        )
-        ends.append(leg_links(alone, Posture(posture.q[:, a:b], posture.pose))[0].gap)
+        ends.append(links_of(leg, posture.q[:, a:b], posture.pose).gap)
     return (ends[0] - ends[1]) / (2.0 * STEP)
 
 
@@ -205,7 +192,7 @@ def _candidates(leg: Leg, k: int) -> list[LoopParameter]:
     places = [
         LoopParameter(f"{leg.name}.{part}.{axis}", "m" if i < 3 else "rad", k, part, i)
         for part in ("base", "attachment")
-        for i, axis in enumerate(PLACE)
+        for i, axis in enumerate(COORDINATES)
         if part == "base" or i < leg.held
     ]
     return elements + places

@@ -49,7 +49,7 @@ class LegLinks:
 def leg_links(robot: ParallelRobot, posture: Posture) -> list[LegLinks]:
     """Return every leg's Jacobian, attachment and gap at postures, by rigid-body relations alone."""
     starts = robot.starts
-    return [_links(leg, posture.q[:, a:b], posture.pose) for leg, a, b in zip(robot.legs, starts, starts[1:])]
+    return [links_of(leg, posture.q[:, a:b], posture.pose) for leg, a, b in zip(robot.legs, starts, starts[1:])]
 
 
 def pseudo_inverse(J: np.ndarray) -> np.ndarray:
@@ -68,7 +68,8 @@ def times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (A @ x[:, :, None])[:, :, 0]
 
 
-def _links(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
+def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
+    """Return one leg at joint values q (N, n) and poses of the platform (N, 4, 4)."""
     from calib.rooms.parallel.mechanism import closure_kernels
 
     count, n = q.shape
