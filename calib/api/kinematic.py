@@ -6,20 +6,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from calib import files
 from calib.api.rendering import Judged, data_frame, listed, optional, progress_shown, saved
 from calib.arguments import checked
+from calib.arrays import shaped
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import Targets, read_targets
 from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
+from calib.geometry.observation import pose_sigmas
 from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection
+from calib.procedure.kinematic_stage.comparison import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
@@ -103,6 +106,13 @@ class PoseSelection(selection.Chosen):
         return "\n".join([*lines, *self.kept(), *(f"note: {note}" for note in self.notes)])
 
 
+class PredictedPoses(NamedTuple):
+    """Poses (m, 4, 4) [m] of a tool in the robot's base, and σ (m, 2) of position [m] and orientation [rad]."""
+
+    pose: np.ndarray
+    sigma: np.ndarray
+
+
 class GeometryFit(Judged, fit.Outcome):
     """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict."""
 
@@ -110,6 +120,23 @@ class GeometryFit(Judged, fit.Outcome):
     def estimate(self) -> Estimate:
         """The fitted parameters [m, rad] with their covariance."""
         return self.selection.fit.estimate
+
+    @one_blas_thread()
+    def predict(self, q: Any, tool: int = 0) -> PredictedPoses:
+        """Return where the calibrated robot puts a tool at any joint values, in its base, and σ of that.
+
+        σ of the position is all that is to be expected (`position_sigma`) where the fit states it, else that of the
+        parameters, as σ of the orientation is.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            tool: which of the fit's tools.
+        """
+        found, poses, torque = self.selection.fit, *self._poses(q)
+        sigma = pose_sigmas(found.cell, poses.q, found.free, found.estimate.covariance, torque, -1, tool)
+        if self.expected is not None:
+            sigma[:, 0] = self.expected.position_sigma(poses.q, torque, -1, tool)
+        return PredictedPoses(self.robot.forward(poses.q, torque) @ found.cell.tools[tool], sigma)
 
     @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
@@ -125,13 +152,18 @@ class GeometryFit(Judged, fit.Outcome):
         Raises:
             UsageError: where no positions were measured.
         """
-        from calib.procedure.kinematic_stage.comparison import gravity_of
-
         if self.expected is None:
             raise UsageError("this fit knows no errors to expect: it takes 20 measured positions or more")
-        poses = PoseMeasurements(np.atleast_2d(np.asarray(q, dtype=float)), self.robot.chain.joint_names)
-        torque = gravity_of(self.inputs.chain, poses)
+        poses, torque = self._poses(q)
         return self.expected.position_sigma(poses.q, torque, tool=tool)
+
+    def _poses(self, q: Any) -> tuple[PoseMeasurements, np.ndarray | None]:
+        """Return poses at joint values (m, n), and their gravity torques (m, n) [N m] where masses are known."""
+        chain = self.inputs.chain
+        poses = PoseMeasurements(
+            shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q"), chain.joint_names
+        )
+        return poses, gravity_of(chain, poses)
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

@@ -19,19 +19,21 @@ calibrated robot for ``base``; for the other two with its own best placement of 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from calib import files
 from calib.data.poses.pose_lists import Targets
-from calib.errors import UsageError
+from calib.errors import Finding, UsageError, finding
 from calib.geometry import installation, inverse
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.observation import pose_sigmas
 from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.error_model import Discrepancy, ErrorModel, outside
+from calib.procedure.findings import lines_of, sentence
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.calibrated import Deflection
@@ -69,6 +71,20 @@ class Fitted:
     fitted: float | None
     learnt: np.ndarray | None = None
     discrepancy: Discrepancy | None = None
+
+    @property
+    def placed(self) -> bool:
+        """Whether it is known where the nominal robot stood."""
+        return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(self.nominal.station_names)
+
+    @property
+    def torques(self) -> Callable[[np.ndarray], np.ndarray] | None:
+        """Gravity torques as the fit took them, of the nominal arm; None where no deflection needs them."""
+        if not any(term.basis == "torque" for term in self.cell.deflection.terms):
+            return None
+        from calib.dynamics.gravity import gravity_torques
+
+        return partial(gravity_torques, self.nominal.chain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,16 +176,11 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
     return one, two
 
 
-def _is_placed(fitted: Fitted) -> bool:
-    """Say whether it is known where the nominal robot stood."""
-    return bool(len(fitted.nominal.stations)) and set(fitted.cell.station_names) <= set(fitted.nominal.station_names)
-
-
 def _station(fitted: Fitted, frame: str) -> int:
     names = fitted.cell.station_names
     if frame not in ("nominal", *names):
         raise UsageError(f"frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
-    if not _is_placed(fitted):
+    if not fitted.placed:
         raise UsageError(
             f"{fitted.folder} does not say where the nominal robot stood (it was fitted from an earlier fit's folder, "
             "by an earlier version, or without an instrument): frame 'base' is left"
@@ -224,74 +235,66 @@ def compensate(
         UsageError: for a tolerance that is none, and a start beyond the limits.
     """
     if not (np.isfinite(tolerance).all() and min(tolerance) > 0.0):
-        raise UsageError(
-            f"tolerance {1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad: expected two sizes above 0"
-        )
+        given = f"{1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad"
+        raise UsageError(f"tolerance {given}: expected two sizes above 0")
     say = progress or (lambda words: None)
     one, two = placements(fitted, frame, tool)
-    count, notes = _dof(targets, one.chain, dof)
+    count, note = _dof(targets, one.chain, dof)
     lower, upper = one.chain.lower, one.chain.upper
-    if (
-        start is not None
-        and not ((np.asarray(start) >= lower - LIMIT_TOLERANCE) & (np.asarray(start) <= upper + LIMIT_TOLERANCE)).all()
-    ):
+
+    def inside(q: np.ndarray) -> np.ndarray:
+        return np.all((q >= lower - LIMIT_TOLERANCE) & (q <= upper + LIMIT_TOLERANCE), axis=-1)
+
+    if start is not None and not inside(np.asarray(start)):
         raise UsageError(f"start {list(start)}: beyond the joints' limits {lower.tolist()} to {upper.tolist()}")
     before = Goal(one, count, lower, upper)
-    after = Goal(two, count, lower, upper, torques_of(fitted))
+    after = Goal(two, count, lower, upper, fitted.torques)
     say("the nominal robot at the targets")
-    wanted, q0 = _wanted(before, targets, start, seed)
+    poses, q0 = _reference(before, targets, start, seed)
+    held = np.clip(q0, lower, upper)
     say("the calibrated robot")
-    q = inverse.reach(after, wanted, q0)
-    q = inverse.nearest(after, wanted, np.clip(q0, lower, upper), q)
+    q = inverse.nearest(after, poses, held, inverse.reach(after, poses, q0))
     far = np.flatnonzero(np.abs(q - q0).max(axis=1, initial=0.0) > MAX_CORRECTION)
-    q[far] = inverse.held_back(after, wanted[far], q0[far], MAX_CORRECTION)
-    left = _sizes(inverse.differences(after, q, wanted))
-    reached = _within(left, tolerance) & ((q0 >= lower - LIMIT_TOLERANCE) & (q0 <= upper + LIMIT_TOLERANCE)).all(axis=1)
+    q[far] = inverse.held_back(after, poses[far], q0[far], MAX_CORRECTION)
+    left, missed = (_sizes(inverse.differences(after, each, poses)) for each in (q, held))
+    reached = _within(left, tolerance) & inside(q0)
     singular = inverse.conditions(after, q0) < SINGULAR
-    reason = tuple("" if good else _why(one.chain, *row) for good, *row in zip(reached, q0, q, left, singular))
+    beyond = np.zeros(q.shape, bool) if fitted.learnt is None else np.atleast_2d(outside(q, fitted.learnt))
+    found = (
+        _extrapolated(one.chain, out) if good else _missed(one.chain, *row)
+        for good, out, *row in zip(reached, beyond, q0, q, left, singular)
+    )
+    reason = tuple("" if each is None else sentence(each) for each in found)
     say("sigmas")
     sigma, expected = _predicted_sigmas(fitted, q, frame, tool, after)
-    beyond = np.zeros(q.shape, bool) if fitted.learnt is None else outside(q, fitted.learnt)
-    reason = tuple(why or _extrapolates(one.chain, row) for why, row in zip(reason, np.atleast_2d(beyond)))
-    missed = _sizes(inverse.differences(after, np.clip(q0, lower, upper), wanted))
     if count == 3:
         sigma[:, 1] = np.nan
-    words = (_frame_words(fitted, frame), _tool_words(tool), *notes, *_turn_words(fitted, count))
+    notes = (_frame_note(fitted, frame), finding("at-targets", tool=tool), note, *_turn_note(fitted, count))
     own = None
-    if frame == "base" and _is_placed(fitted):
+    if frame == "base" and fitted.placed:
         placed, real = placements(fitted, "nominal", tool)
-        held = np.clip(q0, lower, upper)
-        goal = Goal(real, count, lower, upper, torques_of(fitted))
-        own = _sizes(inverse.differences(goal, held, see(placed, held).poses()))
-    return Commands(targets, fitted, q, q0, reached, reason, left, missed, sigma, expected, beyond, count, words, own)
+        own = _sizes(inverse.differences(replace(after, cell=real), held, see(placed, held).poses()))
+    return Commands(
+        targets, fitted, q, q0, reached, reason, left, missed, sigma, expected, beyond, count, tuple(lines_of(notes)),
+        own,
+    )  # fmt: skip
 
 
-def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, tuple[str, ...]]:
+def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, Finding]:
     """Return how much of a pose counts, and what to say of it."""
-    given = 3 if targets.q is None and targets.rotation is None else 6
-    given = 3 if targets.position is not None and targets.rotation is None else given
-    able = 6 if chain.n >= 6 else 5 if chain.n == 5 else 3
+    oriented = targets.rotation is not None or (targets.q is not None and targets.position is None)
+    given, able = 6 if oriented else 3, 6 if chain.n >= 6 else 5 if chain.n == 5 else 3
     if asked not in (None, *inverse.DOF):
         raise UsageError(f"dof {asked}: expected 6, 5 (free to turn about the tool's z), or 3")
     if asked is not None and asked > given:
         raise UsageError(f"{targets.file}: has positions without an orientation: dof {asked} needs qx qy qz qw")
     dof = asked or min(given, able)
     what = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
-    why = f", all that {chain.n} joints can do" if asked is None and able < given else ""
-    return dof, (f"what counts: {what[dof]}{why}",)
+    joints = chain.n if asked is None and able < given else None
+    return dof, finding("what-counts", what=what[dof], joints=joints)
 
 
-def torques_of(fitted: Fitted) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return gravity torques as the fit took them, of the nominal arm; None where no deflection needs them."""
-    if not any(term.basis == "torque" for term in fitted.cell.deflection.terms):
-        return None
-    from calib.dynamics.gravity import gravity_torques
-
-    chain = fitted.nominal.chain
-    return lambda q: gravity_torques(chain, q)
-
-
-def _wanted(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the targets' poses (m, 4, 4) and the nominal robot's joints (m, n) there."""
     if targets.position is None:
         assert targets.q is not None
@@ -329,24 +332,22 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
     return (sizes[:, 0] <= tolerance[0]) & ~(sizes[:, 1] > tolerance[1])
 
 
-def _why(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool) -> str:
-    """Say why a target is not reached, from what is left there (2,) [m, rad]."""
-    rest = f"{1e3 * left[0]:.3g} mm" + ("" if np.isnan(left[1]) else f" and {1e3 * left[1]:.3g} mrad")
+def _missed(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool) -> Finding:
+    """Return why a target is not reached, from what is left there (2,) [m, rad]."""
+    rest = {"left": left[0], "turn": None if np.isnan(left[1]) else left[1]}
     for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
         if not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
-            return f"the target itself is outside the limits {low:.4g} to {high:.4g} of {name} ({value:.4g})"
-    at = [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]
-    if at:
-        return f"{', '.join(at)} at a limit: {rest} left"
-    if singular and left[0] < ASTRAY:
-        return f"near a singularity: joints would move more than {MAX_CORRECTION:g} rad or cannot follow: {rest} left"
-    return f"out of reach: {rest} left at the nearest pose found"
+            return finding("target-outside-limits", joint=name, value=value, low=low, high=high)
+    if at := [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]:
+        return finding("at-limit", joints=at, **rest)
+    code = "near-singularity" if singular and left[0] < ASTRAY else "out-of-reach"
+    return finding(code, most=MAX_CORRECTION, **rest)
 
 
-def _extrapolates(chain: Chain, beyond: np.ndarray) -> str:
-    """Say which joints (n,) of a command stand outside the range that was measured."""
-    names = ", ".join(name for name, out in zip(chain.joint_names, beyond) if out)
-    return f"extrapolated: {names} outside the range that was measured" if names else ""
+def _extrapolated(chain: Chain, beyond: np.ndarray) -> Finding | None:
+    """Return which joints (n,) of a command stand outside the range that was measured."""
+    names = [name for name, out in zip(chain.joint_names, beyond) if out]
+    return finding("command-extrapolates", joints=names) if names else None
 
 
 def _predicted_sigmas(
@@ -372,36 +373,24 @@ def _predicted_sigmas(
     return own, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
 
 
-def _frame_words(fitted: Fitted, frame: str) -> str:
-    """Say in which frame targets were taken to be, and how far its alternative is."""
+def _frame_note(fitted: Fitted, frame: str) -> Finding:
+    """Return in which frame targets were taken to be, and how far its alternative is."""
     if frame not in ("base", "nominal"):
-        return f"targets are in the instrument's frame, station '{frame}'"
-    words = {
-        "base": "targets are in the calibrated robot's base, as robot.toml has it (frame 'base')",
-        "nominal": "targets are in the nominal robot's base where it fits the measurements best (frame 'nominal')",
-    }[frame]
-    if not _is_placed(fitted):
-        return words
-    between = invert(fitted.nominal.stations[0]) @ fitted.cell.stations[0]
-    other = {"base": "the nominal robot's best base", "nominal": "the calibrated robot's base"}[frame]
-    shift, turn = np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))
-    return f"{words}; {other} stands {1e3 * shift:.2f} mm and {1e3 * turn:.2f} mrad from it"
+        return finding("targets-in-station", station=frame)
+    shift = turn = None
+    if fitted.placed:
+        between = invert(fitted.nominal.stations[0]) @ fitted.cell.stations[0]
+        shift, turn = np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))
+    return finding("targets-in-base" if frame == "base" else "targets-in-nominal-base", shift=shift, turn=turn)
 
 
-def _turn_words(fitted: Fitted, dof: int) -> tuple[str, ...]:
-    """Say where orientations count and were never measured."""
+def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
+    """Return that orientations count and were never measured."""
     table = layout(fitted.cell)
-    measured = {table.names[k] for k in fitted.free if k in set(table.tool_index)}
+    measured = {table.names[k] for k in np.intersect1d(fitted.free, table.tool_index)}
     if dof == 3 or any(name.rsplit(".", 1)[-1] in ("rx", "ry", "rz") for name in measured):
-        return ()
-    return ("the fit saw no orientations: how the flange is turned behind the last joint axis stays nominal",)
-
-
-def _tool_words(tool: str) -> str:
-    """Say which tool stands at the targets."""
-    if tool == "flange":
-        return "what stands there is the flange (tool 'flange')"
-    return f"what stands there is the tool '{tool}'"
+        return []
+    return [finding("no-orientations-measured")]
 
 
 SHOWN = 20  # targets that a message lists
@@ -411,8 +400,11 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def _header(names: Sequence[str]) -> list[str]:
-    return ["row", *names, "status", *COLUMNS, "reason"]
+def _unreached(commands: Commands) -> list[str]:
+    """Return which targets are not reached, and why; at most `SHOWN` of them."""
+    lost = np.flatnonzero(~commands.reached)
+    more = [f"{len(lost) - SHOWN} more"] if len(lost) > SHOWN else []
+    return [*(f"target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]), *more]
 
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
@@ -422,13 +414,11 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         UsageError: where targets are not reached and `partial` does not allow that; nothing is written.
     """
     fitted, targets = commands.fitted, commands.targets
-    lost = np.flatnonzero(~commands.reached)
-    if len(lost) and (not partial or len(lost) == len(commands.q)):
-        shown = [f"  target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]]
-        shown += [f"  and {len(lost) - SHOWN} more"] if len(lost) > SHOWN else []
-        advice = "" if len(lost) == len(commands.q) else "\npartial (--partial) writes the others, these rows empty"
-        head = f"{targets.file}: {len(lost)} of {len(commands.q)} targets are not reached; nothing was written"
-        raise UsageError("\n".join([head, *shown]) + advice)
+    lost, count = int(np.sum(~commands.reached)), len(commands.q)
+    if lost and (not partial or lost == count):
+        advice = "" if lost == count else "\npartial (--partial) writes the others, these rows empty"
+        head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
+        raise UsageError("\n  ".join([head, *_unreached(commands)]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names
     factors = np.array(targets.factors or [1.0] * len(names))
     unseen = None if fitted.unseen is None else 1e3 * fitted.unseen
@@ -441,59 +431,42 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         known = None if fitted.learnt is None else int(commands.beyond[k].any())
         status = "reached" if good else "not reached"
         rows.append((k + 1, *q, status, *cells, unseen, *there, known, commands.reason[k]))
-    return files.write_table(out, _header(names), rows)
+    return files.write_table(out, ["row", *names, "status", *COLUMNS, "reason"], rows)
 
 
 def lines(commands: Commands) -> list[str]:
     """Return what a person should know of the commands."""
-    good, targets = commands.reached, commands.targets
+    good, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []
-    result += [f"not reached: target {k + 1}: {commands.reason[k]}" for k in np.flatnonzero(~good)[:SHOWN]]
-    result += [f"not reached: {int((~good).sum()) - SHOWN} more"] if (~good).sum() > SHOWN else []
-    errors = (commands.before, commands.left, commands.sigma)
-    before, left, sigma = (_pair(np.sqrt(np.mean(each[good] ** 2, axis=0))) for each in errors)
-    apart = ""
-    if commands.own is not None:
-        own = _pair(np.sqrt(np.mean(commands.own[good] ** 2, axis=0)))
-        apart = f" ({own} are the arm's own, the rest is where its base stands: --frame nominal leaves that out)"
-    result += [
-        f"by the calibrated model, rms over {int(good.sum())} targets: {before} without compensation{apart}, "
-        f"{left} with it; sigma of the model {sigma}"
+    result += [f"not reached: {words}" for words in _unreached(commands)]
+    before, left, sigma, own = (
+        None if each is None else _pair(np.sqrt(np.mean(each[good] ** 2, axis=0)))
+        for each in (commands.before, commands.left, commands.sigma, commands.own)
+    )
+    found = [
+        finding("compensated", count=int(good.sum()), before=before, own=own, left=left, sigma=sigma),
+        _expectation(commands),
     ]
-    result += [_expectation(commands), *_extrapolation(commands)]
+    out = commands.beyond & good[:, None]
+    if out.any():
+        names = [fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1])]
+        count = int(out.any(axis=1).sum())
+        found.append(finding("commands-extrapolate", count=count, of=int(good.sum()), joints=names))
     most = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
-    return [*result, f"joints move by {1e3 * most:.3g} mrad (mm) at most"]
+    return [*result, *lines_of([*found, finding("joints-move", most=most)])]
 
 
-def _expectation(commands: Commands) -> str:
-    """Say what to expect of the real arm at these targets, by the error model where there is one."""
-    good, fitted = commands.reached, commands.fitted
-    apart = "" if fitted.unseen is None else f"; {1e3 * fitted.unseen:.3g} mm rms were found on poses not fitted"
+def _expectation(commands: Commands) -> Finding:
+    """Return what to expect of the real arm at these targets, by the error model where there is one."""
+    good, unseen = commands.reached, commands.fitted.unseen
     if commands.expected is not None:
-        rms = np.sqrt(np.mean(commands.expected[good, 0] ** 2))
-        within = commands.expected[good, 1].max()
-        return (
-            f"what to expect of the real arm at these targets: {1e3 * rms:.3g} mm rms, at the worst one 95 % within "
-            f"{1e3 * within:.3g} mm{apart}"
-        )
-    if fitted.unseen is not None and not commands.beyond[good].any():
-        return f"what to expect of the real arm: {1e3 * fitted.unseen:.3g} mm rms, as on poses not fitted"
-    known = "" if fitted.fitted is None else f" ({1e3 * fitted.fitted:.3g} mm rms on the fitted ones)"
-    why = f"the fit had no unseen poses{known}" if fitted.unseen is None else "targets outside the range measured"
-    return f"{why}: nothing says what to expect of the real arm{apart}"
-
-
-def _extrapolation(commands: Commands) -> list[str]:
-    """Say how many targets extrapolate, and which joints."""
-    out = commands.beyond & commands.reached[:, None]
-    if not out.any():
-        return []
-    names = ", ".join(commands.fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1]).tolist())
-    return [
-        f"EXTRAPOLATED: {int(out.any(axis=1).sum())} of {int(commands.reached.sum())} targets have joints outside the "
-        f"range that was measured ({names}): no measurement proves the arm there; measure poses like them"
-    ]
+        rms, within = np.sqrt(np.mean(commands.expected[good, 0] ** 2)), commands.expected[good, 1].max()
+        return finding("expected-at-targets", rms=rms, within=within, unseen=unseen)
+    if unseen is None:
+        return finding("nothing-unseen", fitted=commands.fitted.fitted)
+    code = "expected-beyond-range" if commands.beyond[good].any() else "expected-as-unseen"
+    return finding(code, unseen=unseen)
 
 
 def _pair(values: np.ndarray) -> str:

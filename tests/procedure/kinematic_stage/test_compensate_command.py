@@ -138,10 +138,10 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     write(here / "t.csv", [f"q{k + 1} [deg]" for k in range(6)], np.rad2deg(q))
     code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
     assert code == 0, err
-    assert "calibrated robot's base" in out and "the flange" in out
+    assert "calibrated robot's base" in out and "tool 'flange'" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
     found = compensation.read(fitted)
-    goal = Goal(compensation.placements(found)[1], torques=compensation.torques_of(found))
+    goal = Goal(compensation.placements(found)[1], torques=found.torques)
     at = inverse.seen_at(goal, sent).poses()
     position, turn = off(at, forward(cell.nominal, q))
     assert position < 1e-7 and turn < 1e-7
