@@ -16,7 +16,7 @@ from calib.identification.methods.registry import VERSIONS
 from calib.procedure.report.console import rendered
 from calib.rooms.studies.conditions import Condition, read_study, shipped
 from calib.rooms.studies.experiment import make_experiment
-from calib.rooms.studies.reports.report import console_table
+from calib.rooms.studies.reports.report import condition_table
 from calib.rooms.studies.summary import MIN_DATA_SETS, sign_test, summarise
 from calib.rooms.studies.trial import FOUND, NOT_RECORDED, run_trial
 
@@ -172,7 +172,7 @@ def test_a_terminal_shows_figures_whole(tmp_path: Path):
     study = read_study([written(tmp_path)])
     found = [replace(ROW, digest=study.conditions[0].digest, seed=k, torque_error=0.00123 * (k + 1)) for k in range(9)]
     text = StringIO()
-    Console(width=100, file=text).print(*rendered([console_table(summarise(study, found)[0])]))
+    Console(width=100, file=text).print(*rendered([condition_table(summarise(study, found)[0])]))
     assert "0.00369–0.00861" in text.getvalue()
 
 

@@ -19,7 +19,7 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import LoopMetrics
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
-from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text, relative_sigma
+from calib.procedure.report.page import Block, Column, KeyFigure, Pictures, Section, Table, Text, relative_sigma, table
 from calib.records import read_rows, typed_rows
 from calib.robot.chain import Chain
 from calib.units import small
@@ -34,9 +34,22 @@ ERROR_NOTE = (
     "no model of q, v, a explains. ACF outside: share of the residual's autocorrelations beyond the 95 % bounds of "
     "white noise; 5 % if it is white."
 )
-EFFECTS_HEADER = (
-    "geometric error", "sigma", "moves most", "by, in its sigma of torque", "parameters moved", "torque rms [N m]",
-)  # fmt: skip
+EFFECTS = (
+    Column("geometric error", "{0.element}", number=False),
+    Column("sigma", lambda one: small(one.sigma, one.unit)),
+    Column("moves most", "{0.parameter}", number=False),
+    Column("by, in its sigma of torque", "{0.shift_sigma:.2f}"),
+    Column("parameters moved", "{0.parameters_moved}"),
+    Column("torque rms [N m]", lambda one: f"{one.torque_rms or 0.0:.2g}"),
+)
+PARAMETERS = (
+    Column("parameter", "{0.name}", number=False),
+    Column("unit", "{0.unit}", number=False),
+    Column("value", "{0.value:.4g}"),
+    Column("σ", lambda row: "" if row.sigma is None else f"{row.sigma:.2g}"),
+    Column("RSD", lambda row: relative_sigma(row.rsd)),
+    Column("what it holds", lambda row: _shortened(row.expression), number=False),
+)
 FED_FORWARD = {
     FEEDBACK: "feedback alone", CAD: "CAD fed forward", IDENTIFIED: "model fed forward",
     FLOOR: "measured torque fed forward",
@@ -147,7 +160,8 @@ def certificate_section(
     blocks.append(Text("The model", _model_sentences(metrics)))
     blocks.append(Text("What the motion identifies", _identifiability(found)))
     blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
-    blocks += [*pictures("parameters"), _parameter_table(found)]
+    note = "R marks parameters into which others are regrouped; in full in 8-dynamics/estimate.csv."
+    blocks += [*pictures("parameters"), table("Identified parameters", PARAMETERS, found.estimate, note)]
     if metrics.loop:
         blocks.append(Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(metrics.tracking, metrics.tracking_failure)
@@ -304,18 +318,10 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
             f"not part of it is how level the base stands: 1 mrad against gravity would move {tilt.parameter} by "
             f"{tilt.sigmas:.2g} of its sigma of torque noise"
         )
-    rows = [
-        (
-            one.element, small(one.sigma, one.unit), one.parameter,
-            f"{one.shift_sigma:.2f}", str(one.parameters_moved), f"{one.torque_rms or 0.0:.2g}",
-        )
-        for one in effects
-        if one.matters == "yes" and one.sigma is not None and one.shift_sigma is not None
-    ]  # fmt: skip
+    known = [one for one in effects if one.matters == "yes" and None not in (one.sigma, one.shift_sigma)]
     blocks: list[Block] = [Text("Geometry and dynamics", lines)]
-    if found.changed and rows:
-        title = "Which geometric errors matter for the dynamics"
-        blocks.append(Table(title, EFFECTS_HEADER, rows[:SHOWN], numbers=(1, 3, 4, 5)))
+    if found.changed and known:
+        blocks.append(table("Which geometric errors matter for the dynamics", EFFECTS, known[:SHOWN]))
     return blocks
 
 
@@ -410,14 +416,5 @@ def _identifiability(found: DynamicReport) -> list[str]:
     return lines
 
 
-def _parameter_table(found: DynamicReport) -> Table:
-    """Return the identified parameters with σ and RSD, and what is regrouped in them."""
-    rows = []
-    for row in found.estimate:
-        words = row.expression
-        words = words if len(words) <= WORDS else f"{words[:WORDS].rsplit(' ', 2)[0]} …"
-        sigma = "" if row.sigma is None else f"{row.sigma:.2g}"
-        rows.append((row.name, row.unit, f"{row.value:.4g}", sigma, relative_sigma(row.rsd), words))
-    note = "R marks parameters into which others are regrouped; in full in 8-dynamics/estimate.csv."
-    header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
-    return Table("Identified parameters", header, rows, note, numbers=range(2, 5))
+def _shortened(words: str) -> str:
+    return words if len(words) <= WORDS else f"{words[:WORDS].rsplit(' ', 2)[0]} …"

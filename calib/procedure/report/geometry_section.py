@@ -7,14 +7,24 @@ from pathlib import Path
 import numpy as np
 
 from calib.geometry.accuracy import ErrorStatistics, rms_sigma
-from calib.geometry.checks.repeatability import RepeatedPose
 from calib.geometry.model_choice.ladder import ModelStep
 from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report.fit_report import Report
-from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text, relative_sigma
+from calib.procedure.report.page import (
+    Block,
+    Column,
+    KeyFigure,
+    Picture,
+    Pictures,
+    Section,
+    Table,
+    Text,
+    relative_sigma,
+    table,
+)
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
@@ -23,10 +33,29 @@ MAX_ROWS = 60  # parameters beyond which joint corrections are not listed
 MAX_POSES = 30  # repeated poses that are listed
 MAX_OUTLIERS = 20
 MAX_NAMED_OUTLIERS = 8  # outliers named in a sentence
-ISO_HEADER = (
-    "pose", "cycles", "AP nominal [mm]", "AP calibrated [mm]", "x, y, z of it [mm]", "RP [mm]", "RP a, b, c [deg]",
-    "vAP [mm]",
-)  # fmt: skip
+LADDER = (
+    Column("model", "{0.model}", number=False),
+    Column("parameters", lambda step: _counted(step)),
+    Column("cross-validated rms [mm]", lambda step: _numbered(step.cross_validated_mm, 4)),
+    Column("remark", "{0.note}", number=False),
+)
+OUTLIERS = (
+    Column("file", lambda each: Path(each.file).name, number=False),
+    Column("row", "{0.row}"),
+    Column("residual", "{0.nature}", number=False),
+    Column("size", "{0.size}"),
+    Column("robust sigmas", "{0.sigmas:.1f}"),
+)
+REPEATED = (
+    Column("pose", "{0[0]}", number=False),
+    Column("cycles", lambda at: str(len(at[1].rows))),
+    Column("AP nominal [mm]", lambda at: f"{np.linalg.norm(at[1].nominal_mm):.3f}"),
+    Column("AP calibrated [mm]", lambda at: f"{np.linalg.norm(at[1].calibrated_mm):.3f}"),
+    Column("x, y, z of it [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
+    Column("RP [mm]", "{0[1].repeatability_mm:.3f}"),
+    Column("RP a, b, c [deg]", lambda at: ", ".join(f"{value:.4f}" for value in at[1].repeatability_deg)),
+    Column("vAP [mm]", lambda at: _numbered(at[1].multidirectional_mm, 3)),
+)
 ISO_NOTE = (
     "After ISO 9283: AP is the barycentre of a pose's cycles minus the command (what the arm's model says of these "
     "joints; station and tool as fitted), RP the mean distance from the barycentre plus three standard deviations, vAP "
@@ -84,7 +113,8 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks.append(_parameter_table(report))
     if metrics.outliers:
-        blocks.append(_outlier_table(metrics))
+        note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
+        blocks.append(table("Rows that do not fit", OUTLIERS, metrics.outliers, note, most=MAX_OUTLIERS))
     blocks.append(Text("Notes", metrics.warnings))
     return Section("Geometry", blocks, metrics.verdict, metrics.reason, _key_figures(report))
 
@@ -192,15 +222,8 @@ def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistic
 
 def _ladder_table(metrics: FitMetrics) -> Table:
     """Return the models tried with their error on held-out rows."""
-    rows, strong = [], set()
-    for step in metrics.ladder:
-        error = step.cross_validated_mm
-        if step.kept:
-            strong.add(len(rows))
-        rows.append((step.model, _counted(step), "" if error is None else f"{error:.4f}", step.note))
-    header = ("model", "parameters", "cross-validated rms [mm]", "remark")
     note = f"Chosen: {metrics.model}, {parameter_words(metrics)}."
-    return Table("Ladder of models", header, rows, note, frozenset(strong), (1, 2))
+    return table("Ladder of models", LADDER, metrics.ladder, note, lambda step: step.kept)
 
 
 def _counted(step: ModelStep) -> str:
@@ -257,20 +280,6 @@ def _outlier_sentences(metrics: FitMetrics) -> list[str]:
     return [f"{count} rows beyond 4 robust sigma, {how}: {worst}{more}"]
 
 
-def _outlier_table(metrics: FitMetrics) -> Table:
-    """Return the rows that do not fit, worst first."""
-    found = metrics.outliers
-    rows = [
-        (Path(each.file).name, str(each.row), each.nature, each.size, f"{each.sigmas:.1f}")
-        for each in found[:MAX_OUTLIERS]
-    ]
-    note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
-    if len(found) > MAX_OUTLIERS:
-        note += f" {len(found) - MAX_OUTLIERS} more in metrics.json."
-    header = ("file", "row", "residual", "size", "robust sigmas")
-    return Table("Rows that do not fit", header, rows, note, numbers=(1, 3, 4))
-
-
 def _identifiability(report: Report) -> list[str]:
     """Return which parameters are identifiable from the poses, in sentences."""
     values, rank, lines = report.singular_values, report.rank, []
@@ -306,17 +315,10 @@ def iso9283_tables(metrics: FitMetrics) -> list[Table]:
     result = []
     for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
         if iso := found.iso9283:
-            rows = [_iso_row(number, each) for number, each in enumerate(iso.each[:MAX_POSES], 1)]
-            if len(iso.each) > MAX_POSES:
-                rows.append(("…", f"{len(iso.each) - MAX_POSES} more in metrics.json", *[""] * 6))
             title = f"Accuracy and repeatability, {name} ({iso9283_sentence(iso)})"
-            result.append(Table(title, ISO_HEADER, rows, ISO_NOTE, numbers=range(1, 8)))
+            result.append(table(title, REPEATED, [*enumerate(iso.each, 1)], ISO_NOTE, most=MAX_POSES))
     return result
 
 
-def _iso_row(number: int, each: RepeatedPose) -> tuple[str, ...]:
-    sizes = [f"{float(np.linalg.norm(offset)):.3f}" for offset in (each.nominal_mm, each.calibrated_mm)]
-    axes = ", ".join(f"{value:+.3f}" for value in each.calibrated_mm)
-    turns = ", ".join(f"{value:.4f}" for value in each.repeatability_deg)
-    varied = "" if each.multidirectional_mm is None else f"{each.multidirectional_mm:.3f}"
-    return (str(number), str(len(each.rows)), *sizes, axes, f"{each.repeatability_mm:.3f}", turns, varied)
+def _numbered(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"

@@ -3,8 +3,9 @@
 `html` and `console` show the same values; nothing here knows of either, nor of a robot.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,31 @@ class Table:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+
+class Column(NamedTuple):
+    """A column of a table over records: its name, what a cell says of a record (``{0.sigma:.2g}``), and its side."""
+
+    name: str
+    cell: str | Callable[[Any], str]
+    number: bool = True
+
+    def of(self, record: Any) -> str:
+        """Return the cell of a record."""
+        return self.cell.format(record) if isinstance(self.cell, str) else self.cell(record)
+
+
+def table(
+    title: str, columns: Sequence[Column], records: Sequence[Any], note: str = "",
+    strong: Callable[[Any], bool] = lambda record: False, most: int | None = None,
+) -> Table:  # fmt: skip
+    """Return a table of records, a row for each, at most so many; those that are `strong` are set in bold."""
+    if most is not None and len(records) > most:
+        note, records = f"{note} {len(records) - most} more in metrics.json.", records[:most]
+    rows = [[column.of(record) for column in columns] for record in records]
+    bold = frozenset(k for k, record in enumerate(records) if strong(record))
+    numbers = [k for k, column in enumerate(columns) if column.number]
+    return Table(title, [column.name for column in columns], rows, note, bold, numbers)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def study(
     if len(seen) > max_shown:
         blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
     else:
-        blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]
+        blocks = [block for one in seen for block in (report.condition_table(one), *report.failures(one))]
     say(*console.rendered(blocks), result=True)
     say(*found.described(), f"written to {folder}: {report.REPORT} shows it")
 

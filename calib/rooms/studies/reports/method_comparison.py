@@ -31,7 +31,7 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.validation import overlaps, repeated_motion
 from calib.procedure.dynamic_stage.verdict import motion_warnings
 from calib.procedure.findings import Verdict
-from calib.procedure.report.page import Block, Section, Table, Text
+from calib.procedure.report.page import Block, Column, Section, Text, table
 
 APART, SLACK, ALIKE, QUICK = 2.0, 0.05, 2.0, 1.0  # our choices; the last in seconds
 LOOP = "needs the closed loop: state it in the options file, [loop] (calib formats identify-options)"
@@ -284,10 +284,20 @@ def _cells(*values: float) -> list[object]:
     return ["" if np.isnan(value) else value for value in values]
 
 
-SHOWN_COLUMNS = (
-    "", "method", "unseen [%]", "behind the best", "raw [%]", "training [%]", "worst joint", "parameters", "rounds",
-    "simulations", "seconds", "",
-)  # fmt: skip
+COLUMNS = (
+    Column("", "{0.rank}"),
+    Column("method", "{0.name}", number=False),
+    Column("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
+    Column("behind the best", lambda one: "" if one.rank == 1 else f"{one.behind:.2g} ± {one.behind_sigma:.2g}"),
+    Column("raw [%]", "{0.raw:.3g}"),
+    Column("training [%]", "{0.training:.3g}"),
+    Column("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
+    Column("parameters", "{0.parameters}"),
+    Column("rounds", "{0.iterations}"),
+    Column("simulations", "{0.simulations}"),
+    Column("seconds", "{0.seconds:.2g}"),
+    Column("", lambda one: "take" if one.chosen else "as good" if one.good else "", number=False),
+)
 
 
 def line(one: ComparedMethod) -> str:
@@ -308,22 +318,12 @@ def section(found: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
 def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     """Yield the ranked table, and why methods are not in it."""
     good = [one for one in found if not one.failure]
-    rows = [
-        (
-            str(one.rank), one.name, f"{one.unseen:.3g} ± {one.sigma:.2g}",
-            "" if one.rank == 1 else f"{one.behind:.2g} ± {one.behind_sigma:.2g}", f"{one.raw:.3g}",
-            f"{one.training:.3g}", f"{one.worst[0]}: {one.worst[1]:.3g} %", str(one.parameters), str(one.iterations),
-            str(one.simulations), f"{one.seconds:.2g}", "take" if one.chosen else "as good" if one.good else "",
-        )
-        for one in good
-    ]  # fmt: skip
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over "
         f"blocks of time; as good: within {APART:g} standard errors of the difference, or {SLACK:.0%}, of the best"
     )
-    strong = frozenset(k for k, one in enumerate(good) if one.chosen)
-    if rows:
-        yield Table("Methods", SHOWN_COLUMNS, rows, note, strong, (0, *range(2, len(SHOWN_COLUMNS) - 1)))
+    if good:
+        yield table("Methods", COLUMNS, good, note, lambda one: one.chosen)
     lines = [line(one) for one in found if one.failure]
     if lines:
         yield Text("Without an estimate", lines, "no estimate")

@@ -13,7 +13,7 @@ import base64
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata, resources
 from pathlib import Path
@@ -23,7 +23,7 @@ import numpy as np
 from calib import files
 from calib.errors import UsageError, require
 from calib.procedure.report.charts import Chart, Panel, box, line, picture, text
-from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
+from calib.procedure.report.page import Column, Picture, Pictures, Section, Table, Text, table
 from calib.procedure.report.style import AFTER, BEFORE, MARK
 from calib.rooms.studies import summary
 from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
@@ -89,18 +89,48 @@ MEANING = (
     "method goes below: it cannot rank.",
     "All are medians over trials; CPU is processor time of the method alone; p is the sign test's against the best.",
 )
-BESIDE = (  # figures in the order of the columns behind the quartiles
-    "torque_worst", "beta_error", "beta_sigma", "coverage", "survey_tau", "survey_q", "iterations", "simulations",
-    "cpu",
-)  # fmt: skip
-HEADER = (
-    "method", "trials", "failed", "torque [%]", "quartiles", "worst joint [%]", "β [%]", "in σ", "covered [%]",
-    "d_τ [%]", "d_q [%]", "rounds", "simulations", "CPU [s]", "p", "",
-)  # fmt: skip
-ON_CONSOLE = tuple(
-    HEADER.index(name)
-    for name in ("method", "trials", "failed", "torque [%]", "quartiles", "covered [%]", "CPU [s]", "")
+
+
+def _short(value: float) -> str:
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞"
+    return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.1e}"
+
+
+def _median(header: str, figure: str) -> Column:
+    return Column(header, lambda one: _short(one.figures[figure].median))
+
+
+def _quartiles(one: MethodSummary) -> str:
+    found = one.figures["torque_error"]
+    return f"{_short(found.lower)}–{_short(found.upper)}"
+
+
+def _mark(one: MethodSummary) -> str:
+    return "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
+
+
+COLUMNS = (
+    Column("method", "{0.method}", number=False),
+    Column("trials", "{0.trials}"),
+    Column("failed", lambda one: ", ".join(f"{count} {status}" for status, count in one.failures.items()) or "0"),
+    _median("torque [%]", "torque_error"),
+    Column("quartiles", _quartiles),
+    _median("worst joint [%]", "torque_worst"),
+    _median("β [%]", "beta_error"),
+    _median("in σ", "beta_sigma"),
+    _median("covered [%]", "coverage"),
+    _median("d_τ [%]", "survey_tau"),
+    _median("d_q [%]", "survey_q"),
+    _median("rounds", "iterations"),
+    _median("simulations", "simulations"),
+    _median("CPU [s]", "cpu"),
+    Column("p", lambda one: _short(one.p)),
+    Column("", _mark, number=False),
 )
+ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered [%]", "CPU [s]", "")
 
 
 def overview(conditions: Sequence[ConditionSummary]) -> Table:
@@ -166,21 +196,11 @@ def _described(one: Condition) -> str:
     return f"{one.robot}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
 
 
-def _condition_table(one: ConditionSummary) -> Table:
-    """Return all methods of a condition, best first."""
-    rows = [_line(method) for method in one.methods]
-    strong = frozenset(k for k, method in enumerate(one.methods) if method.chosen)
-    return Table(
-        f"Methods on {one.condition.name}", HEADER, rows, _described(one.condition), strong, range(1, len(HEADER) - 1)
-    )
-
-
-def console_table(one: ConditionSummary) -> Table:
-    """Return the columns of a condition's table that a terminal has room for."""
-    whole = _condition_table(one)
-    rows = [tuple(row[k] for k in ON_CONSOLE) for row in whole.rows]
-    header = tuple(HEADER[k] for k in ON_CONSOLE)
-    return replace(whole, header=header, rows=rows, numbers=range(1, len(header) - 1))
+def condition_table(one: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:
+    """Return all methods of a condition, best first; by default the columns that a terminal has room for."""
+    columns = [column for column in COLUMNS if column.name in names]
+    title = f"Methods on {one.condition.name}"
+    return table(title, columns, one.methods, _described(one.condition), lambda method: method.chosen)
 
 
 def failures(one: ConditionSummary) -> list[Text]:
@@ -191,30 +211,6 @@ def failures(one: ConditionSummary) -> list[Text]:
         for status, count in method.failures.items()
     ]
     return [Text("Without an estimate", said)] if said else []
-
-
-def _line(one: MethodSummary) -> tuple[str, ...]:
-    def median(name: str) -> str:
-        return _short(one.figures[name].median)
-
-    failed = ", ".join(f"{count} {status}" for status, count in one.failures.items())
-    mark = "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
-    return (
-        one.method, str(one.trials), failed or "0", median("torque_error"), _quartiles(one.figures["torque_error"]),
-        *map(median, BESIDE), _short(one.p), mark,
-    )  # fmt: skip
-
-
-def _short(value: float) -> str:
-    if math.isnan(value):
-        return "–"
-    if math.isinf(value):
-        return "∞"
-    return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.1e}"
-
-
-def _quartiles(found: Quartiles) -> str:
-    return f"{_short(found.lower)}–{_short(found.upper)}"
 
 
 def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], list[list[object]]]:
@@ -256,7 +252,7 @@ def make_page(
         if not one.methods:
             continue
         own = [row for row in rows if row.digest == one.condition.digest]
-        blocks = [_condition_table(one)]
+        blocks = [condition_table(one, [column.name for column in COLUMNS])]
         drawn = [Pictures("", [boxes(one, own)])] if plots else []
         blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))
