@@ -80,9 +80,9 @@ class Judged(ABC):
 
     def renderables(self) -> Iterator[Any]:
         """Yield what ``print`` shows, for a rich console."""
-        from calib.procedure.report import console
+        from calib.procedure.report import page
 
-        yield from console.section(self.section())
+        yield from page.section(self.section())
 
     def __str__(self) -> str:
         return as_text(self.renderables())

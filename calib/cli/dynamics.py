@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Out, Seed, progress, say, say_written
+from calib.cli.shared import Out, Seed, check_destination, progress, say, say_written
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
 
 app = typer.Typer()
@@ -39,9 +39,7 @@ def identify_dynamics(
         excitation: folder of calib excite: what it predicted is held against what is found
     """
     from calib.api.dynamic import identify_dynamics as identified
-    from calib.cli.shared import check_destination
-    from calib.procedure.report import console as shown
-    from calib.procedure.report import dynamics_section
+    from calib.procedure.report.dynamics_section import read_lines
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
     if excitation is not None:
@@ -51,7 +49,7 @@ def identify_dynamics(
 
     def read(given: Any) -> None:
         check_destination("identify", robot, out, [given.source, given.source.parent])
-        say(*shown.rendered(dynamics_section.read_blocks(given)))
+        say(*read_lines(given))
 
     with progress() as show:
         found = identified(
@@ -88,7 +86,6 @@ def excite(
         limits: TOML: speeds, torques, workspace, collision, friction
     """
     from calib.api.motions import design_excitation
-    from calib.cli.shared import check_destination
     from calib.workers import finishing
 
     check_destination("excite", robot, out, [robot, model, limits, *settings.existing])
@@ -144,7 +141,6 @@ def plan(
         drives: TOML: [drives] Ia, Fv, Fc, off, without --model
     """
     from calib.api.motions import plan_motion
-    from calib.cli.shared import check_destination
 
     check_destination("plan", robot, out, [robot, waypoints, model, limits, drives])
     with progress() as say:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from calib.cli.options import command
-from calib.cli.shared import Out, Seed, exit_failed, numbers, progress, say, say_written
+from calib.cli.shared import Out, Seed, check_destination, exit_failed, numbers, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 
 app = typer.Typer()
@@ -40,15 +40,13 @@ def fit(
         selection: CSV of calib select, or its folder: what it predicted is held against what is found
     """
     from calib.api.kinematic import fit_geometry
-    from calib.cli.shared import check_destination
-    from calib.procedure.report import console as shown
-    from calib.procedure.report import geometry_section
+    from calib.procedure.report.geometry_section import read_lines
 
     check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
     def read(given: Any) -> None:
         check_destination("fit", robot, out, [given.source])
-        say(*shown.rendered(geometry_section.read_blocks(given)))
+        say(*read_lines(given))
 
     with progress() as show:
         found = fit_geometry(

@@ -13,7 +13,7 @@ from study_rows import ROW
 
 from calib.errors import UsageError
 from calib.identification.methods.registry import VERSIONS
-from calib.procedure.report.console import rendered
+from calib.procedure.report.page import rendered
 from calib.rooms.studies.conditions import Condition, read_study, shipped
 from calib.rooms.studies.experiment import make_experiment
 from calib.rooms.studies.reports.report import condition_table

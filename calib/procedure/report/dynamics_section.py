@@ -103,7 +103,7 @@ def read(folder: Path) -> DynamicReport:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
 
 
-def read_blocks(inputs: IdentificationInputs) -> list[Block]:
+def read_lines(inputs: IdentificationInputs) -> list[str]:
     """Return robot and recordings as they were read, in sentences."""
     chain = inputs.chain
     lines = [str(inputs.robot)]
@@ -117,7 +117,7 @@ def read_blocks(inputs: IdentificationInputs) -> list[Block]:
         lines.append(
             f"{case.name.rstrip(':')}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}"
         )
-    return [Text("What was read", [*lines, *(f"  {note}" for note in inputs.notes)])]
+    return [*lines, *(f"  {note}".replace(":: ", ": ") for note in inputs.notes)]
 
 
 def outcome_section(outcome: IdentificationOutcome) -> Section:

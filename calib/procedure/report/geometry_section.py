@@ -69,7 +69,7 @@ ALONE_NOTE = (
 )
 
 
-def read_blocks(inputs: Inputs) -> list[Block]:
+def read_lines(inputs: Inputs) -> list[str]:
     """Return robot and measurements as they were read, in sentences."""
     chain = inputs.chain
     lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}"]
@@ -81,7 +81,7 @@ def read_blocks(inputs: Inputs) -> list[Block]:
     for name, unseen in inputs.unseen.items():
         role = "held out" if unseen.held_out else "validation"
         lines.append(f"{name}: {len(unseen.block)} rows of kind {unseen.block.kind} unseen ({role})")
-    return [Text("What was read", lines)]
+    return lines
 
 
 def outcome_section(metrics: FitMetrics) -> Section:

@@ -24,7 +24,7 @@ from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
-from calib.procedure.report import console
+from calib.procedure.report import page
 from calib.procedure.session import steps
 from calib.procedure.session.folder import UNSEEN, VERDICT, WAYS, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
@@ -170,7 +170,7 @@ LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
 HEAD = "# What the cell is like, as stated to calib new; calib formats limits says what may stand here.\n"
 COLOURS = {
-    **console.COLOURS, "done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow",
+    **page.COLOURS, "done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow",
     "waits": "yellow", "after": "dim", "failed": "red",
 }  # fmt: skip
 

@@ -39,7 +39,7 @@ def study(
         list_studies: the studies that come with the toolkit
     """
     from calib.identification.methods.registry import LISTING
-    from calib.procedure.report import console
+    from calib.procedure.report import page
     from calib.rooms.studies.reports import report
 
     if list_methods or list_studies:
@@ -62,7 +62,7 @@ def study(
         blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
     else:
         blocks = [block for one in seen for block in (report.condition_table(one), *report.failures(one))]
-    say(*console.rendered(blocks), result=True)
+    say(*page.rendered(blocks), result=True)
     say(*found.described(), f"written to {folder}: {report.REPORT} shows it")
 
 
@@ -95,7 +95,7 @@ def compare(
     from calib import files
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs
-    from calib.procedure.report import console
+    from calib.procedure.report import page
     from calib.rooms.studies.reports import method_comparison
     from calib.rooms.studies.reports.method_comparison import caveats, compare_methods, write_table
 
@@ -110,7 +110,7 @@ def compare(
         found = compare_methods(
             given, chosen, friction, progress, lambda one: say_now(method_comparison.line(one))
         )  # fmt: skip
-    say(*console.section(method_comparison.section(found, caveats(given, found))), result=True)
+    say(*page.section(method_comparison.section(found, caveats(given, found))), result=True)
     if out is not None:
         with files.results(table, overwrite=overwrite):
             say(f"written to {write_table(found, out)}")

@@ -24,7 +24,7 @@ from calib.identification.loop.replay import Replay
 from calib.identification.scores import PredictionErrors, RelativeErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.report import charts, console, dynamics_figures, dynamics_section
+from calib.procedure.report import charts, dynamics_figures, dynamics_section, page
 from calib.robot.calibrated import CalibratedChain
 from calib.units import motion_units
 
@@ -64,7 +64,7 @@ def test_a_second_ctrl_c_ends_as_the_first_would(monkeypatch):
 def test_names_in_brackets_reach_the_console():
     rms = {key: np.full(3, 1e-3) for key in ("feedback", "cad", "model", "floor")}
     one = Replay("log.npz", 30.0, None, True, (), np.zeros(3), rms, unseen=True)
-    *_, last = console.rendered(dynamics_section.tracking_blocks({"log.npz": one}))
+    *_, last = page.rendered(dynamics_section.tracking_blocks({"log.npz": one}))
     assert isinstance(last, Text) and "the controller of [loop];" in last.plain
 
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from calib.procedure.findings import PREDICTION_ONLY
-from calib.procedure.report import certificate, console
+from calib.procedure.report import certificate, page
 from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
 
 HOSTILE = "[bold]<script>alert(1)</script> & \"quoted\" 'one'[/]"
@@ -42,7 +42,7 @@ class Reader(HTMLParser):
 
 def printed(*blocks, width: int = 200, markup: bool = False) -> str:
     out = Console(file=StringIO(), width=width, highlight=False)
-    for line in console.rendered(blocks):
+    for line in page.rendered(blocks):
         out.print(line, soft_wrap=True, markup=markup)
     assert isinstance(out.file, StringIO)
     return out.file.getvalue()
