@@ -1,5 +1,7 @@
 """Frozen arrays and the one shape check."""
 
+from dataclasses import fields
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -11,6 +13,16 @@ def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
     array = np.array(values, dtype=dtype, order="C")
     array.flags.writeable = False
     return array
+
+
+class Frozen:
+    """Base of dataclasses whose fields annotated ``np.ndarray`` become read-only copies: of floats, or of flags."""
+
+    def __post_init__(self) -> None:
+        for one in fields(self):  # type: ignore[arg-type]
+            if one.type in (np.ndarray, "np.ndarray"):
+                value = np.asarray(getattr(self, one.name))
+                object.__setattr__(self, one.name, frozen(value, bool if value.dtype == bool else float))
 
 
 def shaped(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> np.ndarray:

@@ -15,8 +15,8 @@ from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
-from calib.identification.methods.method import MethodEntry
-from calib.identification.methods.registry import LISTING
+from calib.identification.methods.method import Method
+from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import plain
@@ -102,9 +102,9 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
         )
 
 
-def methods() -> tuple[MethodEntry, ...]:
+def methods() -> tuple[Method, ...]:
     """Return the methods of identification: ``name``, ``description``, ``source``, and what each ``needs``."""
-    return LISTING
+    return tuple(METHODS.values())
 
 
 @checked

@@ -211,20 +211,15 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
     return retriangulate(triangles.reshape(-1, p))
 
 
-def expressions(base: Base, digits: int = 5, smallest: float = MIN_COEFFICIENT) -> tuple[str, ...]:
-    """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``.
-
-    Args:
-        digits: significant digits of the coefficients.
-        smallest: coefficients below are left out.
-    """
+def expressions(base: Base) -> tuple[str, ...]:
+    """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``; small coefficients are left out."""
     lines = []
     for name, k, row in zip(base.names, base.kept, base.split.coefficients):
         text = base.standard[k]
         for coefficient, index in zip(row, base.split.dropped):
-            if abs(coefficient) < smallest:
+            if abs(coefficient) < MIN_COEFFICIENT:
                 continue
-            size = f"{float(f'{abs(coefficient):.12g}'):.{digits}g}"  # ties must not hang on the last bit
+            size = f"{float(f'{abs(coefficient):.12g}'):.5g}"  # ties must not hang on the last bit
             factor = "" if size == "1" else f"{size} "
             text += f" {'-' if coefficient < 0 else '+'} {factor}{base.standard[index]}"
         lines.append(f"{name} = {text}")

@@ -38,7 +38,6 @@ class Bodies:
         placements: (B, 4, 4) of the body's frame in its parent's at q = 0.
         gravity: (3,) in the base frame [m/s²].
         paths: (B, n) coordinates that move the body, in the order base to body, then -1.
-        depths: (B,) how many of them.
         links: (B, 4 + n) parent, kind, coordinate, depth and path of every body, for the kernels.
         constants: (B + 1, 13) the first three rows of every placement, between frames turned so that each moving axis
             is z, and the scale; gravity in the last row; for the kernels.
@@ -54,7 +53,6 @@ class Bodies:
     placements: np.ndarray
     gravity: np.ndarray
     paths: np.ndarray
-    depths: np.ndarray
     links: np.ndarray
     constants: np.ndarray
     order: np.ndarray
@@ -192,7 +190,6 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
         placements=frozen(placements),
         gravity=frozen(gravity),
         paths=frozen(paths, np.int64),
-        depths=frozen(depths, np.int64),
         links=frozen(np.column_stack([parents, kinds, coordinates, depths, paths]), np.int64),
         constants=frozen(constants),
         order=frozen([_PERMUTED[axis] for axis in axes], np.int64),

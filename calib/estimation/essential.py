@@ -34,7 +34,7 @@ class EliminationStep:
         rsd: its relative standard deviation before it went [%]; infinite for one at zero.
         ratio: largest over smallest RSD of all parameters before it went.
         f, p: statistic (x / σ)² of leaving it out, and the probability of a larger one if it is truly zero.
-        f_total, p_total: of leaving out all that went so far, against the base model.
+        p_total: of leaving out all that went so far, against the base model.
         residual_std: of the weighted residuals after it went.
         listed: it went because it was on the drop list.
     """
@@ -44,7 +44,6 @@ class EliminationStep:
     ratio: Number
     f: Number
     p: Number
-    f_total: Number
     p_total: Number
     residual_std: float
     listed: bool
@@ -132,10 +131,9 @@ def _step(
 ) -> EliminationStep:
     rsd = current.estimate.rsd
     f, p = nested_test(current, [worst])
-    f_total, p_total = nested_test(base, gone)
     spread = float(rsd.max() / rsd.min()) if rsd.min() > 0.0 else np.inf
     return EliminationStep(
-        current.estimate.names[worst], float(rsd[worst]), spread, f, p, f_total, p_total,
+        current.estimate.names[worst], float(rsd[worst]), spread, f, p, nested_test(base, gone)[1],
         smaller.estimate.residual_std, listed,
     )  # fmt: skip
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import frozen
+from calib.arrays import Frozen
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(Frozen):
     """p estimated parameters.
 
     Attributes:
@@ -25,10 +25,6 @@ class Estimate:
     covariance: np.ndarray
     residual_std: float
     dof: int
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", frozen(self.values))
-        object.__setattr__(self, "covariance", frozen(self.covariance))
 
     @property
     def sigma(self) -> np.ndarray:
@@ -51,3 +47,12 @@ class Estimate:
             (self.names[i], self.names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong])
         ]
         return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return [R z] (p, p + 1) of values and covariance (p, p), RᵀR = Σ⁻¹ and z = R x; variances of zero as if one."""
+    sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    sigma = np.where(sigma > 0.0, sigma, 1.0)
+    size, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    root = (axes / np.sqrt(np.maximum(size, 1e-13 * size[-1]))).T / sigma
+    return np.column_stack([root, root @ values])

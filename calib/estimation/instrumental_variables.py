@@ -40,7 +40,6 @@ class InstrumentStrength:
         names: p columns of W.
         correlations: (p,) canonical correlations between Z and W, falling; 1 where Z spans W, 0 where the rank fails.
         partial_r2: (p,) share of each column, cleaned of the others, that Z explains (Shea 1997).
-        first_stage_f: (p,) F of each column's regression on Z.
         cragg_donald: F of the weakest combination, (r - p) λ² / (1 - λ²) / p with λ the least correlation; above 10 the
             usual approximations hold (Staiger & Stock 1997).
         condition: condition number of Zᵀ W, columns of Z and W of unit norm.
@@ -49,7 +48,6 @@ class InstrumentStrength:
     names: tuple[str, ...]
     correlations: np.ndarray
     partial_r2: np.ndarray
-    first_stage_f: np.ndarray
     cragg_donald: float
     condition: float
 
@@ -200,21 +198,18 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     """
     p, rows = len(problem.names), int(problem.data.rows.sum())
     factor = combine(problem.data, std)
-    explained, rest = factor[:p, p : 2 * p], factor[p : 2 * p, p : 2 * p]
+    explained = factor[:p, p : 2 * p]
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
     correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
-    both, gone = np.sum(explained**2, axis=0), np.sum(rest**2, axis=0)
     cross = (factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)).T @ (explained / norms)
     least = correlations[-1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        first = np.where(gone > 0.0, both / gone, np.inf) * (rows - p) / p
         donald = float((rows - p) / p * np.divide(least, 1.0 - least))
     return InstrumentStrength(
         problem.names,
         correlations,
         _shea(explained / norms, factor[:, p : 2 * p] / norms),
-        first,
         donald,
         np.linalg.cond(cross),
     )

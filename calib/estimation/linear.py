@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import frozen, shaped
+from calib.arrays import Frozen, shaped
 from calib.errors import CalibError, NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
@@ -20,7 +20,7 @@ from calib.estimation.triangles import Triangles, combine, retriangulate, solve_
 
 
 @dataclass(frozen=True, eq=False)
-class LinearFit:
+class LinearFit(Frozen):
     """A linear estimate and what it rests on.
 
     Attributes:
@@ -34,9 +34,6 @@ class LinearFit:
     group_std: np.ndarray
     condition: float
     condition_normalised: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "group_std", frozen(self.group_std))
 
 
 def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:

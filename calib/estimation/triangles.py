@@ -110,14 +110,6 @@ def collect(
     return absorb(empty(names, units, count), matrix, target, 0 if group is None else group)
 
 
-def merge(first: Triangles, second: Triangles) -> Triangles:
-    """Return the triangles of both sets of rows, groups joined pairwise (parallel passes, several files)."""
-    if first.names != second.names or first.groups != second.groups:
-        raise CalibError("only triangles of the same parameters and groups merge")
-    factors = [retriangulate(np.vstack(pair)) for pair in zip(first.factors, second.factors)]
-    return replace(first, factors=frozen(np.stack(factors)), rows=frozen(first.rows + second.rows, int))
-
-
 def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
     """Return the triangles with the parameters of each set equal: one column, their sum, at the first one's place.
 

@@ -1,4 +1,4 @@
-"""What the residuals still hold: correlation in time, departure from the normal law, and the share explained."""
+"""Tests of residuals: correlation in time, departure from the normal law, share explained, scatter of their scores."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,8 @@ class Whiteness:
         acf, pacf: (lags,) at lags 1, 2, …
         bound: half width 1.96 / sqrt(N) in which 95 % of a white series' values lie.
         outside: share of the autocorrelations beyond the bound; 0.05 for a white series.
-        ljung_box, ljung_box_p: statistic and probability of a larger one in a white series.
-        skewness, kurtosis: of the residuals, 0 and 0 (excess) for normal ones.
+        ljung_box_p: probability of a larger statistic of Ljung and Box in a white series.
+        kurtosis: excess, 0 for normal residuals.
         normal_p: probability under the normal law, D'Agostino & Pearson (1973); it assumes independent residuals.
     """
 
@@ -27,9 +27,7 @@ class Whiteness:
     pacf: Array
     bound: Number
     outside: float
-    ljung_box: Number
     ljung_box_p: Number
-    skewness: Number
     kurtosis: Number
     normal_p: Number
 
@@ -46,11 +44,10 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
         raise CalibError(f"{len(x)} residuals are too few for {lags} lags; at least {max(lags + 1, 20)}")
     rho = autocorrelation(x, lags)
     bound = 1.96 / np.sqrt(len(x))
-    statistic, probability = ljung_box(rho, len(x))
     skewness, kurtosis = _shape(x)
     return Whiteness(
         frozen(rho), frozen(partial_autocorrelation(rho)), bound, float(np.mean(np.abs(rho) > bound)),
-        statistic, probability, skewness, kurtosis, _normality(skewness, kurtosis, len(x)),
+        ljung_box(rho, len(x))[1], kurtosis, _normality(skewness, kurtosis, len(x)),
     )  # fmt: skip
 
 
@@ -130,3 +127,37 @@ def r_squared(target: np.ndarray, residual: np.ndarray) -> float:
     """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative where the mean would predict better."""
     total = float(np.sum((target - np.mean(target)) ** 2))
     return 1.0 - float(np.sum(np.asarray(residual) ** 2)) / total if total > 0.0 else float("nan")
+
+
+def scatter(white: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return Σ_j σ_j² Σ_kl ρ_j(k - l) w_jk w_jlᵀ (p, p): the covariance of Σ_k W_kᵀ r_k.
+
+    σ_j², ρ_j are variance and autocorrelation of row j's residuals over one uninterrupted record, tapered linearly
+    (Bartlett 1946) so that the result is positive; its width is three times that of `whiteness.inflation`'s window.
+    Where noise was differentiated (accelerations) neighbours cancel and this is less than Σ σ_j² w wᵀ; where they are
+    alike, as in the error of a simulated motion, it is far more.
+
+    Args:
+        white: W (N, rows, p).
+        residual: r (N, rows); zero where a row is not in use.
+    """
+    white = shaped(white, (None, None, None), "rows")
+    residual = shaped(residual, white.shape[:2], "residuals")
+    count, p = len(white), white.shape[2]
+    size = 1 << (2 * count - 1).bit_length()
+    result = np.zeros((p, p))
+    min_lags = 12  # at least, of the residuals' autocorrelation
+    for row in range(white.shape[1]):
+        own, values = residual[:, row], white[:, row]
+        variance = float(np.mean(own**2))
+        if variance == 0.0 or count < 4 * min_lags:
+            result += variance * values.T @ values
+            continue
+        lags = int(min(count // 4, max(min_lags, 15 * inflation(own))))
+        rho = autocorrelation(own, lags) * (1.0 - np.arange(1, lags + 1) / (lags + 1.0))
+        kernel = np.zeros(size)
+        kernel[0], kernel[1 : lags + 1], kernel[size - lags :] = 1.0, rho, rho[::-1]
+        gain = np.fft.rfft(kernel).real
+        smooth = np.fft.irfft(np.fft.rfft(values, size, axis=0) * gain[:, None], size, axis=0)[:count]
+        result += variance * values.T @ smooth
+    return 0.5 * (result + result.T)

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.arrays import frozen
+from calib.arrays import Frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
-from calib.estimation.convex.cone_program import minimise
+from calib.estimation.constrained import minimise
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class _Plane:
 
 
 @dataclass(frozen=True, eq=False)
-class BodyCone:
+class BodyCone(Frozen):
     """What bodies and drives of a robot can make of its base parameters.
 
     Attributes:
@@ -42,10 +42,6 @@ class BodyCone:
     transform: np.ndarray
     labels: tuple[str, ...]
     positive: np.ndarray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "transform", frozen(self.transform))
-        object.__setattr__(self, "positive", frozen(self.positive, bool))
 
     def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
         """Return the plane that holds argmin ½ ‖R β - z‖² on the cone and lower <= A β <= upper; None where none does.

@@ -77,7 +77,6 @@ class GainRecord:
         told: see `DriveGains.told`.
         covariance: (n, n).
         unit, scale: of the gains, and what fixed it.
-        not_told: joints, from 1, whose gain is not identified.
     """
 
     values: Array
@@ -86,7 +85,6 @@ class GainRecord:
     covariance: Array
     unit: str
     scale: str
-    not_told: tuple[int, ...]
 
     @classmethod
     def of(cls, found: DriveGains, unit: str) -> GainRecord:
@@ -94,7 +92,7 @@ class GainRecord:
         told = np.array(found.told)
         return cls(
             np.where(told == "not told", np.nan, found.gains), np.where(told == "told", found.sigma, np.nan),
-            found.told, found.covariance, f"{unit} per A", found.scale, tuple(joint + 1 for joint in found.own),
+            found.told, found.covariance, f"{unit} per A", found.scale,
         )  # fmt: skip
 
 

@@ -17,21 +17,31 @@ from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
-from calib.identification.cases import Case
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.left_out.regimes import regimes
-from calib.identification.left_out.tempering import tempered_prior
-from calib.identification.left_out.time_folds import estimate
-from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop, require_robot
-from calib.identification.methods.loop_agreement import LoopDisagreement, disagreement
+from calib.identification.methods.bias import (
+    LoopDisagreement,
+    LoopTest,
+    compare_with_loop,
+    disagreement,
+    require_simulable,
+)
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
-from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, residual_inflation, scaled
-from calib.identification.rods import rods
-from calib.identification.rows import ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
+from calib.identification.prior import (
+    TEMPERING,
+    FirstFit,
+    Prior,
+    find_prior,
+    residual_inflation,
+    rods,
+    scaled,
+    tempered_prior,
+)
+from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, per_joint
+from calib.identification.time_folds import estimate, regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
@@ -145,7 +155,7 @@ def identify_model(
     require(cases, "no recording to identify from", UsageError)
     method = method_named(settings.method)
     if method.needs_simulation:
-        settings = require_loop(settings) if method.needs_controller else require_robot(settings)
+        settings = require_simulable(settings, method.needs_controller)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)
@@ -255,7 +265,7 @@ def _richer_friction(
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau if prior is None else tau * prior.tempering / TEMPERING,
         np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
-        None if prior is None else np.sqrt(TEMPERING) * prior.rows, settings.apart, model.torque_rows,
+        prior, settings.apart, model.torque_rows,
         frozenset(tuple(sorted({row for row, _ in one.acts})) for one in model.columns if len(one.acts) > 1),
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads

@@ -96,11 +96,8 @@ from calib.config_types import (  # fmt: skip
     Names,
     OneOf,
     OneOrMany,
-    Positive,
     Real,
     Spread,
-    Text,
-    Whole,
     shown,
 )
 from calib.data.recordings.recording import parse_cut
@@ -108,13 +105,9 @@ from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
-from calib.dynamics.torque_rows import ROWS, TorqueRows
+from calib.dynamics.torque_rows import MOTOR, ROWS, TorqueRows
 from calib.errors import CalibError, UsageError, refused_as
-from calib.identification.friction.friction_ladder import NAMES
-from calib.identification.loop.loop_settings import LoopSettings, check_loop
-from calib.identification.methods.registry import METHODS
-from calib.identification.parameter_constraints import ConstraintSettings
-from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
+from calib.identification.settings import Choices, Coupling, IdentificationSettings, Payload
 
 
 def _no_zero(value: Any) -> Any:
@@ -166,34 +159,17 @@ class TermTable:
 
 @checked
 @dataclass(frozen=True)
-class IdentifySettings:
+class IdentifySettings(Choices):
     """How to identify: the keys of the options file, see ``calib formats identify-options``.
 
-    None where nothing is said and the default of `calib.identification.settings.IdentificationSettings` stands. Tables
-    may be given as dictionaries: ``IdentifySettings(method="iv", filter={"cutoff": 20.0})``.
+    Tables may be given as dictionaries: ``IdentifySettings(method="iv", filter={"cutoff": 20.0})``.
     """
 
-    friction: Annotated[str, OneOf(NAMES)] | None = None
-    method: Annotated[str, OneOf(tuple(METHODS))] | None = None
-    weights: Annotated[str, OneOf(WEIGHTS)] | None = None
-    drives: Texts | None = None
-    passive: Text | None = None
-    v0: Annotated[tuple[Positive, ...], Spread()] | None = None
-    rows: Annotated[str, OneOf(tuple(ROWS))] | None = None
-    gravity: Annotated[tuple[float, float, float], Expect("three numbers [m/s²]")] | None = None
-    essential: Annotated[str, OneOf(RULES)] | None = None
-    ratio: Positive | None = None
-    level: Annotated[float, Real(above=0, most=1.0)] | None = None
-    keep: Names | None = None
-    drop: Names | None = None
-    prior: Annotated[str, OneOf(PRIORS)] | None = None
-    folds: Annotated[int, Whole(2, 50)] | None = None
-    samples: Annotated[int, Whole(1000, 10_000_000)] | None = None
+    drives: Texts = ()
+    rows: Annotated[str, OneOf(tuple(ROWS))] = MOTOR.name
     coupling: tuple[Coupling, ...] = ()
     term: tuple[TermTable, ...] = ()
     payload: Mapping[str, Payload] = field(default_factory=dict)
-    loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
-    constraints: ConstraintSettings | None = None
     slow: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
     cut_slow: Flag = False
     accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()
@@ -202,11 +178,6 @@ class IdentifySettings:
     filter: FilterOptions = field(default_factory=FilterOptions)
     gains: Gains | None = None
     files: Mapping[str, FileSettings] = field(default_factory=dict)
-
-
-_TABLES = ("loop", "slow", "gains", "gain_identification")  # beside the keys of `IdentificationSettings`
-_SETTINGS = [key.name for key in fields(IdentifySettings) if key.default is None and key.name not in _TABLES]
-_FIELDS = {"drives": "sets", "rows": "torque_rows"}  # where `IdentificationSettings` calls a key otherwise
 
 
 @dataclass(frozen=True)
@@ -272,12 +243,10 @@ def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOpti
     Raises:
         UsageError: for a term that cannot be, or a file's payload that is none.
     """
-    stated = {_FIELDS.get(key, key): getattr(read, key) for key in _SETTINGS if getattr(read, key) is not None}
-    if read.rows is not None:
-        stated["torque_rows"] = ROWS[read.rows]
     settings = IdentificationSettings(
-        **stated, couplings=read.coupling, terms=_terms(read.term, source), payloads=read.payload, loop=read.loop
-    )
+        **{key.name: getattr(read, key.name) for key in fields(Choices)}, sets=read.drives, torque_rows=ROWS[read.rows],
+        couplings=read.coupling, terms=_terms(read.term, source), payloads=read.payload,
+    )  # fmt: skip
     for name, file in read.files.items():
         check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
     every = FileSettings(read.recording, read.filter, gains=read.gains)

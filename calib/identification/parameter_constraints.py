@@ -9,23 +9,22 @@ Bodies that can exist are a cone (`calib.identification.body_cone`), which M(q) 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import numpy as np
 
-from calib.arrays import frozen
+from calib.arrays import Frozen, frozen
 from calib.config import strict
 from calib.config_types import Checked, Expect, Flag, Real, Text, Whole
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import NotConverged, UsageError, require, suggestion
-from calib.estimation.convex.cone_program import Definite
-from calib.estimation.convex.constrained import Constrained, within
-from calib.estimation.convex.constraint_relations import contradicting, restricted
+from calib.errors import Finding, NotConverged, UsageError, finding, refuse_option, require, suggestion
+from calib.estimation.constrained import Constrained, Definite, contradicting, restricted, within
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
 from calib.identification.body_cone import BodyCone, cone_of
@@ -33,20 +32,13 @@ from calib.records import Number
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 MIN_EIGENVALUE = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
-RAISED_BY, MAX_EIGENVALUE = (
-    10**0.5,
-    0.4,
-)  # factor and limit of the same where an estimate cannot be simulated (our choice)
+RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4  # factor and limit of it where an estimate cannot be simulated (our choice)
 
 
 def _in_order(value: Any) -> Any:
-    if (
-        isinstance(value, list | tuple)
-        and len(value) == 2
-        and all(type(x) in (int, float) for x in value)
-        and value[0] > value[1]
-    ):
-        raise ValueError(f"the lower bound {value[0]:g} is above the upper {value[1]:g}")
+    match value:
+        case [int() | float() as low, int() | float() as high] if low > high:
+            raise ValueError(f"the lower bound {low:g} is above the upper {high:g}")
     return value
 
 
@@ -60,6 +52,12 @@ class WeightedSum:
     most: float | None = None
     equal: float | None = None
     name: Text = ""
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lower and upper bound; infinite where there is none."""
+        low, high = (self.least, self.most) if self.equal is None else (self.equal, self.equal)
+        return -np.inf if low is None else low, np.inf if high is None else high
 
 
 Bounds = Annotated[
@@ -89,7 +87,7 @@ class ConstraintSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Constraints:
+class Constraints(Frozen):
     """What p columns must satisfy.
 
     Attributes:
@@ -112,12 +110,8 @@ class Constraints:
     least: float = MIN_EIGENVALUE
     likely: np.ndarray | None = None
 
-    def __post_init__(self) -> None:
-        for key in ("matrix", "lower", "upper", "inertia"):
-            object.__setattr__(self, key, frozen(getattr(self, key)))
-
     def solve(self, factor: np.ndarray) -> Constrained:
-        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.convex.constrained.within`.
+        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.constrained.within`.
 
         Raises:
             NotConverged: with the last β, where no robot of definite inertia satisfies the others.
@@ -126,16 +120,13 @@ class Constraints:
             return self.touched(factor).solve(factor)
         p = len(factor) - 1
         free = np.linalg.solve(factor[:p, :p], factor[:p, p])
-        try:
+        postures = f"M(q) positive definite in {len(self.inertia)} postures"
+        with _unsatisfied(f"no estimate satisfies {self} with {postures}: take bounds back, or record other motion"):
             wanted = _definite(self.inertia, free, self.least, self.likely)
             return within(factor, self.matrix, self.lower, self.upper, wanted)
-        except NotConverged as error:
-            raise NotConverged(
-                f"[constraints]: no estimate was found that satisfies {'; '.join(self.names) or 'them'}, with M(q) "
-                f"positive definite in {len(self.inertia)} postures: take bounds back, or tell them apart by motion "
-                f"({error})",
-                error.last,
-            ) from error
+
+    def __str__(self) -> str:
+        return "; ".join(self.names) or "them"
 
     def raised(self) -> Constraints | None:
         """Return these with M(q) three times as far from singular, None where it already is by `MAX_EIGENVALUE`.
@@ -153,14 +144,8 @@ class Constraints:
         """
         if self.cone is None:
             return self
-        try:
+        with _unsatisfied(f"no bodies that can exist satisfy {self}: take bounds back"):
             plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
-        except NotConverged as error:
-            raise NotConverged(
-                f"[constraints]: no bodies that can exist satisfy {'; '.join(self.names) or 'them'}: take bounds back "
-                f"({error})",
-                error.last,
-            ) from error
         if plane is None:
             return replace(self, cone=None)
         named = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
@@ -168,6 +153,15 @@ class Constraints:
             self, cone=None, plane=named, names=(*self.names, named), matrix=np.vstack([self.matrix, plane.normal]),
             lower=np.append(self.lower, plane.bound), upper=np.append(self.upper, np.inf),
         )  # fmt: skip
+
+
+@contextmanager
+def _unsatisfied(words: str) -> Iterator[None]:
+    """Say why no optimum was found, for an error raised inside."""
+    try:
+        yield
+    except NotConverged as error:
+        raise NotConverged(f"[constraints]: {words} ({error})", error.last) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,64 +184,49 @@ class Binding:
     bound: Number
     equality: bool
 
+    def findings(self, plane: str) -> list[Finding]:
+        """Return what a user should know of it; `plane`: name of the one that stands for bodies that can exist."""
+        sigmas = abs(self.free - self.bound) / max(self.sigma, 1e-300)
+        max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is named (our choice)
+        if self.name == plane:
+            return [finding("held-to-bodies", name=self.name, sigmas=sigmas)]
+        if self.equality and sigmas <= max_sigmas:
+            return []
+        code = "against-equality" if self.equality else "on-its-bound"
+        return [finding(code, name=self.name, free=self.free, sigma=self.sigma)]
+
 
 @dataclass(frozen=True, eq=False)
 class Held:
     """A constrained estimate beside the free one.
 
     Attributes:
-        names: of all constraints.
+        constraints: that were asked, bodies that can exist as a plane.
         solution: the optimum with its multipliers.
         binding: those that hold it.
         tight: indices of the postures in which M(q) is on its bound.
         free: the free estimate.
-        plane: name of the one that stands for bodies that can exist.
-        least: see `Constraints`.
     """
 
-    names: tuple[str, ...]
+    constraints: Constraints
     solution: Constrained
     binding: tuple[Binding, ...]
     tight: np.ndarray
     free: LinearFit
-    plane: str = ""
-    least: float = MIN_EIGENVALUE
 
     @property
     def postures(self) -> int:
         """Number of postures in which M(q) is on its bound."""
         return len(self.tight)
 
-    def lines(self) -> list[str]:
+    def findings(self) -> list[Finding]:
         """Return what a user should know of constraints that hold the estimate."""
-        told = []
-        max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is told (our choice)
-        for one in self.binding:
-            said = f"the data alone say {one.free:.3g} ± {one.sigma:.2g}"
-            if one.name == self.plane:
-                away = abs(one.free - one.bound) / max(one.sigma, 1e-300)
-                told.append(
-                    f"held to {one.name}: the data alone lie {away:.3g} standard deviations beyond; the motion is too "
-                    "poor, or the estimate is biased"
-                )
-            elif not one.equality:
-                told.append(
-                    f"an estimate sits on its bound, {one.name}: {said}; the bound may exclude the truth, or the "
-                    "estimate is biased"
-                )
-            elif abs(one.free - one.bound) > max_sigmas * one.sigma:
-                told.append(f"the data speak against {one.name}: {said}")
+        found = [one for each in self.binding for one in each.findings(self.constraints.plane)]
         if self.postures:
-            told.append(
-                f"M(q) is held positive definite in {self.postures} postures: the data alone give a robot that cannot "
-                "be there; the motion is too poor, or the estimate is biased"
-            )
-        if self.postures and self.least > MIN_EIGENVALUE:
-            told.append(
-                f"M(q) is kept {self.least / MIN_EIGENVALUE:.0f} times as far from singular as asked: nearer, the "
-                "controller cannot hold the simulated robot"
-            )
-        return told
+            found.append(finding("held-definite", postures=self.postures))
+            if self.constraints.least > MIN_EIGENVALUE:
+                found.append(finding("held-from-singular", times=self.constraints.least / MIN_EIGENVALUE))
+        return found
 
 
 def make_constraints(
@@ -256,71 +235,42 @@ def make_constraints(
     base: Base,
     names: Sequence[str],
     terms: Sequence[DriveTerm | None],
-    seed: int = 0,
 ) -> Constraints:
     """Return what the settings ask of the columns of an estimate.
 
     Args:
         names: (p,) of the columns: those of the base, then richer friction.
         terms: (p,) the drive term behind each column; None for parameters of bodies.
-        seed: of the postures.
 
     Raises:
         UsageError: for a name that is none, a bound without effect on the torques, bounds that contradict each other.
     """
-    p = len(names)
-    told, rows, lower, upper = [], [], [], []
-    for name, (low, high) in settings.bounds.items():
-        told.append(_words(name, low, high))
-        rows.append(_row({name: 1.0}, base, names))
-        lower.append(low)
-        upper.append(high)
+    asked: list[tuple[str, Mapping[str, float], float, float]]
+    asked = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
     for number, one in enumerate(settings.sum, 1):
-        low = one.equal if one.equal is not None else -np.inf if one.least is None else one.least
-        high = one.equal if one.equal is not None else np.inf if one.most is None else one.most
+        place, (low, high) = f"[[constraints.sum]] number {number}", one.limits
         named = one.name or " + ".join(f"{weight:g} {name}" for name, weight in one.weights.items())
-        if one.equal is not None and (one.least, one.most) != (None, None):
-            raise UsageError(f"[[constraints.sum]] number {number}: 'equal' goes without 'least' and 'most'")
+        twice = one.equal is not None and (one.least, one.most) != (None, None)
+        require(not twice, f"{place}: 'equal' goes without 'least' and 'most'", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
-            raise UsageError(f"[[constraints.sum]] number {number} ({named}): expected equal, or least <= most")
-        told.append(_words(named, low, high))
-        rows.append(_row(one.weights, base, names))
-        lower.append(low)
-        upper.append(high)
+            refuse_option(f"{place} ({named})", "expected equal, or least <= most")
+        asked.append((named, one.weights, low, high))
     if settings.signs:
-        stated = set(settings.bounds)
-        for k, one in enumerate(terms):
-            if one is not None and one.nonnegative and names[k] not in stated:
-                told.append(f"{names[k]} >= 0")
-                rows.append(np.eye(p)[k])
-                lower.append(0.0)
-                upper.append(np.inf)
-    matrix, low, high = np.reshape(rows, (-1, p)), np.array(lower, dtype=float), np.array(upper, dtype=float)
+        signed = [name for name, one in zip(names, terms) if one is not None and one.nonnegative]
+        asked += [(name, {name: 1.0}, 0.0, np.inf) for name in signed if name not in settings.bounds]
+    words = [_words(named, low, high) for named, _, low, high in asked]
+    matrix = np.reshape([_row(weights, base, names) for _, weights, _, _ in asked], (-1, len(names)))
+    low, high = (np.array([one[k] for one in asked], dtype=float) for k in (2, 3))
     against = contradicting(matrix, low, high) if len(matrix) else ()
     if against:
-        raise UsageError(
-            f"[constraints] contradict each other: {'; '.join(told[k] for k in against)}: no estimate satisfies them "
-            "together; take one of them back"
+        named = "; ".join(words[k] for k in against)
+        refuse_option(
+            "[constraints] contradict each other",
+            f"{named}: no estimate satisfies them together; take one of them back",
         )
     cone = cone_of(model, base) if settings.bodies and model.inertial else None
-    inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, p, seed)
-    return Constraints(tuple(told), matrix, low, high, inertia, cone)
-
-
-def signs(names: Sequence[str], positive: Sequence[str]) -> Constraints:
-    """Return x_j >= 0 for columns by name.
-
-    Raises:
-        UsageError: for a name that is none of the columns.
-    """
-    for name in positive:
-        require(name in names, f"'{name}' is none of the estimated parameters {', '.join(names)}", UsageError)
-    matrix = np.eye(len(names))[[list(names).index(name) for name in positive]]
-    count = len(positive)
-    return Constraints(
-        tuple(f"{name} >= 0" for name in positive), matrix, np.zeros(count), np.full(count, np.inf),
-        np.zeros((0, 0, 0, len(names))),
-    )  # fmt: skip
+    inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
+    return Constraints(tuple(words), matrix, low, high, inertia, cone)
 
 
 def hold(
@@ -349,11 +299,11 @@ def hold(
     )
     group = fit.group_std * np.sqrt(after / np.where(before > 0.0, before, np.inf))
     held = replace(fit, estimate=estimate, group_std=np.where(before > 0.0, group, fit.group_std))
-    return held, _told(constraints, found, fit)
+    return held, _binding(constraints, found, fit)
 
 
-def _told(constraints: Constraints, found: Constrained, free: LinearFit) -> Held:
-    """Return the constraints that bind, in words; multipliers come as `within` orders them."""
+def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> Held:
+    """Return the constraints that bind; multipliers come as `within` orders them."""
     same = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~same)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~same)
@@ -370,7 +320,7 @@ def _told(constraints: Constraints, found: Constrained, free: LinearFit) -> Held
             float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound), bool(same[places[k]]),
         ))  # fmt: skip
     tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
-    return Held(constraints.names, found, tuple(binding), tight, free, constraints.plane, constraints.least)
+    return Held(constraints, found, tuple(binding), tight, free)
 
 
 def _words(name: str, low: float, high: float) -> str:
@@ -394,13 +344,12 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
         elif name in base.standard:
             standard[base.standard.index(name)] += weight
         else:
-            raise UsageError(
-                f"[constraints]: '{name}' is no parameter of this model{suggestion(name, (*names, *base.standard))}; "
-                f"it estimates {', '.join(names)}"
-            )
+            similar = suggestion(name, (*names, *base.standard))
+            words = f"'{name}' is no parameter of this model{similar}; it estimates {', '.join(names)}"
+            refuse_option("[constraints]", words)
     own = standard[base.kept]  # T of the kept columns is the identity
     if np.abs(base.transform.T @ own - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
-        raise UsageError(_without_effect(weights, base))
+        refuse_option("[constraints]", _without_effect(weights, base))
     row[: base.b] += own
     require(row.any(), f"[constraints]: the weights of {', '.join(weights)} add to nothing", UsageError)
     return row
@@ -410,25 +359,18 @@ def _without_effect(weights: Mapping[str, float], base: Base) -> str:
     """Say why a sum of standard parameters cannot be constrained."""
     silent = [name for name in weights if name in base.without_effect]
     if silent:
-        return (
-            f"[constraints]: {', '.join(silent)} has no effect on the torques of this robot: a bound on it would say "
-            "nothing of the estimate; leave it out"
-        )
-    parts = [
-        line for line in bases.expressions(base)
-        if any(name in line.replace("=", " ").split() for name in weights)
-    ]  # fmt: skip
-    return (
-        f"[constraints]: {', '.join(weights)}: torques identify it only in sums with others: {'; '.join(parts[:4])}. "
-        "State the bound for such a sum"
-    )
+        return f"{', '.join(silent)} has no effect on the torques of this robot: leave the bound out"
+    lines = bases.expressions(base)
+    parts = [line for line in lines if any(name in line.replace("=", " ").split() for name in weights)]
+    sums = "; ".join(parts[:4])
+    return f"{', '.join(weights)}: torques identify it only in sums with others: {sums}. State the bound for such a sum"
 
 
-def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p: int, seed: int) -> np.ndarray:
+def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p: int) -> np.ndarray:
     """Return the tensor (K, n, n, p) of inertia matrices over random postures, each column that of an acceleration."""
     if not settings.inertia or not model.inertial or model.rows != model.n:
         return np.zeros((0, model.n, model.n, p))
-    q = bases.random_samples(model, settings.inertia, seed).q
+    q = bases.random_samples(model, settings.inertia).q
     count, n = q.shape
     still = np.zeros_like(q)
     rest = model.regressor(q, still, still)[:, :, base.kept]

@@ -8,17 +8,16 @@ from typing import Generic
 import numpy as np
 from typing_extensions import TypeVar
 
-from calib.arrays import frozen
+from calib.arrays import Frozen
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
-from calib.identification.cases import Case
-from calib.identification.rows import BLOCK, segmented_states
+from calib.identification.rows import BLOCK, Case, segmented_states
 
 Model = TypeVar("Model", bound=RegressorModel, default=IdentificationModel, covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Dynamics(Generic[Model]):
+class Dynamics(Frozen, Generic[Model]):
     """A model with numbers.
 
     Attributes:
@@ -29,9 +28,6 @@ class Dynamics(Generic[Model]):
 
     model: Model
     values: np.ndarray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", frozen(self.values))
 
     def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
         """Return the torques (N, n) the gears pass on to the bodies, by the model; friction may depend on them."""

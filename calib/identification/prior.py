@@ -20,14 +20,16 @@ parameters that cancel. Rows are weighed by their joint's residual, worth as man
 autocorrelation lets it, but not fewer than one in `max_inflation`: residuals of a short record look like one wave
 whatever the model is. What the model lacks is no noise, and differs on other motion: where sizes are found residuals
 count `TEMPERING` times less, and the prior as many times more for the values than for their covariance; more where
-regimes left out ask for it (`calib.identification.left_out.tempering`).
+regimes left out ask for it (`calib.identification.prior`).
 
 Directions that the motion identifies well do not feel the prior; those that it does not identify follow the whole
 robot. It does not make the parameters those of possible bodies: that is the semidefinite fit of another module; but
 `bounded` keeps the drives' inertia positive, and lets friction brake at any speed.
+
+Rods between the joints stand for the masses of a robot whose description holds none.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,13 +38,39 @@ import scipy.linalg
 import scipy.optimize
 
 from calib.arrays import frozen
+from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
+from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
-from calib.estimation.convex.constrained import within
+from calib.estimation.constrained import within
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
+from calib.identification.time_folds import CrossValidation, Regimes
+from calib.robot.chain import Chain
+
+RADIUS = 0.1  # [m] of the balls that rods are made of
+PAYLOAD = (2.0, 0.1)  # [kg, m]
+
+
+def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:
+    """Return rods (B, 10) from each body's frame to the next one's, mass by length and thickness; `total` [kg]."""
+    arm = model.bodies
+    ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
+    for i, parent in enumerate(arm.parents):
+        if parent >= 0 and arm.coordinates[i] >= 0:
+            ends[parent] = arm.placements[i][:3, 3]
+    moving = arm.coordinates >= 0
+    share = np.where(moving, np.linalg.norm(ends, axis=1) + 2 * RADIUS, 0.0)
+    masses = total * share / share.sum()
+    return np.array(
+        [
+            pseudo_inertia.rod(mass, end, RADIUS) if moves else pseudo_inertia.ball(*PAYLOAD)
+            for mass, end, moves in zip(masses, ends, moving)
+        ]
+    )
+
 
 TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
 MIN_NOISE = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
@@ -88,6 +116,10 @@ class Prior:
         lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit))
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
         return np.hstack([inverse, np.zeros((len(unit), 1))])
+
+    def widened(self, more: int) -> np.ndarray:
+        """Return these rows with zeros for `more` columns behind the base's."""
+        return np.insert(self.rows, [len(self.own)] * more, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
         """Return (b,) which parameters rest on the prior: the data lower their variance by less than `resting_share`.
@@ -326,3 +358,38 @@ def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
     found = within(factor, rows, np.zeros(len(rows)), np.full(len(rows), np.inf)).values
     alone = rows[np.count_nonzero(rows, axis=1) == 1]
     return np.where((alone != 0.0).any(axis=0), np.maximum(found, 0.0), found)
+
+
+STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
+
+
+def tempered_prior(
+    find: Callable[[float, Prior | None], Prior], rows: Sequence[ObservationRows], regimes: Regimes
+) -> Prior:
+    """Return the prior of the tempering with which the regimes are predicted best by what the rest identifies.
+
+    Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
+    one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by
+    `min_gain`.
+
+    Args:
+        find: tempering and a prior to start from to the prior whose sizes the evidence chose with it.
+        rows: in the base columns.
+        regimes: of these rows.
+    """
+    data, columns, best = triangulate(rows), np.arange(len(rows[0].names)), None
+    found = find(STEPS[0], None)
+    std = found.first.std
+    min_gain = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
+    for tempering in STEPS:
+        own = found if tempering == STEPS[0] else find(tempering, found)
+        inflation = tempering * own.first.inflation
+        validation = CrossValidation(
+            data, len(std), 1, own.first.std, inflation, np.full(len(columns), -1), own.rows, regimes
+        )
+        squares = (validation.extrapolated(columns) / std**2).sum(axis=1)
+        error = float(np.log(np.maximum(squares, 1e-300)).mean())
+        if best is None or error < best[0] - min_gain:
+            best = error, own
+    assert best is not None
+    return best[1]

@@ -1,4 +1,7 @@
-"""Cases as rows of y = W x: built a block at a time at the full rate, low-passed and thinned alike on both sides."""
+"""Cases as rows of y = W x: built a block at a time at the full rate, low-passed and thinned alike on both sides.
+
+A `Case` is one recording: its motion, the torques to explain, and what the robot carried.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,101 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from calib.arrays import frozen
 from calib.data.signals.filtering import Decimator, decimate, decimate_blocks, kept, slope
+from calib.data.signals.motion import Motion, moving
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.dynamics.torque_rows import MOTOR, POWER, TorqueRows
-from calib.errors import UsageError
+from calib.errors import UsageError, refuse_data
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
-from calib.identification.cases import Case
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A motion and its torques.
+
+    Attributes:
+        name: the recording's, unique among all.
+        motion: q, v, a at the full rate.
+        target: (N, rows) what the model's rows have to explain, unfiltered [N m or N; A where no gain is known].
+        carried: labels of the payloads on board.
+        present: (N, rows) which rows may be used: no lost samples, and no slow ones where they are cut.
+        noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
+            known.
+        torque_rows: which torques the targets are.
+    """
+
+    name: str
+    motion: Motion
+    target: np.ndarray
+    carried: tuple[str, ...]
+    present: np.ndarray
+    noise: np.ndarray | None = None
+    torque_rows: TorqueRows = MOTOR
+
+    @property
+    def duration(self) -> float:
+        """Length of what the filters left [s]."""
+        return len(self.motion) / self.motion.rate
+
+
+def make_case(
+    name: str,
+    motion: Motion,
+    rows: TorqueRows = MOTOR,
+    *,
+    gains: np.ndarray | None = None,
+    carried: Sequence[str] = (),
+    slow: float | Sequence[float] | None = None,
+) -> Case:
+    """Return the case of a motion.
+
+    Args:
+        rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
+        gains: (n,) torque per unit of the effort; None: 1.
+        carried: labels of payloads.
+        slow: rows of joints slower than this are not used: a share of the peak speed or (n,) speeds; None:
+            all are.
+    """
+    effort = np.array(motion.effort) if gains is None else motion.effort * gains
+    if rows.sensed and motion.tau_link is None:
+        refuse_data(
+            motion.file,
+            f"rows '{rows.name}' need torques of sensors behind the gear (columns tau_l1 …, tau_sensor1 …) beside "
+            "motors'",
+        )
+    target = rows.target(effort, motion.tau_link, motion.q, motion.v)
+    known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
+    if slow is not None:
+        known &= moving(motion, slow)
+    noise = None
+    if motion.effort_variance is not None and rows.motors_alone:
+        noise = frozen(np.sqrt(motion.effort_variance) * (1.0 if gains is None else np.abs(gains)))
+    return Case(name, motion, frozen(target), tuple(carried), frozen(rows.of_joints(known), bool), noise, rows)
+
+
+def case_names(paths: Sequence[str]) -> tuple[str, ...]:
+    """Return a unique name per recording: the file's, with the cut (or the folder) where that is needed.
+
+    Raises:
+        UsageError: where the same recording and cut is given twice.
+    """
+    twice = sorted({path for path in paths if list(paths).count(path) > 1})
+    if twice:
+        raise UsageError(f"{twice[0]} is given twice")
+    plain = [_file(path) for path in paths]
+    tail = [path.replace("\\", "/").rsplit("/", 1)[-1] for path in paths]
+    chosen = [p if plain.count(p) == 1 else t for p, t in zip(plain, tail)]
+    return tuple(c if chosen.count(c) == 1 else path for c, path in zip(chosen, paths))
+
+
+def _file(path: str) -> str:
+    from calib.data.recordings.recording import parse_cut
+
+    return parse_cut(path)[0].replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
+
 
 BLOCK = 4096  # samples of the full rate at a time
 
@@ -65,18 +155,16 @@ class ObservationRows:
         )
 
 
-def observe(
-    model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator, load: np.ndarray | None = None
-) -> ObservationRows:
+def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator) -> ObservationRows:
     """Return the rows of a case in the model's `columns`, filtered and thinned by `decimator`.
 
-    Args:
-        load: (N, n) transmitted torques at the full rate, where a term needs them.
+    A body's parameters reach the joints before it, a drive's its own: half of all entries, or less, can differ from 0.
     """
     motion = case.motion
-    column, row = _live(model, columns)
+    column, row = np.nonzero(model.acting()[columns])
     source = model.torque_rows.repeated(motion.n)  # rows that repeat others are copied, not filtered anew
     own, again = source[row] == row, source[row] != row
+    seen = columns[column[own]]
     size = len(kept(motion.segment, decimator))
     matrix = np.zeros((model.rows, len(columns), size)).transpose(2, 0, 1)  # whoever reads it takes a row's columns
     states = segmented_states(model.columns, case)
@@ -85,20 +173,21 @@ def observe(
         spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
         if len(decimator.taps) == 1 and model.torque_rows is not POWER:
             for part in spans:  # nothing to filter: no need to turn entries into series and back
-                matrix[part] = _regressor(model, case, part, load, states)[:, :, columns]
+                matrix[part] = _regressor(model, case, part, states)[:, :, columns]
             continue
         if model.torque_rows is POWER:
-            blocks = (
-                _power_block(model, columns[column[own]], case, part, states, slice(start, stop)) for part in spans
-            )
+            blocks = (_power_block(model, seen, case, part, states, slice(start, stop)) for part in spans)
         else:
-            blocks = (_block(model, columns[column[own]], row[own], case, part, load, states) for part in spans)
+            entries = (_regressor(model, case, part, states).transpose(2, 1, 0) for part in spans)
+            blocks = (each[seen, row[own]] for each in entries)
         for part in decimate_blocks(blocks, decimator):
             matrix[place : place + part.shape[1], row[own], column[own]] = part.T
             place += part.shape[1]
     matrix[:, row[again], column[again]] = matrix[:, source[row[again]], column[again]]
-    names, units = model.names, model.units
-    return _rows([names[k] for k in columns], [units[k] for k in columns], matrix, case, decimator)
+    names, units = (tuple(one[k] for k in columns) for one in (model.names, model.units))
+    target, present = decimate(case.target, decimator, motion.segment), thinned(case.present, motion.segment, decimator)
+    rate, block = motion.rate / decimator.factor, np.zeros(len(target), dtype=int)
+    return ObservationRows(names, units, matrix, target, present, block, rate)
 
 
 def observe_terms(
@@ -181,34 +270,10 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
     return replace(data, factors=factors, rows=data.rows[index].sum(axis=1))
 
 
-def _live(model: RegressorModel, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (k,) column, of those chosen, and (k,) torque row of all entries of the regressor that can differ from 0.
-
-    A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
-    """
-    column, row = np.nonzero(model.acting()[columns])
-    return column, row
-
-
-def _block(
-    model: RegressorModel,
-    columns: np.ndarray,
-    rows: np.ndarray,
-    case: Case,
-    part: slice,
-    load: np.ndarray | None,
-    states: np.ndarray,
-) -> np.ndarray:
-    """Return the entries (k, N_i) of the regressor in these columns and rows, each (k,), of a part of the samples."""
-    return _regressor(model, case, part, load, states).transpose(2, 1, 0)[columns, rows]
-
-
-def _regressor(
-    model: RegressorModel, case: Case, part: slice, load: np.ndarray | None, states: np.ndarray
-) -> np.ndarray:  # fmt: skip
+def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
     """Return the regressor (N_i, rows, p) of a part of the samples."""
-    motion, own = case.motion, None if load is None else load[part]
-    return model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
+    motion = case.motion
+    return model.regressor(motion.q[part], motion.v[part], motion.a[part], None, case.carried, states[:, part])
 
 
 def _power_block(
@@ -237,16 +302,6 @@ def _power_block(
 @runtime_checkable
 class _HasEnergy(Protocol):
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray: ...
-
-
-def _rows(
-    names: Sequence[str], units: Sequence[str], matrix: np.ndarray, case: Case, decimator: Decimator
-) -> ObservationRows:
-    segment = case.motion.segment
-    target = decimate(case.target, decimator, segment)
-    present = thinned(case.present, segment, decimator)
-    rate = case.motion.rate / decimator.factor
-    return ObservationRows(tuple(names), tuple(units), matrix, target, present, np.zeros(len(target), dtype=int), rate)
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:

@@ -7,8 +7,7 @@ import numpy as np
 
 from calib.data.signals.motion import moving
 from calib.estimation.whiteness import Whiteness, examine, r_squared
-from calib.identification.cases import Case
-from calib.identification.rows import segments
+from calib.identification.rows import Case, segments
 from calib.records import Array, Number
 
 

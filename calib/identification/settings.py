@@ -7,7 +7,7 @@ from typing import Annotated, TypeVar
 import numpy as np
 
 from calib.config import strict
-from calib.config_types import Expect, JointNumber, Real, Text
+from calib.config_types import Checked, Expect, JointNumber, Names, OneOf, Positive, Real, Spread, Text, Whole
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -15,7 +15,9 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
-from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.friction.friction_ladder import NAMES
+from calib.identification.loop.loop_settings import LoopSettings, check_loop
+from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.robot.chain import Chain
 
@@ -53,15 +55,12 @@ class Payload:
 
 
 @dataclass(frozen=True)
-class IdentificationSettings:
-    """The choices of an identification; the defaults suit a serial arm with motor torques.
+class Choices:
+    """The choices that options files and identification call alike; the defaults suit a serial arm with motor torques.
 
     Attributes:
-        sets: names of the standard drive terms, one text per joint, or one for all; none: those of the rows.
         passive: names of the drive terms of a parallel robot's passive joints, one text for all.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
-        torque_rows: which torques are explained.
-        couplings, terms: what a joint-by-joint model lacks.
         friction: ``auto``, ``standard`` or a rung (`calib.identification.friction.friction_ladder`).
         method: see `calib.identification.methods.least_squares`.
         weights: what weighs the joints' rows in WLS, one of `WEIGHTS`: their residuals, or the variance over repeats.
@@ -70,40 +69,52 @@ class IdentificationSettings:
         keep, drop: parameters never, or first, left out.
         prior: of the parameters, its sizes by evidence, regularised towards the CAD or rods (``auto``), to the CAD, or
             none.
-        payloads: label → what is known of it.
-        payload_values: label → its ten standard parameters in the tip's frame, where a gain identification found them;
-            they, or else the stated mass and centre, serve for predictions where no recording to learn from carries it.
         gravity: in the base frame [m/s²]; None: the robot's.
         samples: most rows (per torque) that are held; of longer recordings every second, third, ... row alone.
         folds: number of time blocks for cross-validation.
         loop: the closed loop that recordings came from, for instrumental variables.
         constraints: what parameters must satisfy, for the methods pc-*; None: their defaults.
+    """
+
+    passive: Text = ""
+    v0: Annotated[tuple[Positive, ...], Spread()] = (V0,)
+    friction: Annotated[str, OneOf(NAMES)] = "auto"
+    method: Annotated[str, OneOf(tuple(METHODS))] = "wls"
+    weights: Annotated[str, OneOf(WEIGHTS)] = "residuals"
+    essential: Annotated[str, OneOf(RULES)] = "both"
+    ratio: Positive = 20.0
+    level: Annotated[float, Real(above=0, most=1.0)] = 0.05
+    keep: Names = ()
+    drop: Names = ()
+    prior: Annotated[str, OneOf(PRIORS)] = "auto"
+    gravity: Annotated[tuple[float, float, float], Expect("three numbers [m/s²]")] | None = None
+    samples: Annotated[int, Whole(1000, 10_000_000)] = 20_000
+    folds: Annotated[int, Whole(2, 50)] = 6
+    loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
+    constraints: ConstraintSettings | None = None
+
+
+@dataclass(frozen=True)
+class IdentificationSettings(Choices):
+    """All choices of an identification.
+
+    Attributes:
+        sets: names of the standard drive terms, one text per joint, or one for all; none: those of the rows.
+        torque_rows: which torques are explained.
+        couplings, terms: what a joint-by-joint model lacks.
+        payloads: label → what is known of it.
+        payload_values: label → its ten standard parameters in the tip's frame, where a gain identification found them;
+            they, or else the stated mass and centre, serve for predictions where no recording to learn from carries it.
         seed: for random states.
         apart: joints, from 0, whose torque is in a unit of its own: no total holds them.
     """
 
     sets: tuple[str, ...] = ()
-    passive: str = ""
-    v0: tuple[float, ...] = (V0,)
     torque_rows: TorqueRows = MOTOR
     couplings: tuple[Coupling, ...] = ()
     terms: tuple[DriveTerm, ...] = ()
-    friction: str = "auto"
-    method: str = "wls"
-    weights: str = "residuals"
-    essential: str = "both"
-    ratio: float = 20.0
-    level: float = 0.05
-    keep: tuple[str, ...] = ()
-    drop: tuple[str, ...] = ()
-    prior: str = "auto"
     payloads: Mapping[str, Payload] = field(default_factory=dict)
     payload_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    gravity: tuple[float, float, float] | None = None
-    samples: int = 20_000
-    folds: int = 6
-    loop: LoopSettings | None = None
-    constraints: ConstraintSettings | None = None
     seed: int = 0
     apart: tuple[int, ...] = ()
 

@@ -28,9 +28,9 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.essential import Rule, eliminate
 from calib.estimation.estimate import Estimate
 from calib.estimation.triangles import Triangles, tie
-from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.prediction import predict
+from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.rooms.parallel.excite import ParallelExcitation, design_parallel

@@ -35,9 +35,8 @@ from calib.dynamics.torque_rows import torque_rows
 from calib.errors import TaskLost
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
-from calib.identification import reweighted
-from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
+from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings, Payload, make_model
 from calib.identification.uncertainty import geometry_uncertainty
 from calib.robot.calibrated import CalibratedChain
@@ -252,15 +251,15 @@ def judged(given: World, found: Identification, chain: Chain, cases: list[Case],
 
     The torque's error is that of the noisy estimate, against noise-free torque; the bias that of noise-free torques.
     """
-    how = reweighted.estimator(found)
-    rows = reweighted.rows_on(found, chain, cases)
-    noisy, _ = reweighted.estimate(how, rows)
+    how = geometry_uncertainty.estimator(found)
+    rows = geometry_uncertainty.rows_on(found, chain, cases)
+    noisy, _ = geometry_uncertainty.estimate(how, rows)
     decimator = common_decimator(cases, given.settings)
     exact = [
         replace(part, target=decimate(tau, decimator)[: len(part.target)])
         for part, tau in zip(rows, _cut(given, cases))
     ]
-    biased, _ = reweighted.estimate(how, exact)
+    biased, _ = geometry_uncertainty.estimate(how, exact)
     size = (biased - given.base) / found.fitted.estimate.sigma
     model, error, torque = make_model(chain, given.settings), [], []
     for case in other:

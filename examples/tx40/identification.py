@@ -38,14 +38,12 @@ from calib.estimation.essential import Rule, eliminate
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
-from calib.identification.cases import Case, make_case
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.loop.simulated_motion import simulated_case
 from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental
-from calib.identification.parameter_constraints import hold
-from calib.identification.parameter_constraints import signs as signed
-from calib.identification.rows import observe
+from calib.identification.parameter_constraints import ConstraintSettings, hold, make_constraints
+from calib.identification.rows import Case, make_case, observe
 from calib.rooms.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 from calib.simulation.loop.controllers import Controller, pd
@@ -166,8 +164,8 @@ def judge(
 ) -> dict[str, Any]:
     """Return the errors of least squares and of instrumental methods, direct and cross, and what the tests say."""
     first = next(iter(results.values()))
-    values = {"LS": full(study, first, first.ordinary), "PC-LS": full(study, first, consistent(first))}
-    values |= {name: full(study, result, result.fit) for name, result in results.items()}
+    values = {"LS": first.ordinary.estimate.values, "PC-LS": consistent(study, first).estimate.values}
+    values |= {name: result.fit.estimate.values for name, result in results.items()}
 
     def predicted(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
         return (
@@ -186,24 +184,19 @@ def judge(
         "direct": {name: relative(*predicted(name, training))[1] for name in values},
         "cross": {name: [cross(name, log) for log in others] for name in values},
         "torque_error": {name: torque_error(study, others[0].reference, own) for name, own in values.items()},
-        "estimated": len(first.columns),
+        "estimated": len(first.names),
         "rounds": {name: [vars(one) for one in finite(result)] for name, result in results.items()},
         "verdict": verdict(first),
     }
 
 
-def consistent(result: Instrumental) -> LinearFit:
+def consistent(study: Study, result: Instrumental) -> LinearFit:
     """Return least squares of the same rows under the signs of PC-IV (PC-IDIM-LS)."""
     data, std = result.problem.least_squares(), result.ordinary.group_std
-    asked = signed(result.names, signs(result.names))
+    bounds = dict.fromkeys(signs(result.names), (0.0, np.inf))
+    settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
+    asked = make_constraints(settings, study.model, study.base, result.names, [None] * study.base.b)
     return hold(result.ordinary, combine(data, std), data, std, asked, stated=True)[0]
-
-
-def full(study: Study, result: Instrumental, fit: LinearFit) -> np.ndarray:
-    """Return all base parameters, those that were not estimated zero."""
-    values = np.zeros(study.base.b)
-    values[result.columns] = fit.estimate.values
-    return values
 
 
 def finite(result: Instrumental) -> list[Round]:
@@ -327,8 +320,8 @@ def draw(study: Study, log: Log, found: Instrumental, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     series = {
-        "LS": np.subtract(*with_measured(study, log, full(study, found, found.ordinary))),
-        "IV": np.subtract(*with_simulated(study, log, full(study, found, found.fit), study.controller)),
+        "LS": np.subtract(*with_measured(study, log, found.ordinary.estimate.values)),
+        "IV": np.subtract(*with_simulated(study, log, found.fit.estimate.values, study.controller)),
     }
     figure, axes = plt.subplots(3, 6, figsize=(15, 7))
     for j in range(6):

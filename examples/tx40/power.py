@@ -17,8 +17,8 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import from_chain
 from calib.dynamics.torque_rows import MOTOR, POWER, TorqueRows
-from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, chain_states, identify_model
+from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.robot.load import load
 

@@ -14,10 +14,10 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.identification.cases import make_case
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
+from calib.identification.rows import make_case
 from calib.rooms.cells import known_robots
 from calib.simulation.loop.closed_loop import Sensing, simulate
 from calib.simulation.loop.references import random_fourier

@@ -17,9 +17,9 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics.bodies import standard_parameters
-from calib.identification.cases import Case, make_case
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import identify_instrumental
+from calib.identification.rows import Case, make_case
 from calib.robot import description, library
 from calib.rooms.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate

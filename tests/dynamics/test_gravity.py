@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import gravity_torques
 from calib.errors import RobotError
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf

@@ -9,7 +9,6 @@ from differences import check
 
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
-from calib.dynamics.gravity import gravity_torques
 from calib.errors import CalibError, RobotError
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.load import load
@@ -61,13 +60,6 @@ def test_mass_matrix_is_pinocchios(name):
     for one, at in zip(matrix, q):
         upper = np.triu(pin.crba(made, made.createData(), at))
         assert np.allclose(one, upper + np.triu(upper, 1).T, rtol=0, atol=1e-12 * np.abs(matrix).max())
-
-
-def test_static_torques_are_those_of_gravity():
-    chain = ARMS["motley"]
-    q = states(5)[0]
-    found = rigid_body.inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, 0 * q, 0 * q)
-    assert np.allclose(found, gravity_torques(chain, q), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["lwr4plus", "motley", "mimic", "payload"])

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError, NotConverged, Unidentifiable
-from calib.estimation.convex.cone_program import Definite
-from calib.estimation.convex.constrained import within
-from calib.estimation.convex.constraint_relations import contradicting, from_free, restricted
+from calib.estimation.constrained import Definite, contradicting, from_free, restricted, within
 from calib.estimation.instrumental_variables import instrument, projected
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect, combine

@@ -8,7 +8,7 @@ from linear_problems import noisy
 
 from calib.errors import CalibError
 from calib.estimation.linear import wls
-from calib.estimation.triangles import absorb, collect, combine, empty, merge
+from calib.estimation.triangles import absorb, collect, combine, empty
 
 STD = np.array([0.1, 1.0, 5.0])
 
@@ -46,15 +46,6 @@ def test_more_rows_than_one_chunk_equal_the_whole():
     matrix, target = rng.normal(size=(45_000, 3)), rng.normal(size=45_000)
     whole = np.column_stack([matrix, target])
     assert gram(collect(matrix, target)) == pytest.approx(whole.T @ whole, rel=1e-11, abs=1e-8)
-
-
-def test_parts_merge_to_the_whole_and_only_like_parts_merge():
-    matrix, target, group = noisy(3, STD)
-    parts = [collect(matrix[k::2], target[k::2], np.r_[group[k::2]]) for k in (0, 1)]
-    whole = collect(matrix, target, group)
-    assert gram(merge(*parts), STD) == pytest.approx(gram(whole, STD), rel=1e-11)
-    with pytest.raises(CalibError, match="same parameters"):
-        merge(whole, collect(matrix, target, group, names=list("abcde")))
 
 
 def test_selected_columns_equal_a_model_without_the_others():

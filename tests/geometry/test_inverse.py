@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from differences import check
 
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
 from calib.robot.load import load

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from planted import cell, load, measure, perturb, random_joints
 
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import gravity_torques
 from calib.errors import UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see

@@ -13,11 +13,10 @@ from calib.dynamics import base as bases
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.errors import UsageError
+from calib.estimation.estimate import whitened
 from calib.identification.possible import solve
-from calib.identification.possible.information import Information, whitened
-from calib.identification.possible.nearest import nearest
-from calib.identification.possible.prior_bodies import find_prior_bodies
-from calib.identification.possible.problem import BodyCost, make_problem
+from calib.identification.possible.information import Information
+from calib.identification.possible.problem import BodyCost, find_prior_bodies, make_problem, nearest
 from calib.identification.prediction import Dynamics
 from calib.robot.chain import Chain, Element, Joint
 
@@ -66,7 +65,7 @@ def told(
 ) -> Information:
     dynamics = Dynamics(model, base.to_standard(values))
     return Information(
-        chain, dynamics, base.names, base.units, values, covariance, base.transform, whitened(values, covariance), False
+        chain, dynamics, base.names, base.units, values, covariance, base.transform, whitened(values, covariance)
     )
 
 

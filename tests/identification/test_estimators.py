@@ -16,7 +16,7 @@ from calib.estimate_files import read_estimate
 from calib.estimation.triangles import collect
 from calib.identification.identify import identify as fit
 from calib.identification.methods.least_squares import scaled_tls
-from calib.identification.methods.registry import LISTING, METHODS
+from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.dynamic_stage.verdict import model_warnings
 
@@ -125,7 +125,7 @@ def test_every_method_says_what_it_assumes():
               "srcdkf"}  # fmt: skip
     assert set(METHODS) == least_squares | others | {f"pc-{name}" for name in least_squares}
     assert all(one.name == name and len(one.assumes) > 20 for name, one in METHODS.items())
-    assert all("\n" not in one.description and one.description and one.source for one in LISTING)
-    assert {one.name for one in LISTING if one.needs_controller} == {
+    assert all("\n" not in one.description and one.description and one.source for one in METHODS.values())
+    assert {one.name for one in METHODS.values() if one.needs_controller} == {
         "iv", "didim", "cloe", "clie", "pc-iv", "pc-didim",
     }  # fmt: skip

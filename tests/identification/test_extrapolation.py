@@ -12,13 +12,13 @@ from calib.arrays import frozen
 from calib.data.signals.filtering import design_decimator
 from calib.dynamics import drives
 from calib.dynamics.shapes import Joined
-from calib.identification.cases import Case
 from calib.identification.friction.drive_table import drive_table
 from calib.identification.friction.passivity import braking, driven
 from calib.identification.identify import Identification, identify
-from calib.identification.left_out.regimes import regimes
 from calib.identification.prediction import Dynamics, predict
+from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
+from calib.identification.time_folds import regimes
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 COUPLED = drives.coupled(1, 2, label="2.3")

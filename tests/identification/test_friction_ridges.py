@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.estimation.triangles import absorb, empty
-from calib.identification.left_out.time_folds import estimate
+from calib.identification.time_folds import estimate
 
 SEEN, SHARE = 2.0, 0.3  # the parameter that the motion shows, and of the noise, what looks like the other column
 HARDLY = 1e-6

@@ -19,7 +19,6 @@ from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of
 from calib.errors import RobotError
-from calib.identification import reweighted
 from calib.identification.identify import identify
 from calib.identification.settings import IdentificationSettings
 from calib.identification.uncertainty import geometry_uncertainty
@@ -56,13 +55,15 @@ def test_spreading_is_the_adjoint_of_decimation(factor):
 def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
     found = identify(CalibratedChain(arm, planted.arm()), [case], settings)
-    how = reweighted.estimator(found)
-    again, _ = reweighted.estimate(how, found.rows)
+    how = geometry_uncertainty.estimator(found)
+    again, _ = geometry_uncertainty.estimate(how, found.rows)
     np.testing.assert_allclose(again, found.fitted.estimate.values, atol=1e-9)
     matrix, _, _ = geometry_uncertainty.sensitivity(found, arm, [case])
 
     def refitted(values: np.ndarray) -> np.ndarray:
-        return reweighted.estimate(how, reweighted.rows_on(found, arm.with_values(values), [case]))[0]
+        return geometry_uncertainty.estimate(how, geometry_uncertainty.rows_on(found, arm.with_values(values), [case]))[
+            0
+        ]
 
     differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
 

@@ -13,10 +13,10 @@ from calib.identification.friction.friction_ladder import FrictionCandidates, se
 from calib.identification.gains import identify_gains
 from calib.identification.identify import chain_states, common_decimator, find_base, first_fit, identify
 from calib.identification.prediction import Dynamics, predict
-from calib.identification.reweighted import standstill_shift
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.scores import score
 from calib.identification.settings import IdentificationSettings, Payload, make_model
+from calib.identification.uncertainty.geometry_uncertainty import standstill_shift
 
 PLAIN = IdentificationSettings(friction="standard")
 
@@ -118,7 +118,7 @@ def one_sine(name: str = "s"):
     """Return the case of a robot whose joints share one sine."""
     from calib.data.recordings.recording import Recording
     from calib.data.signals.motion import FilterOptions, make_motion
-    from calib.identification.cases import make_case
+    from calib.identification.rows import make_case
 
     t = np.arange(0, 30, 1 / planted.RATE)
     w, amplitude, phase = 2 * np.pi * 0.2, np.array([0.8, 0.6, 0.7]), np.array([0.0, 0.3, 1.6])

@@ -14,10 +14,10 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import States
 from calib.dynamics.torque_rows import Projection, TorqueRows, projected
 from calib.errors import CalibError, UsageError
-from calib.identification.cases import make_case
 from calib.identification.identify import identify_model
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.prediction import predict
+from calib.identification.rows import make_case
 from calib.identification.scores import score
 from calib.identification.settings import IdentificationSettings
 

@@ -13,10 +13,10 @@ from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import Finding, MeasurementError, finding
-from calib.identification.cases import Case, make_case
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify import identify
-from calib.identification.possible.contradiction import Contradiction, contradiction
+from calib.identification.possible.solve import Contradiction, contradiction
+from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
 from calib.procedure.findings import Verdict, level_of, settle

@@ -11,8 +11,8 @@ from calib.dynamics.bodies import bodies_of
 from calib.dynamics.drives import coupled, standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import POWER
-from calib.identification.cases import make_case
 from calib.identification.identify import identify_model
+from calib.identification.rows import make_case
 from calib.identification.settings import IdentificationSettings
 
 

@@ -12,12 +12,11 @@ from without_figures import run
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
-from calib.identification.cases import Case, make_case
 from calib.identification.loop import replay as replays
 from calib.identification.prediction import Dynamics, predict
+from calib.identification.rows import Case, make_case
 from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, simulate
-from calib.simulation.loop.tracking import replayed_error
+from calib.simulation.loop.closed_loop import Plant, replayed_error, simulate
 
 PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]))
 

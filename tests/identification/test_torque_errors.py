@@ -9,17 +9,17 @@ import planted_motion as planted
 import pytest
 
 from calib.arrays import frozen
-from calib.identification.cases import Case
 from calib.identification.identify import Identification, identify
 from calib.identification.prediction import predict
+from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.identification.uncertainty.torque_errors import (
     TorqueErrorModel,
     TorqueIntervals,
     intervals,
     learn_torque_errors,
+    parameter_variances,
 )
-from calib.identification.uncertainty.torque_uncertainty import parameter_variances
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 

@@ -12,9 +12,9 @@ from calib import cli
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.linear import wls
-from calib.identification.cases import make_case
 from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
+from calib.identification.rows import make_case
 from calib.identification.settings import IdentificationSettings
 
 SINGLE = np.array([0.2, 4.0, 0.1])  # standard deviations of one sample over the periods [N m]

@@ -9,8 +9,8 @@ from computed_torque import ComputedTorque, simulate
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import CannotSimulate
-from calib.identification.cases import make_case
 from calib.identification.identify import identify_model
+from calib.identification.rows import make_case
 from calib.identification.settings import IdentificationSettings
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along

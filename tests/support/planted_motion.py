@@ -13,7 +13,7 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
-from calib.identification.cases import Case, make_case
+from calib.identification.rows import Case, make_case
 from calib.robot.chain import Chain, Element, Joint
 
 N = 3

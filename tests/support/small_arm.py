@@ -13,10 +13,9 @@ from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
-from calib.identification.cases import make_case
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
-from calib.identification.rows import observe
+from calib.identification.rows import make_case, observe
 from calib.robot import mdh
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from calib.estimation.relevance import SETTLED, Gram, gram, relevance
-from calib.estimation.variances import ROUNDS, variance_weights
+from calib.estimation.robust import ROUNDS, variance_weights
 
 KNOTS = 9  # values per joint, linear in between (our choice)
 CORRELATION_LENGTH = 0.5  # how far one value speaks for others, of the range (our choice)

@@ -7,9 +7,8 @@ import numpy as np
 
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.rigid_body import regressor
-from calib.identification.cases import Case
 from calib.identification.checks.recorded_motion import CREEP
-from calib.identification.rows import segments
+from calib.identification.rows import Case, segments
 
 
 @dataclass(frozen=True, eq=False)

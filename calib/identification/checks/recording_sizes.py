@@ -12,12 +12,11 @@ import numpy as np
 
 from calib.column_changes import Explanation
 from calib.dynamics.bodies import Bodies, bodies_of
-from calib.identification.cases import Case
 from calib.identification.checks.motion_samples import take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
 from calib.identification.checks.torque_lag import Lag, lag_of
 from calib.identification.checks.whole_robot import ClockRatio, clock_ratio, rearranged, wrong_joints
-from calib.identification.rows import segments
+from calib.identification.rows import Case, segments
 from calib.robot.chain import Chain
 
 MAX_LAG_SAMPLES, MAX_SAMPLES = 1500, 500  # samples on which a lag is looked for, and all else

@@ -22,7 +22,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.estimation.whiteness import inflation
 from calib.identification.checks.motion_samples import MotionSamples, basis, drive_columns, left_share
-from calib.identification.rods import rods
+from calib.identification.prior import rods
 from calib.robot.chain import Chain
 
 

@@ -27,10 +27,9 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import STEPS, JointRange
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of
-from calib.identification.cases import Case
-from calib.identification.left_out.regimes import regimes
-from calib.identification.left_out.time_folds import CrossValidation
-from calib.identification.rows import ObservationRows, observe_terms, triangulate
+from calib.identification.prior import TEMPERING, Prior
+from calib.identification.rows import Case, ObservationRows, observe_terms, triangulate
+from calib.identification.time_folds import CrossValidation, regimes
 from calib.records import Number, stored
 
 MIN_GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
@@ -114,7 +113,7 @@ class FrictionCandidates:
         v0: (n,) smoothing of the Coulomb sign.
         linear: (n,) prismatic joints.
         apart: rows in a unit of their own, which no total holds.
-        prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
+        prior: what is known of the base parameters; None for nothing.
         torque_rows: which torques the rows are; those of the motors among them.
         coupled: pairs of joints, from 0, whose coupling is part of the model already.
     """
@@ -127,7 +126,7 @@ class FrictionCandidates:
     inflation: np.ndarray
     v0: np.ndarray
     linear: np.ndarray
-    prior: np.ndarray | None = None
+    prior: Prior | None = None
     apart: tuple[int, ...] = ()
     torque_rows: TorqueRows = MOTOR
     coupled: frozenset[tuple[int, ...]] = frozenset()
@@ -332,7 +331,7 @@ def _cross_validation(
         part.extend(every, observe_terms(every, case, candidates.decimator, load, candidates.torque_rows))
         for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads)
     ]
-    data = triangulate(rows)
+    data, prior = triangulate(rows), candidates.prior
     base = data.parameters - len(every)
     group, place, start, number = np.full(data.parameters, -1), {}, base, 0
     for name, terms in offered.items():
@@ -351,16 +350,9 @@ def _cross_validation(
         candidates.std,
         candidates.inflation,
         group,
-        _padded(candidates.prior, len(every)),
+        prior and np.sqrt(TEMPERING) * prior.widened(len(every)),
         regimes(rows, candidates.cases, candidates.decimator),
     ), place
-
-
-def _padded(prior: np.ndarray | None, more: int) -> np.ndarray | None:
-    """Return the prior's rows with zeros for `more` columns behind the base's."""
-    if prior is None:
-        return None
-    return np.hstack([prior[:, :-1], np.zeros((len(prior), more)), prior[:, -1:]])
 
 
 def _sizes(candidates: FrictionCandidates, validation: CrossValidation) -> np.ndarray:

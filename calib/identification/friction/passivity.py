@@ -8,9 +8,8 @@ from calib.data.signals.motion import moving
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import Joined
 from calib.errors import refuse_data
-from calib.identification.cases import Case
 from calib.identification.prediction import Dynamics
-from calib.identification.rows import term_columns
+from calib.identification.rows import Case, term_columns
 
 MIN_ENERGY_SHARE = -0.01  # of the energy that a joint moves: noise and other columns' shares stay above (our choice)
 

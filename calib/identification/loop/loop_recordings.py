@@ -17,14 +17,12 @@ from calib.data.signals.filtering import Decimator, border, low_pass
 from calib.data.signals.motion import ROWS, Motion
 from calib.dynamics.bodies import Bodies
 from calib.errors import NotConverged, UsageError, refuse_data
-from calib.identification.cases import Case
 from calib.identification.loop.controller import IdentifiedController, identify_controller
 from calib.identification.loop.loop_settings import LoopSettings
-from calib.identification.rows import segments
-from calib.simulation.loop.closed_loop import Plant
+from calib.identification.rows import Case, segments
+from calib.simulation.loop.closed_loop import Plant, feed_forward
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
-from calib.simulation.loop.tracking import feed_forward
 
 DEGREES = 180.0 / np.pi
 

@@ -31,16 +31,14 @@ from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm, added_inertia, standard
 from calib.dynamics.rigid_body import mass_matrix
 from calib.errors import require
-from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import periods_per_sample, take
 from calib.identification.prediction import Dynamics
-from calib.identification.rows import segments
+from calib.identification.rows import Case, segments
 from calib.records import Array, stored
 from calib.robot.chain import Chain
-from calib.simulation.loop.closed_loop import Plant
+from calib.simulation.loop.closed_loop import Plant, feed_forward, replayed_error
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference
-from calib.simulation.loop.tracking import feed_forward, replayed_error
 
 FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
 FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured

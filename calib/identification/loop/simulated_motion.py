@@ -7,8 +7,8 @@ import numpy as np
 from calib.data.signals.filtering import curvature, low_pass, slope
 from calib.data.signals.motion import Motion
 from calib.errors import CalibError
-from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import Loop
+from calib.identification.rows import Case
 from calib.simulation.loop.closed_loop import SimulatedRun
 
 

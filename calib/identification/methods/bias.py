@@ -1,12 +1,21 @@
-"""Is least squares biased? The loop a recording came from, simulated, says so, and offers the estimate that is not."""
+"""Is least squares biased? The loop a recording came from, simulated, says so, and offers the estimate that is not.
+
+`disagreement` compares estimates that take a loop for granted with those that do not, on the same rows.
+
+CLOE and CLIE fit a simulated loop; what of the loop is stated wrongly goes into their parameters, and no residual need
+tell: half a period's delay of a velocity is just kd / (2 rate) more inertia. Instruments need the loop but roughly, and
+least squares not at all. Noise of the positions biases least squares, so parameters alone decide nothing: the recorded
+torques must side against the loop as well, beside simulated motion, which is free of noise.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, Finding, finding, refuse_option
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.methods.instrumental import Instrumental
+from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, MethodEstimate
 from calib.identification.methods.simulated import IV
 from calib.identification.settings import IdentificationSettings
@@ -28,52 +37,39 @@ class LoopTest:
     loops: ClosedLoops | None = None
     failure: str = ""
 
-    def lines(self, taken: bool) -> list[str]:
-        """Return what a user should be warned of who took this estimate, or (`taken` False) one of least squares."""
+    def findings(self, taken: bool) -> list[Finding]:
+        """Return what a user should know who took this estimate, or (`taken` False) one of least squares."""
         if self.failure:
-            return [f"the test of least squares by simulation of the closed loop failed: {self.failure}"]
+            return [finding("loop-test-failed", why=self.failure)]
         if self.found is None:
             return []
-        told = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
-        return told + (_blurred(self) if taken else _words(self.found))
+        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
+        return noticed + (_blurred(self) if taken else _biased(self.found))
 
 
-def require_loop(settings: IdentificationSettings) -> IdentificationSettings:
+def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:
     """Return the settings of a method that simulates, whose model is one that can be.
 
-    Raises:
-        UsageError: where no loop is stated, or the model cannot be simulated.
-    """
-    name = settings.method
-    if settings.loop is None:
-        raise UsageError(
-            f"method '{name}' simulates the closed loop: state its controller in the options file, [loop] controller = "
-            "… (calib formats identify-options), and log or state the reference; from q and torque alone use wls or "
-            "irls"
-        )
-    if not settings.torque_rows.motors_alone:
-        raise UsageError(
-            f"method '{name}' explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
-        )
-    if settings.friction not in ("auto", "standard"):
-        raise UsageError(
-            f"method '{name}' simulates standard friction only, not friction = '{settings.friction}'; use wls, whose "
-            "estimate a [loop] then tests for bias"
-        )
-    return replace(settings, friction="standard")
-
-
-def require_robot(settings: IdentificationSettings) -> IdentificationSettings:
-    """Return the settings of a method that simulates the robot alone, whose model is one that can be.
+    Args:
+        with_loop: whether it simulates the closed loop, or the robot alone.
 
     Raises:
-        UsageError: for other torques than the motors', or richer friction.
+        UsageError: where no loop is stated, or for other torques than the motors', or richer friction.
     """
-    name = settings.method
+    place = f"method '{settings.method}'"
+    if with_loop and settings.loop is None:
+        words = (
+            "state the controller that it simulates in the options file, [loop] controller = … (calib formats "
+            "identify-options), and log or state the reference; from q and torque alone use wls or irls"
+        )
+        refuse_option(place, words)
     if not settings.torque_rows.motors_alone:
-        raise UsageError(f"method '{name}' explains motor torques; rows = '{settings.torque_rows.name}' needs wls")
+        refuse_option(
+            place, f"explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
+        )
     if settings.friction not in ("auto", "standard"):
-        raise UsageError(f"method '{name}' simulates standard friction only, not friction = '{settings.friction}'")
+        words = f"simulates standard friction only, not friction = '{settings.friction}'"
+        refuse_option(place, f"{words}; use wls, whose estimate a [loop] then tests for bias")
     return replace(settings, friction="standard")
 
 
@@ -92,72 +88,105 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
     return LoopTest(estimate.instrumental, estimate.loops, "" if estimate.found else str(estimate.failure))
 
 
-def _weakness(found: Instrumental) -> list[str]:
+def _weakness(found: Instrumental) -> list[Finding]:
     strength = found.strength
     if not strength.weak:
         return []
     least = np.argsort(strength.partial_r2)[:5]
-    named = ", ".join(f"{strength.names[k]} ({100 * strength.partial_r2[k]:.2g} %)" for k in least)
-    return [
-        f"weak instruments (Cragg-Donald {strength.cragg_donald:.3g}, wanted above 10): IV is biased towards least "
-        f"squares and its sigmas are too small; of these columns the simulation explains least: {named}"
-    ]
+    names = [f"{strength.names[k]} ({100 * strength.partial_r2[k]:.2g} %)" for k in least]
+    return [finding("weak-instruments", donald=strength.cragg_donald, names=names)]
 
 
-def _distance(found: Instrumental, max_miss: float = 10.0) -> list[str]:
-    # max_miss: [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
-    far = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < max_miss]
-    if not far:
+def _distance(found: Instrumental) -> list[Finding]:
+    max_miss = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
+    joints = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < max_miss]
+    return [finding("loop-not-followed", joints=joints)] if joints else []
+
+
+def _gains(found: Instrumental) -> list[Finding]:
+    """Name the joints whose gains are not those of the recording: all that the simulated robot did was to follow."""
+    joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
+    return [finding("loop-gains-off", joints=joints)] if joints else []
+
+
+def _biased(found: Instrumental) -> list[Finding]:
+    """Say what the test means; nothing of a loop that explains less than the model does, or of a bias too small."""
+    shift, min_shift = found.shift, 1.0  # standard deviations of a shift that is worth a word (our choice)
+    if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
         return []
-    return [
-        f"the simulated robot does not follow the recorded one ({', '.join(far)} of its motion apart): wrong gains, "
-        "control rate, delay or reference? Estimates bear a third of the right bandwidth, not another loop"
-    ]
+    names = [f"{found.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
+    return [finding("least-squares-biased", p=found.verdict.p, names=names)]
 
 
-def _gains(found: Instrumental) -> list[str]:
-    """Say whose gains are not those of the recording: all that the simulated robot did was to follow."""
-    if not len(found.off):
+def _blurred(test: LoopTest) -> list[Finding]:
+    """Say where W is no longer its true value plus noise, which instruments take for granted."""
+    if test.found is None or test.loops is None or not test.found.estimator.measured:
         return []
-    named = ", ".join(f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off)
-    return [
-        f"the recorded robot strays further from its reference than the simulated one, or less ({named}): are kp and "
-        "kd of [loop] that many times the controller's? iv and didim bear it, cloe and clie do not"
-    ]
-
-
-def _words(found: Instrumental, max_shift: float = 1.0) -> list[str]:
-    """Say what the test means; nothing of a loop that explains less than the model does, or of a bias too small.
-
-    `max_shift`: standard deviations of a shift that is not worth a word (our choice).
-    """
-    if not found.verdict.biased() or not found.valid or not found.explains:
-        return []
-    shift = found.shift
-    if shift.max() < max_shift:
-        return []
-    worst = np.argsort(-shift)[:5]
-    named = ", ".join(f"{found.names[k]} by {shift[k]:.2g} sigma" for k in worst)
-    p = f"p = {found.verdict.p:.2g}" if found.verdict.p > 0.0 else "p < 1e-300"
-    if shift.max() < MAX_SHIFT_SIGMAS:
-        return [f"least squares is biased ({p}), but by little: {named}"]
-    return [f"least squares is biased (Durbin, Wu, Hausman: {p}), off {named}: method 'iv' is not"]
-
-
-def _blurred(test: LoopTest, max_blur: float = 3.0) -> list[str]:
-    """Say where W is no longer its true value plus noise, which instruments take for granted.
-
-    `max_blur`: widths of the smoothed sign that the noise of the velocity may have (our choice).
-    """
-    if test.found is None or test.loops is None:
-        return []
-    case = test.loops.pairs[0][0]
-    noise = case.motion.velocity_noise()
+    noise, max_blur = test.loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
     widths = {one.acts[0][0]: one.settings[-1] for one in test.found.plant.terms if one.shape == "sign"}
-    wide = [f"{noise[j] / width:.2g} at joint {j + 1}" for j, width in widths.items() if noise[j] > max_blur * width]
-    if not wide or not test.found.estimator.measured:
-        return []
-    return [
-        f"the noise of the velocities is wider than the Coulomb sign ({', '.join(wide)} widths v0): the sign's columns "
-        "shrink, and IV makes up by too much Fc and too little Fv; instruments = 'didim' looks at no measured position"
-    ]
+    blurred = [(j, noise[j] / width) for j, width in widths.items() if noise[j] > max_blur * width]
+    joints = [f"{size:.2g} at joint {j + 1}" for j, size in blurred]
+    return [finding("noisy-signs", joints=joints)] if joints else []
+
+
+SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choice)
+
+
+@dataclass(frozen=True)
+class LoopDisagreement:
+    """An estimate that takes the loop for granted, beside one that does not.
+
+    Attributes:
+        method, beside: of the two.
+        parameter, sigmas: the one that differs most, and by how many standard deviations of both together.
+        left, beside_left: by torque row, share of the torque in the band that each leaves unexplained [%].
+        factor: by torque row, the method's torque over the other's.
+    """
+
+    method: str
+    beside: str
+    parameter: str
+    sigmas: float
+    left: tuple[float, ...]
+    beside_left: tuple[float, ...]
+    factor: tuple[float, ...]
+
+
+def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
+    """Return where an output-error estimate is refuted by recorded torques; None where it is not, or is another's.
+
+    Args:
+        problem: of both.
+        found: the estimate.
+        test: what instruments say; without any, least squares takes their place.
+    """
+    if not (found.found and found.alone and found.loops is not None):
+        return None
+    own, instruments = found.estimate, test.found
+    max_beside_instruments = 1.2  # times the torque that instruments leave unexplained (our choice)
+    max_beside_wls = 2.0  # the same beside least squares, of which it is the least that there is (our choice)
+    if instruments is not None and instruments.valid and len(instruments.names) == len(own.values):
+        name, other, limit = instruments.estimator.name, instruments.fit.estimate, max_beside_instruments
+        left, beside = (instruments.simulated_error(x.values) for x in (own, other))
+    else:
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return None
+        name, other, limit = "wls", plain.estimate, max_beside_wls
+        size = np.maximum(problem.pooled.residual_squares(np.zeros(len(own.values))), 1e-300)
+        left, beside = (100.0 * np.sqrt(problem.pooled.residual_squares(x.values) / size) for x in (own, other))
+    away = np.abs(own.values - other.values) / np.maximum(np.hypot(own.sigma, other.sigma), 1e-300)
+    worst = int(np.argmax(away))
+    if away[worst] < SIGMAS or not np.any(left > limit * beside):
+        return None
+    return LoopDisagreement(
+        found.method, name, other.names[worst], float(away[worst]), tuple(left.tolist()), tuple(beside.tolist()),
+        _factors(problem, own.values, other.values),
+    )  # fmt: skip
+
+
+def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
+    """Return by torque row the slope of W own against W other."""
+    factors = problem.pooled.factors[:, :, :-1]
+    mine, theirs = factors @ own, factors @ other
+    return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))

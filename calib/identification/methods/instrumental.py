@@ -29,13 +29,12 @@ from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, Usa
 from calib.estimation import instrumental_variables
 from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import Triangles, absorb, combine, empty
+from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
-from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.loop.simulated_motion import low_passed, simulated_case, simulated_samples
-from calib.identification.parameter_constraints import Constraints, Held, hold, signs
-from calib.identification.rows import ObservationRows, observe
+from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, hold, make_constraints
+from calib.identification.rows import Case, ObservationRows, observe, pool, triangulate
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
@@ -86,7 +85,6 @@ class Instrumental:
     Attributes:
         fit: the estimate.
         ordinary: weighted least squares of the same rows, to compare.
-        columns: of the base parameters that were estimated.
         plant: the simulated robot with the estimate.
         rounds: what happened.
         strength: how well the instruments stand for W.
@@ -103,7 +101,6 @@ class Instrumental:
 
     fit: LinearFit
     ordinary: LinearFit
-    columns: np.ndarray
     plant: Plant
     rounds: tuple[Round, ...]
     strength: InstrumentStrength
@@ -178,11 +175,9 @@ def identify_instrumental(
     decimator: Decimator,
     *,
     method: str = "iv",
-    columns: np.ndarray | None = None,
     inertia: np.ndarray | None = None,
     positive: Sequence[str] = (),
     constraints: Constraints | None = None,
-    tolerance: float = 0.025,
     limit: int = MAX_ROUNDS,
 ) -> Instrumental:
     """Estimate base parameters with instruments from simulation.
@@ -193,12 +188,10 @@ def identify_instrumental(
         cases: recordings, each with the loop it came from.
         decimator: the parallel filter of W, Z and y.
         method: ``iv`` or ``didim``.
-        columns: indices of the base parameters to estimate (essential ones), the others zero; None: all.
         inertia: (n,) of the regular robot it starts from [kg m²]; None: kd² / (2 kp), for which the first controller
             would be damped by 0.7.
         positive: names of base parameters that must not be negative (PC-IDIM-IV).
         constraints: on the base parameters that are estimated; None: those of `positive`.
-        tolerance: of parameters and of the residual, relative.
         limit: most iterations.
 
     Raises:
@@ -209,11 +202,13 @@ def identify_instrumental(
     one_of(method, ROUNDS, "method", UsageError)
     if not model.torque_rows.motors_alone or not cases:
         raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
-    task = _task(model, base, cases, decimator, ROUNDS[method], columns)
+    observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
     if constraints is None and positive:
-        constraints = signs(task.observed[0].names, positive)
-    task = replace(task, constraints=constraints)
-    ordinary = _ordinary(task.observed)
+        settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
+        constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
+    task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints)
+    data = pool(triangulate(observed), model.rows)
+    ordinary = wls(data, settled_std(data, 1e-3))
     plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
@@ -225,11 +220,7 @@ def identify_instrumental(
         found = _estimate_round(task, runs, std, tau)
         task = task.after(found)
         rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
-        if (
-            before is not None
-            and retreats == 0
-            and instrumental_variables.settled(before, found.fit, tolerance, tolerance)
-        ):
+        if before is not None and retreats == 0 and instrumental_variables.settled(before, found.fit):
             return _result(task, found, ordinary, task.plant(plant, found), rounds, std, runs)
         task, found, plant, runs, retreats = _simulate_new(task, found, plant, std, tau)
         before, std, tau = found.fit, found.fit.group_std, found.tau
@@ -247,12 +238,11 @@ class _Fixed:
 
     model: IdentificationModel
     base: Base
-    kept: np.ndarray
     cases: Sequence[tuple[Case, Loop]]
     decimator: Decimator
     observed: Sequence[ObservationRows]
     estimator: _RoundEstimator
-    constraints: Constraints | None = None
+    constraints: Constraints | None
 
     def after(self, found: _Found) -> _Fixed:
         """Return the task of the next round, which most likely is held in the same postures."""
@@ -260,15 +250,10 @@ class _Fixed:
             return self
         return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
 
-    def standard(self, values: np.ndarray) -> np.ndarray:
-        """Return standard parameters with the values of those base parameters that are estimated."""
-        whole = np.zeros(self.base.b)
-        whole[self.kept] = values
-        return self.base.to_standard(whole)
-
     def plant(self, old: Plant, found: _Found) -> Plant:
         """Return the robot of a round's estimate."""
-        return _with_values(old, self.standard(found.fit.estimate.values))
+        values = self.base.to_standard(found.fit.estimate.values)
+        return old.with_parameters(np.concatenate([values, np.zeros(len(old.parameters) - len(values))]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,19 +268,9 @@ class _Found:
     bound: Held | None
 
 
-def _task(
-    model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator,
-    estimator: _RoundEstimator, columns: np.ndarray | None,
-) -> _Fixed:  # fmt: skip
-    kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
-    observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
-    observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
-    return _Fixed(model, base, kept, cases, decimator, observed, estimator)
-
-
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
     """Return the estimate with the instruments of these runs; its sigmas with the inflation `tau` of the last."""
-    columns = task.base.kept[task.kept]
+    columns = task.base.kept
     moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
     simulated = [observe(task.model, columns, case, task.decimator).matrix for case in moved]
     observed = [
@@ -350,7 +325,7 @@ def _result(
     verdict = instrumental_variables.exogeneity(problem, std, found.tau)
     strength = instrumental_variables.strength(problem, std)
     return Instrumental(
-        fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
+        fit, ordinary, plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
         _distance(runs), _stray(runs), bound, problem, task.estimator,
     )  # fmt: skip
 
@@ -365,10 +340,6 @@ def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None)
     n = model.bodies.n
     extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
     return Plant(model.bodies, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
-
-
-def _with_values(plant: Plant, values: np.ndarray) -> Plant:
-    return plant.with_parameters(np.concatenate([values, np.zeros(len(plant.parameters) - len(values))]))
 
 
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
@@ -430,22 +401,6 @@ def _stack(
     return problem
 
 
-def _ordinary(observed: Sequence[ObservationRows]) -> LinearFit:
-    """Return weighted least squares of the rows as they are."""
-    count, first = observed[0].target.shape[1], observed[0]
-    data = empty(first.names, first.units, count)
-    for rows in observed:
-        for row in range(count):
-            used = rows.present[:, row]
-            data = absorb(data, rows.matrix[used, row], rows.target[used, row], row)
-    return wls(data, settled_std(data, 1e-3))
-
-
-def _from_simulation(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
-    """Return DIDIM's estimate, from [Z y] alone."""
-    return wls(_simulated(problem), std, np.full(problem.data.groups, tau))
-
-
 def _simulated(problem: Instruments) -> Triangles:
     """Return the triangles of [Z y]."""
     return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
@@ -505,6 +460,11 @@ ROUNDS = {
     one.name: one
     for one in (
         _RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
-        _RoundEstimator("didim", _from_simulation, lambda problem, std: combine(_simulated(problem), std), False),
+        _RoundEstimator(
+            "didim",
+            lambda problem, std, tau: wls(_simulated(problem), std, np.full(problem.data.groups, tau)),
+            lambda problem, std: combine(_simulated(problem), std),
+            False,
+        ),
     )
 }

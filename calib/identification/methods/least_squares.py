@@ -13,12 +13,13 @@ from calib.estimation.samples import SampleFit, Samples, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
 from calib.identification.friction.passivity import braking, driving
-from calib.identification.left_out.time_folds import estimate
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.parameter_constraints import Constraints, hold
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, bounded, residual_inflation, weighing
+from calib.identification.time_folds import estimate
 
+CONSISTENT, CONSTRAINED = "; parameters satisfy [constraints]", " under constraints on its parameters"
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
 
 
@@ -92,10 +93,10 @@ def _drawn(
     The prior counts `tempering` times.
     """
     pooled, group = problem.pooled, problem.groups
-    own, more = problem.base.b, pooled.parameters - problem.base.b
+    own = problem.base.b
     known = None
     if prior is not None:
-        known = np.sqrt(tempering) * np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
+        known = np.sqrt(tempering) * prior.widened(pooled.parameters - own)
     ridges = estimate(pooled, std, tau, group, known)[1]
     covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
     if prior is not None:
@@ -194,10 +195,6 @@ class _ConstrainedLeastSquares(Method):
         )  # fmt: skip
 
 
-def _irls(problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray) -> LinearFit:
-    return _reweighted(problem, tau).fit
-
-
 def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
@@ -208,31 +205,40 @@ def _reweighted(
 def samples_of(problem: IdentificationProblem) -> Samples:
     """Return the rows of all recordings, those of one instant together."""
     rows = problem.rows
-    matrix, target, present = (np.concatenate([getattr(part, key) for part in rows]) for key in _STACKED)
+    parts = ([getattr(part, key) for part in rows] for key in ("matrix", "target", "present"))
+    matrix, target, present = (np.concatenate(part) for part in parts)
     return stack(matrix, target, present, rows[0].names, rows[0].units)
 
 
-_STACKED = ("matrix", "target", "present")
 OLS = _LeastSquares(
     "ols", "the torques of all joints are equally noisy, q, v and a exact",
     lambda problem, std, tau: ols(problem.pooled, tau), weighted=False,
+    description="least squares, all rows alike", source="Gauss; Atkeson, An & Hollerbach 1986",
 )  # fmt: skip
 WLS = _LeastSquares(
     "wls", "each joint's torque is as noisy as its own residuals say, q, v and a exact",
     lambda problem, std, tau: wls(problem.pooled, std, tau), takes_prior=True,
+    description="least squares, each joint by its residuals", source="Gautier & Poignet 2001",
 )  # fmt: skip
 IRLS = _LeastSquares(
-    "irls",
-    "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
-    _irls,
-)
+    "irls", "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
+    lambda problem, std, tau: _reweighted(problem, tau).fit,
+    description="least squares, weighted across joints, odd samples gated out", source="Han, Wu, Liu & Xiong 2020",
+    tunes=("gate of 3 sigma",), version=2,
+)  # fmt: skip
 TLS = _LeastSquares(
     "tls",
     f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
     "residuals, all up to one estimated factor, independently from row to row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
-)
-_CONSISTENT = "; parameters satisfy [constraints]"
-PC_OLS = _ConstrainedLeastSquares("pc-ols", OLS.assumes + _CONSISTENT, OLS)
-PC_WLS = _ConstrainedLeastSquares("pc-wls", WLS.assumes + _CONSISTENT, WLS)
-PC_IRLS = _ConstrainedLeastSquares("pc-irls", IRLS.assumes + _CONSISTENT, IRLS)
+    description="total least squares with scaled columns", version=2,
+    source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
+    tunes=("ratio of the columns' noise to the torques'",),
+)  # fmt: skip
+PC_OLS, PC_WLS, PC_IRLS = (
+    _ConstrainedLeastSquares(
+        f"pc-{one.name}", one.assumes + CONSISTENT, one, tunes=one.tunes, version=one.version,
+        description=one.name + CONSTRAINED, source="Sousa & Cortesão 2014; Wensing et al. 2018",
+    )
+    for one in (OLS, WLS, IRLS)
+)  # fmt: skip

@@ -19,16 +19,15 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
-from calib.estimation.estimate import Estimate
+from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, empty, retriangulate
-from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.instrumental import Instrumental
 from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.prior import Prior
-from calib.identification.rows import ObservationRows, pool, triangulate
+from calib.identification.rows import Case, ObservationRows, pool, triangulate
 
 
 class EstimateStatus(Enum):
@@ -192,11 +191,9 @@ class MethodEstimate:
 
 def _standing_for(estimate: Estimate) -> Triangles:
     """Return triangles of one group on which least squares gives an estimate, its covariance and degrees of freedom."""
-    p, sigma = len(estimate.values), np.where(estimate.sigma > 0.0, estimate.sigma, 1.0)
-    size, axes = np.linalg.eigh(estimate.covariance / np.outer(sigma, sigma))
-    root = (axes / np.sqrt(np.maximum(size, 1e-13 * size[-1]))).T / sigma
+    p = len(estimate.values)
     factor = np.zeros((1, p + 1, p + 1))
-    factor[0, :p] = retriangulate(np.column_stack([root, root @ estimate.values]))[:p]
+    factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
     factor[0, p, p] = np.sqrt(max(estimate.dof, 1))
     return replace(
         empty(estimate.names, estimate.units, 1), factors=frozen(factor), rows=frozen([max(estimate.dof, 1) + p], int)
@@ -212,6 +209,11 @@ class Method(ABC):
     Attributes:
         name: what options and files call it.
         assumes: what its estimate rests on, for the user.
+        description: one line.
+        source: whose it is.
+        tunes: what of it is chosen beforehand and not estimated from the data; () for nothing.
+        version: raised whenever it gives another estimate, or another count of rounds, of the same data: what studies
+            have kept of it from before then does not count, and is run again.
         takes_prior: whether a prior, the ridges of richer friction and a stated noise of the rows have a place in it.
         needs_controller: whether it simulates the closed loop that a recording came from.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
@@ -220,6 +222,10 @@ class Method(ABC):
 
     name: str
     assumes: str
+    description: str = field(kw_only=True)
+    source: str = field(kw_only=True)
+    tunes: tuple[str, ...] = field(default=(), kw_only=True)
+    version: int = field(default=1, kw_only=True)
     takes_prior: bool = field(default=False, kw_only=True)
     needs_controller: bool = field(default=False, kw_only=True)
     needs_simulation: bool = field(default=False, kw_only=True)
@@ -228,6 +234,11 @@ class Method(ABC):
     @abstractmethod
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's p columns, or the status that says why there is none."""
+
+    def __str__(self) -> str:
+        needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""
+        tuned = f"; tuned: {', '.join(self.tunes)}" if self.tunes else ""
+        return f"{self.name:10} {self.description} ({self.source}){needs}{tuned}"
 
 
 def attempted(
@@ -244,43 +255,3 @@ def attempted(
             method, status, None, problem.pooled, nothing, nothing, failure=error, loops=loops
         )  # fmt: skip
     return replace(found, seconds=time.perf_counter() - began)
-
-
-@dataclass(frozen=True)
-class MethodEntry:
-    """A method as a list shows it.
-
-    Attributes:
-        method: itself.
-        description: one line.
-        source: whose it is.
-        tunes: what of it is chosen beforehand and not estimated from the data; () for nothing.
-        version: raised whenever it gives another estimate, or another count of rounds, of the same data: what studies
-            have kept of it from before then does not count, and is run again.
-    """
-
-    method: Method
-    description: str
-    source: str
-    tunes: tuple[str, ...] = ()
-    version: int = 1
-
-    @property
-    def name(self) -> str:
-        """What options and files call it."""
-        return self.method.name
-
-    @property
-    def needs_controller(self) -> bool:
-        """Whether it simulates the closed loop, and so asks for the controller and its reference."""
-        return self.method.needs_controller
-
-    @property
-    def needs_simulation(self) -> bool:
-        """Whether it asks for a model whose motion can be computed from torques."""
-        return self.method.needs_simulation
-
-    def __str__(self) -> str:
-        needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""
-        tuned = f"; tuned: {', '.join(self.tunes)}" if self.tunes else ""
-        return f"{self.name:10} {self.description} ({self.source}){needs}{tuned}"

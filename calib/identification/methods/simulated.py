@@ -7,7 +7,7 @@ from calib.errors import UsageError
 from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.instrumental import identify_instrumental
-from calib.identification.methods.least_squares import WLS
+from calib.identification.methods.least_squares import CONSISTENT, CONSTRAINED, WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
 
 
@@ -22,6 +22,7 @@ class _Simulated(Method):
 
     needs_controller: bool = field(default=True, kw_only=True)
     needs_simulation: bool = field(default=True, kw_only=True)
+    tunes: tuple[str, ...] = field(default=("tolerance 2.5 %", "10 rounds"), kw_only=True)
     instruments: str = ""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -63,13 +64,21 @@ class _Simulated(Method):
 
 
 IV = _Simulated(
-    "iv", "the controller and its reference are those of the loop, the model's friction that of the robot"
+    "iv", "the controller and its reference are those of the loop, the model's friction that of the robot",
+    description="instrumental variables from the simulated closed loop", source="Janot, Vandanjon & Gautier 2014",
 )  # fmt: skip
 DIDIM = _Simulated(
     "didim",
     "the simulated robot moves as the real one: controller and reference are those of the loop, the model's friction "
     "that of the robot; no measured position takes part",
     "didim",
+    description="least squares on the simulated motion alone (the slides' CLIE)",
+    source="Gautier, Janot & Vandanjon 2013",
 )
-PC_IV = _Simulated("pc-iv", f"{IV.assumes}; parameters satisfy [constraints]", "iv", takes_constraints=True)
-PC_DIDIM = _Simulated("pc-didim", f"{DIDIM.assumes}; parameters satisfy [constraints]", "didim", takes_constraints=True)
+PC_IV, PC_DIDIM = (
+    replace(
+        one, name=f"pc-{one.name}", assumes=one.assumes + CONSISTENT, instruments=one.name, takes_constraints=True,
+        description=one.name + CONSTRAINED, source=source,
+    )
+    for one, source in ((IV, "Janot & Wensing 2021"), (DIDIM, "Leboutet et al. 2021"))
+)  # fmt: skip

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib import files
-from calib.arrays import frozen
-from calib.errors import RobotError, refused_as
+from calib.arrays import Frozen
+from calib.errors import RobotError, refused_as, require
 from calib.estimate_files import read_covariance, read_estimate
+from calib.estimation.estimate import whitened
 from calib.estimation.triangles import combine, retriangulate
 from calib.identification.model_file import read_dynamics, read_table
 from calib.identification.prediction import Dynamics
@@ -30,7 +31,7 @@ INFORMATION = "information.csv"
 
 
 @dataclass(frozen=True, eq=False)
-class Information:
+class Information(Frozen):
     """An identified model with what its data say.
 
     Attributes:
@@ -40,7 +41,6 @@ class Information:
         values, covariance: (b,), (b, b) the estimate as identified, a prior included where there was one.
         transform: T (b, p).
         factor: (k, b + 1) the rows [R z].
-        rests_on_prior: whether the estimate holds a prior, the rows do not.
     """
 
     chain: Chain
@@ -51,11 +51,6 @@ class Information:
     covariance: np.ndarray
     transform: np.ndarray
     factor: np.ndarray
-    rests_on_prior: bool
-
-    def __post_init__(self) -> None:
-        for key in ("values", "covariance", "transform", "factor"):
-            object.__setattr__(self, key, frozen(getattr(self, key)))
 
     @property
     def b(self) -> int:
@@ -85,7 +80,7 @@ def of(found: Identification, chain: Chain) -> Information:
     transform[np.arange(b, len(found.names)), [place[name] for name in found.names[b:]]] = 1.0
     return Information(
         chain, found.dynamics, found.names, estimate.units, estimate.values, estimate.covariance, transform,
-        _information(found), True,
+        _information(found),
     )  # fmt: skip
 
 
@@ -101,18 +96,14 @@ def _information(found: Identification) -> np.ndarray:
     count = len(found.names) - own
     if count:
         group = np.concatenate([np.full(own, -1), found.friction.groups]).astype(int)
-        from calib.identification.left_out.time_folds import estimate
+        from calib.identification.time_folds import estimate
 
-        known = None if found.prior is None else _widened(found.prior.rows, count)
+        known = None if found.prior is None else found.prior.widened(count)
         ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, known)[1]
         drawn = np.zeros((count, own + count + 1))
         drawn[:, own:-1] = np.diag(1.0 / np.maximum(ridges[own:], 1e-12))
         rows.append(drawn)
     return retriangulate(np.vstack(rows))
-
-
-def _widened(rows: np.ndarray, more: int) -> np.ndarray:
-    return np.hstack([rows[:, :-1], np.zeros((len(rows), more)), rows[:, -1:]])
 
 
 def read(folder: str | Path) -> Information:
@@ -135,21 +126,12 @@ def read(folder: str | Path) -> Information:
         names, units, values = estimate.names, estimate.units, estimate.values
         covariance = read_covariance(folder)[1]
         transform = _transform(names, groups, dynamics.model.names)
-        rested = (folder / INFORMATION).is_file()
-        factor = _numbers(folder / INFORMATION) if rested else whitened(values, covariance)
+        data = folder / INFORMATION
+        require(data.is_file() or (np.diag(covariance) > 0.0).all(), "a parameter without variance", ValueError)
+        factor = _numbers(data) if data.is_file() else whitened(values, covariance)
         if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
             raise ValueError("files of different sizes")
-    return Information(chain, dynamics, names, units, values, covariance, transform, factor, rested)
-
-
-def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return [R z] (b, b + 1) with RᵀR = Σ⁻¹ and z = R β."""
-    sigma = np.sqrt(np.diag(covariance))
-    if not (sigma > 0.0).all():
-        raise ValueError("a parameter without variance")
-    size, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    upper = (axes / np.sqrt(np.maximum(size, 1e-13 * size[-1]))).T / sigma
-    return np.column_stack([upper, upper @ values])
+    return Information(chain, dynamics, names, units, values, covariance, transform, factor)
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:

@@ -9,7 +9,7 @@ Fv, Fc (1×1 matrices of the same kind), the parameters are
 
 with the log-det divergence D (Lee, Wensing & Park 2020): convex, the same in any frame and any unit, and infinite at
 the border, so every body is possible with a margin. A plain Euclidean distance would need a weight between kg and kg
-m²; that in the coordinates of P_i⁰ does not, and may be asked for (`calib.identification.possible.nearest`).
+m²; that in the coordinates of P_i⁰ does not, and may be asked for (`calib.identification.possible.problem`).
 
 How much the CAD counts. exp(-½ γ D) is, up to its norm, the Wishart density of a 4×4 matrix with mode P⁰ and γ + 5
 degrees of freedom (our observation), so γ has a marginal likelihood,
@@ -29,25 +29,43 @@ would otherwise overrule any CAD.
 
 Newton's method solves it in milliseconds, strictly inside the cone; the nearest possible robot without any prior lies
 on the border, a semidefinite program for Clarabel (`nearest`).
+
+An estimate contradicts every robot that can exist where its distance from the nearest one is large. Where the model is
+right, 95 % of all estimates are within √χ²(b) of a possible robot. Honest recordings are farther: friction of another
+form has no place in a possible body, and the data's sigmas do not know of it. Only a distance several times that bound
+points to signs, orders and robots; what it means is for a verdict to say.
 """
+
+from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 from scipy.special import multigammaln  # type: ignore[attr-defined]
 
-from calib.arrays import frozen
+from calib.arrays import Frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import NotConverged, UsageError, suggestion
-from calib.identification.possible import nearest as border
-from calib.identification.possible.information import Information
-from calib.identification.possible.prior_bodies import PriorBodies, find_prior_bodies
-from calib.identification.possible.problem import DRIVE, BodyCost, make_problem
+from calib.identification.possible.information import Information, of
+from calib.identification.possible.problem import (
+    DRIVE,
+    BodyCost,
+    PriorBodies,
+    blame,
+    find_prior_bodies,
+    make_problem,
+    nearest,
+)
 from calib.identification.prediction import Dynamics
+from calib.robot.chain import Chain
+
+if TYPE_CHECKING:
+    from calib.identification.identify import Identification
 
 WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
 PRIORS = ("entropic", "euclidean")
@@ -56,7 +74,7 @@ SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
 
 
 @dataclass(frozen=True, eq=False)
-class PossibleBodies:
+class PossibleBodies(Frozen):
     """Standard parameters of a robot that can exist.
 
     Attributes:
@@ -87,10 +105,6 @@ class PossibleBodies:
     source: str
     prior: str
     notes: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "covariance", frozen(self.covariance))
-        object.__setattr__(self, "margins", frozen(self.margins))
 
     @property
     def possible(self) -> bool:
@@ -127,23 +141,20 @@ def find_possible(information: Information, weight: float | None = None, prior: 
         for references in find_prior_bodies(information.chain, model)
     ]
     away, problem = min(
-        (
-            (information.distance(border.nearest(problem)), problem)
-            for _, problem in choices[:: max(len(choices) - 1, 1)]
-        ),
+        ((information.distance(nearest(problem)), problem) for _, problem in choices[:: max(len(choices) - 1, 1)]),
         key=lambda pair: pair[0],
     )
-    blamed = border.blame(problem, information) if away > allowed else ()
+    blamed = blame(problem, information) if away > allowed else ()
     doubt = max(1.0, away / np.sqrt(information.b))
     _, gamma, problem, values, references = max(
         (candidate for choice in choices for candidate in _candidates(*choice, weight, doubt)), key=lambda one: one[0]
     )
     euclidean = prior == "euclidean"
-    values = border.nearest(problem, pull=gamma) if euclidean else values
+    values = nearest(problem, pull=gamma) if euclidean else values
     min_gamma = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
     while weight is None and away <= allowed < information.distance(values) and gamma > min_gamma:
         gamma /= 2.0
-        values = border.nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
+        values = nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
     curved_at = _reference(problem) if euclidean else values
     return PossibleBodies(
         Dynamics(model, values), _covariance(problem, gamma, curved_at), gamma, doubt,
@@ -301,3 +312,52 @@ def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) ->
         if pseudo_inertia.margin(body) < 1e-3:
             found.append(f"body {label} is thinner than a millimetre: hardly possible")
     return found
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """How far an estimate is from the nearest possible robot.
+
+    Attributes:
+        distance: in standard deviations (Mahalanobis); up to `max_times` times `allowed` that of a robot near it.
+        allowed: what it stays below in 95 % of all cases where the model is right.
+        unexplained: of the torques, in weighted rows, that the nearest possible robot leaves beside the estimate [%].
+    """
+
+    distance: float
+    allowed: float
+    unexplained: float
+
+
+def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
+    """Return how far an estimate is from what can exist; None where its rows hold no bodies, or nothing was found.
+
+    Args:
+        found: the estimate, of torques.
+        chain: the robot it was identified on.
+    """
+    model = found.dynamics.model
+    if not isinstance(model, IdentificationModel) or not model.torque_rows.has_bodies:
+        return None
+    information = of(found, chain)
+    allowed = bound(information.b)
+    problems = [make_problem(information, one) for one in find_prior_bodies(chain, model)]
+
+    def distances() -> Iterator[float]:
+        for problem in problems[: max(len(problems) - 1, 1)]:
+            try:
+                yield information.distance(nearest(problem))
+            except NotConverged:
+                continue
+
+    weight = 1.0  # γ that hardly draws, yet keeps Newton's steps off the border: its distance is at most a tenth larger
+    try:
+        away = information.distance(solve(problems[-1], weight))
+    except (NotConverged, ValueError):  # the latter where curvatures overflow
+        away = np.inf
+    max_times = 3.0  # times the bound, up to which no semidefinite program is solved for the last tenth
+    if away > max_times * allowed:
+        away = min((away, *distances()))
+    if not np.isfinite(away):
+        return None
+    return Contradiction(float(away), allowed, 100.0 * float(away) / float(np.linalg.norm(information.factor[:, -1])))

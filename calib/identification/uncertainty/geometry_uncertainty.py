@@ -20,27 +20,113 @@ interval of φ*, for the estimate never uses them.
 Not part of S: the weights' and the prior's own dependence on g, and that of load-dependent friction's columns (which
 rest on the fitted torque, and that hardly changes with g). For methods other than OLS and WLS the sensitivity is that
 of WLS with their residuals' spread.
+
+`compare` adds one identification on two geometries, the nominal and the calibrated one, from the same torques.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import frozen
+from calib.arrays import Frozen, frozen
 from calib.data.signals.filtering import Decimator, decimate, kept, spread
+from calib.data.signals.motion import moving
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.triangles import retriangulate
-from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.reweighted import cut, estimator, inverted, stacked, weights
-from calib.identification.rows import ObservationRows, segments
+from calib.identification.rows import Case, ObservationRows, observe, segments, thinned
 from calib.identification.settings import make_model
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimator:
+    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + LᵀL.
+
+    Attributes:
+        deviation: (rows,) R = diag(deviation²).
+        beforehand: (k, p) L, what was known beforehand, as whitened rows; (0, p) for nothing.
+        pull: (p,) that information times its mean; what keeps parameters within bounds is part of it.
+    """
+
+    deviation: np.ndarray
+    beforehand: np.ndarray
+    pull: np.ndarray
+
+
+def estimator(found: Identification) -> _Estimator:
+    """Return how an identification weighed its rows, and what it knew beforehand."""
+    fitted = found.fitted
+    p = fitted.pooled.parameters
+    deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
+    if fitted.beforehand is None:
+        return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
+    deviation = deviation * np.sqrt(fitted.inflation)
+    factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
+    known, values = fitted.beforehand, fitted.estimate.values
+    pull = factors[:, :p].T @ (factors[:, :p] @ values - factors[:, p]) + known.T @ (known @ values)
+    return _Estimator(deviation, known, pull)
+
+
+def estimate(how: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
+    """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
+    p = len(how.pull)
+    factor = np.hstack([how.beforehand, np.zeros((len(how.beforehand), 1))])
+    for part in all_rows:
+        white = np.column_stack([stacked(part), part.target.ravel()]) * weights(how, part)[:, None]
+        factor = retriangulate(np.vstack([factor, white]))
+    inverse, solution = inverted(factor[:p, :p]), factor[:p, p]
+    return inverse @ (solution + inverse.T @ how.pull), inverse @ inverse.T
+
+
+def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
+    """Return the rows of an identification as another geometry would have given them; friction's columns stay."""
+    model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
+    result = []
+    for part, case in zip(found.rows, cases):
+        own = observe(model, found.base.kept, case, decimator)
+        matrix = np.concatenate([own.matrix, part.matrix[:, :, found.base.b :]], axis=2)
+        result.append(replace(part, matrix=matrix))
+    return result
+
+
+def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
+    """Return by how much φ (p,) changes where rows of nearly standing joints are left out; for one row per joint."""
+    how, decimator = estimator(found), common_decimator(cases, found.settings)
+    faster = [
+        replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
+        for part, case in zip(found.rows, cases)
+    ]
+    return estimate(how, faster)[0] - estimate(how, found.rows)[0]
+
+
+def cut(rows: ObservationRows, own: slice) -> ObservationRows:
+    """Return some of the rows."""
+    return replace(
+        rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own]
+    )
+
+
+def inverted(upper: np.ndarray) -> np.ndarray:
+    """Return the inverse of an upper triangle (p, p) whose columns have units of their own."""
+    unit = np.linalg.norm(upper, axis=0)
+    return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
+
+
+def stacked(rows: ObservationRows) -> np.ndarray:
+    return rows.matrix.reshape(-1, rows.matrix.shape[2])
+
+
+def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
+    """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
+    return (rows.present / (how.deviation if by is None else by)).ravel()
+
 
 STEP = 1e-5  # of the central differences [m or rad]
 SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
@@ -51,7 +137,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class GeometryUncertainty:
+class GeometryUncertainty(Frozen):
     """The estimate's sensitivity to the geometry and what it adds to the covariance.
 
     Attributes:
@@ -74,10 +160,6 @@ class GeometryUncertainty:
     geometry: np.ndarray | None
     felt: np.ndarray
     left: np.ndarray
-
-    def __post_init__(self) -> None:
-        for name in ("sensitivity", "torque", "deviations", "felt", "left"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
     def covariance(self) -> np.ndarray:
@@ -252,3 +334,58 @@ def _differences(
 
 def _rms(values: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(values**2, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryComparison:
+    """Two estimates from the same torques, on two geometries.
+
+    Attributes:
+        names, units: of the p parameters.
+        values: (2, p) on the nominal (CAD) and on the calibrated geometry.
+        sigma: (2, p) of each: of torque noise alone on the nominal, total on the calibrated one.
+        difference: (p,) standard deviation of the difference: the geometry's part, and what little of the torque noise
+            the two do not share.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+    sigma: np.ndarray
+    difference: np.ndarray
+
+    @property
+    def relative(self) -> np.ndarray:
+        """(p,) 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = 100.0 * (self.values[0] - self.values[1]) / np.abs(self.values[1])
+        return np.where(self.values[1] == 0.0, np.nan, found)
+
+
+def compare(
+    found: Identification, carried: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
+) -> GeometryComparison:
+    """Estimate the same columns from the same torques on the nominal geometry, and say how far apart the two are.
+
+    Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
+    """
+    how, noise = estimator(found), np.array(found.fitted.std) * np.sqrt(found.fitted.inflation)
+    both = (rows_on(found, nominal, cases), found.rows)
+    (first, inverse), (second, own) = (estimate(how, rows) for rows in both)
+    values = np.asarray(found.fitted.estimate.values)
+    alone, apart = np.zeros(len(values)), np.array(carried.sigma_geometry**2)
+    chunk = 2000  # thinned samples at a time, where each needs its own line of a matrix
+    for one, other in zip(*both):
+        for start in range(0, len(one.target), chunk):
+            part = slice(start, start + chunk)
+            gain, ours = (
+                matrix @ (stacked(cut(rows, part)) * weights(how, cut(rows, part), how.deviation**2)[:, None]).T
+                for matrix, rows in ((inverse, one), (own, other))
+            )
+            spread_of = np.tile(noise, len(one.target[part]))
+            alone += np.sum((gain * spread_of) ** 2, axis=1)
+            apart += np.sum(((gain - ours) * spread_of) ** 2, axis=1)
+    return GeometryComparison(
+        found.names, found.fitted.estimate.units, frozen(np.stack([values + first - second, values])),
+        frozen(np.stack([np.sqrt(alone), carried.sigma])), frozen(np.sqrt(apart)),
+    )  # fmt: skip

@@ -14,13 +14,12 @@ from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
-from calib.identification.cases import Case
 from calib.identification.gains import GainRecord
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
-from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals
-from calib.identification.uncertainty.torque_uncertainty import read_uncertainty
+from calib.identification.rows import Case
+from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs

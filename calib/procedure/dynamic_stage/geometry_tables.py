@@ -22,8 +22,12 @@ from typing import NamedTuple
 import numpy as np
 
 from calib import files
-from calib.identification.uncertainty.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
-from calib.identification.uncertainty.two_geometries import GeometryComparison
+from calib.identification.uncertainty.geometry_uncertainty import (
+    NOTHING,
+    TILTS,
+    GeometryComparison,
+    GeometryUncertainty,
+)
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
 

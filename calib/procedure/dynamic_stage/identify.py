@@ -9,11 +9,15 @@ import numpy as np
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
-from calib.identification.possible.contradiction import contradiction
+from calib.identification.possible.solve import contradiction
 from calib.identification.scores import Score
-from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty, propagate
+from calib.identification.uncertainty.geometry_uncertainty import (
+    GeometryComparison,
+    GeometryUncertainty,
+    compare,
+    propagate,
+)
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, learn_torque_errors
-from calib.identification.uncertainty.two_geometries import GeometryComparison, compare
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, assess

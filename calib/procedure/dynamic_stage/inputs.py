@@ -17,9 +17,9 @@ from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
 from calib.data.signals.reference_files import with_reference
 from calib.data.signals.resampling import Resampled
 from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
-from calib.identification.cases import Case, case_names, make_case
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
+from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.procedure.robot_kinds import Mechanism

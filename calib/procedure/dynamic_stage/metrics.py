@@ -14,7 +14,6 @@ import numpy as np
 
 from calib.data.signals.motion import Motion
 from calib.estimation.essential import EliminationStep
-from calib.identification.cases import Case
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
@@ -22,6 +21,7 @@ from calib.identification.identify import Identification
 from calib.identification.loop.replay import Replay
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import Binding
+from calib.identification.rows import Case
 from calib.identification.scores import Score
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -155,7 +155,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         found.friction.off,
         inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
         LoopMetrics.of(found.bias, found.fitted.instrumental is None),
-        held and ConstraintMetrics(held.names, held.binding, held.postures),
+        held and ConstraintMetrics(held.constraints.names, held.binding, held.postures),
         {one.name: one for one in outcome.tracking.replays},
         outcome.tracking.failure,
         {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
@@ -221,8 +221,8 @@ class UnseenReport:
 
 # ---- folders of earlier versions ------------------------------------------------------------------------------------
 
-_WHITENESS = ("pacf", "bound", "ljung_box", "ljung_box_p", "skewness", "kurtosis", "normal_p")
-_STEP = ("ratio", "f", "p", "f_total", "p_total")
+_WHITENESS = ("pacf", "bound", "ljung_box_p", "kurtosis", "normal_p")
+_STEP = ("ratio", "f", "p", "p_total")
 
 
 def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:

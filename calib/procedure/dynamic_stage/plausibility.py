@@ -14,8 +14,8 @@ from calib.errors import Finding, finding
 from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.checks.whole_robot import ClockRatio
-from calib.identification.methods.loop_agreement import LoopDisagreement
-from calib.identification.possible.contradiction import Contradiction
+from calib.identification.methods.bias import LoopDisagreement
+from calib.identification.possible.solve import Contradiction
 from calib.procedure.findings import level_of, limit
 from calib.robot.chain import Chain
 from calib.robot.description import impossible_bodies

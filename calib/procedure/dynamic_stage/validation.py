@@ -12,12 +12,12 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.errors import finding
-from calib.identification.cases import Case
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.friction.passivity import driven
-from calib.identification.methods.loop_agreement import LoopDisagreement
-from calib.identification.possible.contradiction import Contradiction
+from calib.identification.methods.bias import LoopDisagreement
+from calib.identification.possible.solve import Contradiction
 from calib.identification.prediction import Dynamics, predict
+from calib.identification.rows import Case
 from calib.identification.scores import Score, score
 from calib.identification.uncertainty.torque_errors import (
     TorqueDiscrepancy,

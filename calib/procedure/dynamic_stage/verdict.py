@@ -15,10 +15,10 @@ import numpy as np
 from calib.data.signals.motion import moving
 from calib.data.signals.persistency import ExcitationReport
 from calib.errors import Finding, finding
-from calib.identification.cases import Case
 from calib.identification.identify import Identification
-from calib.identification.reweighted import standstill_shift
+from calib.identification.rows import Case
 from calib.identification.scores import Score
+from calib.identification.uncertainty.geometry_uncertainty import standstill_shift
 from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
 from calib.procedure.findings import Verdict, limit, lines_of, sentence, settle
 from calib.robot.chain import Chain
@@ -197,16 +197,16 @@ def model_warnings(
     cases: Sequence[Case], found: Identification, excitation: Mapping[str, ExcitationReport]
 ) -> tuple[str, ...]:
     """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
-    noticed = [*_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)]
-    loop = found.bias.lines(found.fitted.instrumental is not None)
-    return (*parameter_warnings(found), *loop, *lines_of(noticed))
+    loop = found.bias.findings(found.fitted.instrumental is not None)
+    noticed = [*loop, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)]
+    return (*parameter_warnings(found), *lines_of(noticed))
 
 
 def parameter_warnings(found: Identification[Any]) -> list[str]:
     """Return what a user should know of the parameters, whatever the robot: condition, bounds, prior."""
     condition = settle([finding("motion-condition", condition=found.condition[1])])
-    held = found.fitted.held.lines() if found.fitted.held is not None else []
-    return [*lines_of(condition), *held, *lines_of([*_negative(found), *_rests(found)])]
+    held = found.fitted.held.findings() if found.fitted.held is not None else []
+    return lines_of([*condition, *held, *_negative(found), *_rests(found)])
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:

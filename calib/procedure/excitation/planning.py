@@ -18,7 +18,7 @@ from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.errors import RobotError, UsageError, require
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
-from calib.identification.uncertainty.torque_uncertainty import Uncertainty, read_uncertainty
+from calib.identification.uncertainty.torque_errors import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings

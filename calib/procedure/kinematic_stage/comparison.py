@@ -210,7 +210,7 @@ def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
     """Return gravity torques (m, n) [N m] of a block; None where the robot's masses are not known."""
     if chain.inertias is None or len(chain.driven) != chain.n:
         return None
-    from calib.dynamics.gravity import gravity_torques
+    from calib.dynamics.rigid_body import gravity_torques
 
     return gravity_torques(chain, block.q)
 

@@ -82,7 +82,7 @@ class Fitted:
         """Gravity torques as the fit took them, of the nominal arm; None where no deflection needs them."""
         if not any(term.basis == "torque" for term in self.cell.deflection.terms):
             return None
-        from calib.dynamics.gravity import gravity_torques
+        from calib.dynamics.rigid_body import gravity_torques
 
         return partial(gravity_torques, self.nominal.chain)
 

@@ -9,7 +9,7 @@ import numpy as np
 from calib import files
 from calib.dynamics.shapes import Joined
 from calib.estimation.whiteness import Whiteness
-from calib.identification.cases import Case
+from calib.identification.rows import Case
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import UnseenReport

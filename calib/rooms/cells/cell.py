@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
 from calib.data.poses.measurements import Poses, Positions
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry.installation import Installation, see
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain

@@ -8,9 +8,8 @@ import numpy as np
 from calib.data.poses.measurements import Poses
 from calib.dynamics import base as bases
 from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.rigid_body import inverse_dynamics
+from calib.dynamics.rigid_body import gravity_torques, inverse_dynamics
 from calib.estimate_files import StoredEstimate
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import gravity_torques
 from calib.robot.chain import Chain, random_joints
 
 WARM_POSES, WARM_TIME = 30.0, 120.0  # i_0 [poses], t_0 [s]

@@ -23,10 +23,9 @@ from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import Cell
 from calib.rooms.cells.unmodelled import TorqueErrors, gear_torques
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.simulation.loop.closed_loop import Plant, Sensing, feed_forward, simulate
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference
-from calib.simulation.loop.tracking import feed_forward
 
 STRETCH, SHIFT, MASS = 0.05, 6e-3, 0.04  # how wrong the maker's masses are, 1 sigma: shape, centre [m], mass
 BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0  # of the joint controller, and of its measured speed's filter [Hz]

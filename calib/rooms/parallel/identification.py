@@ -12,13 +12,13 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, UsageError, finding
-from calib.identification.cases import Case
 from calib.identification.friction.passivity import MIN_ENERGY_SHARE
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
+from calib.identification.rows import Case
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather

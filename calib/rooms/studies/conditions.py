@@ -54,7 +54,7 @@ MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "paylo
 TRIAL = 1
 """Raised whenever the trials of all methods come out otherwise: no row from before then counts.
 
-Where one method changes, its `calib.identification.methods.registry.MethodEntry.version` is raised."""
+Where one method changes, its `calib.identification.methods.method.Method.version` is raised."""
 
 _Few = Spread(words="a value, or a list of them")
 Robots = Annotated[

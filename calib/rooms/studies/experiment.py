@@ -25,21 +25,19 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
-from calib.identification.cases import Case, make_case
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.parameter_constraints import ConstraintSettings
-from calib.identification.rows import observe
+from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain, random_joints
 from calib.robot.load import load
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
 from calib.rooms.studies.conditions import Condition
-from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference, random_fourier
-from calib.simulation.loop.tracking import feed_forward
 
 # our choices
 MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each

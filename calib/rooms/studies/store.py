@@ -7,7 +7,7 @@ rows.parquet   all rows before; made of both when a command ends, where pyarrow 
 study.lock     held while a command works on the folder
 
 A row's key is (digest of the condition, method, seed): rows of conditions that a study file no longer states stay, and
-are not counted; so do those of a method that has changed since (`MethodEntry.version`), until it is run again.
+are not counted; so do those of a method that has changed since (`Method.version`), until it is run again.
 """
 
 from __future__ import annotations

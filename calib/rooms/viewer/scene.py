@@ -266,7 +266,7 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
     terms = cell.deflection.terms
     torque = None
     if any(term.basis == "torque" for term in terms):
-        from calib.dynamics.gravity import gravity_torques
+        from calib.dynamics.rigid_body import gravity_torques
 
         torque = gravity_torques(cell.chain, q)
     return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T

@@ -5,6 +5,12 @@
 integrated by the classical Runge-Kutta form at the controller's rate, in more steps where the smoothed sign of Coulomb
 friction is stiff (`kernels`): no chatter at rest, and no other model than the one that is identified. At every instant
 that is recorded the equation holds to rounding for the true q, v, a and the torque.
+
+`tracking_error` says what a model is good for: how far a robot strays from its reference when the model's torques are
+fed forward.
+
+A second judgement beside the computed-torque test, which by itself is "not a direct answer" about tracking (Kolyubin,
+Shiriaev & Jubien 2019, section 7): an error of torque that the feedback swallows costs nothing here.
 """
 
 from __future__ import annotations
@@ -16,13 +22,13 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 from calib.arrays import frozen, shaped
-from calib.dynamics.bodies import Bodies
+from calib.dynamics.bodies import Bodies, upright_turn
 from calib.dynamics.drives import DriveTerm
+from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
-_TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
 LOWER = (
@@ -252,7 +258,7 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return placements and parameters between frames turned so that each joint moves about or along z."""
     result = np.zeros((bodies.count + 1, 23))
     result[-1, :3] = -bodies.gravity
-    turns = [np.eye(3)[:, _TURNS[axis]] for axis in bodies.axes]
+    turns = [upright_turn(axis)[:3, :3] for axis in bodies.axes]
     for i, parent in enumerate(bodies.parents):
         before = np.eye(3) if parent < 0 else turns[parent].T
         result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
@@ -305,3 +311,41 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
     return Diverged(f"the loop diverged at {time:.4g} s: {LOWER}", None)
+
+
+def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
+    """Return the torques (N, n) that the believed robot needs along the reference, drives included [N m or N]."""
+    model = IdentificationModel(believed.bodies, believed.terms)
+    block = 4096  # instants at a time
+    parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
+    regressors = (model.regressor(reference.q[part], reference.v[part], reference.a[part]) for part in parts)
+    return np.concatenate([regressor @ believed.parameters for regressor in regressors])
+
+
+def replayed_error(
+    robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None, push: np.ndarray
+) -> np.ndarray:
+    """Return the rms of q - q_r (n,) [rad or m] under torques (N, n) ahead and (N, n) that push, without noise."""
+    own = controller if ahead is None else controller.with_feedforward(ahead)
+    run = simulate(robot, own, reference, push=push)
+    return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
+
+
+def tracking_error(
+    robot: Plant,
+    believed: Plant | None,
+    controller: Controller,
+    reference: Reference,
+    sensing: Sensing | None = None,
+    seed: int = 0,
+) -> np.ndarray:
+    """Return the rms of q - q_r (n,) [rad or m] of the robot under feedback and the believed robot's torques.
+
+    Args:
+        robot: what moves; on a real arm the best model there is stands for it.
+        believed: whose torques are fed forward; None: feedback alone.
+    """
+    ahead = controller if believed is None else controller.with_feedforward(feed_forward(believed, reference))
+    run = simulate(robot, ahead, reference, sensing, seed)
+    tick = sample_ticks(len(reference.t), 1 if sensing is None else sensing.every)
+    return np.sqrt(np.mean((run.q - reference.at(tick)[0]) ** 2, axis=0))

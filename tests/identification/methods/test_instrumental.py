@@ -15,12 +15,12 @@ from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
 from calib.estimation import instrumental_variables
-from calib.identification.cases import make_case
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods import instrumental
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
+from calib.identification.rows import make_case
 from calib.robot import mdh
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
@@ -160,7 +160,7 @@ def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_ot
     held = found(case, v0=np.inf, constraints=make_constraints(bounds, model, base, base.names, [None] * base.b))
     assert held.fit.estimate.values[place] == pytest.approx(limit, rel=1e-6)
     assert held.fit.estimate.sigma[place] < 1e-9 * plain.fit.estimate.sigma[place]
-    assert held.constrained is not None and "sits on its bound" in held.constrained.lines()[0]
+    assert held.constrained is not None and held.constrained.findings()[0].code == "on-its-bound"
 
 
 @pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])

@@ -14,11 +14,10 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.torque_rows import POWER
 from calib.errors import NotConverged, UsageError
 from calib.estimation.triangles import collect
-from calib.identification.cases import make_case
 from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem
 from calib.identification.methods.registry import METHODS
-from calib.identification.rows import observe
+from calib.identification.rows import make_case, observe
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.rooms.studies.methods.maximum_likelihood import noise_of_states
 from calib.rooms.studies.methods.networks import hopfield

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry.model_choice.ladder import EFFECTS
 from calib.robot.calibrated import Deflection, evaluate
 from calib.robot.chain import random_joints

@@ -263,7 +263,7 @@ def test_the_truths_are_those_of_the_library():
 
 
 def test_the_better_model_tracks_better():
-    from calib.simulation.loop.tracking import tracking_error
+    from calib.simulation.loop.closed_loop import tracking_error
 
     plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion()
     rough = replace(plant, parameters=1.2 * plant.parameters)

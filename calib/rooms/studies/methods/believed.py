@@ -7,8 +7,8 @@ import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, UsageError, refused_as
-from calib.identification.cases import Case
 from calib.identification.methods.method import IdentificationProblem
+from calib.identification.rows import Case
 from calib.simulation.loop.closed_loop import Plant
 
 SHARES = (

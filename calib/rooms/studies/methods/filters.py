@@ -23,11 +23,10 @@ import numpy as np
 
 from calib.errors import CalibError, CannotSimulate, Diverged, require
 from calib.estimation.linear import LinearFit
-from calib.identification.cases import Case
 from calib.identification.loop.simulated_motion import low_passed
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
-from calib.identification.rows import segments
+from calib.identification.rows import Case, segments
 from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, start_of
 from calib.rooms.studies.methods.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.rooms.studies.methods.tangents import Stepper, stepper
@@ -241,6 +240,17 @@ _ASSUMES = (
     "the model's friction is that of the robot"
 )
 EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
-    _KalmanFilter(("sr" if root else "") + rule, _ASSUMES, Filter(rule, root))
-    for rule in ("ekf", "ukf", "cdkf") for root in (False, True)
+    _KalmanFilter(
+        ("sr" if root else "") + rule, _ASSUMES, Filter(rule, bool(root)), source=source,
+        description="the same, square-root form" if root else description,
+        tunes=("first covariance of the parameters", "rate of the filter", *(["α = 0.1"] if rule == "ukf" else [])),
+    )
+    for rule, description, *sources in (
+        ("ekf", "extended Kalman filter, parameters as states", "Gautier & Poignet 2001",
+         "Kaminski, Bryson & Schmidt 1971"),
+        ("ukf", "unscented Kalman filter, the same", "Julier & Uhlmann 2004", "van der Merwe & Wan 2001"),
+        ("cdkf", "central-difference Kalman filter, the same", "Nørgaard, Poulsen & Ravn 2000",
+         "van der Merwe & Wan 2001"),
+    )
+    for root, source in enumerate(sources)
 )  # fmt: skip

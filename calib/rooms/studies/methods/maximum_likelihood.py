@@ -24,9 +24,9 @@ from calib.data.signals.filtering import Decimator, curvature, kept, low_pass, s
 from calib.data.signals.motion import Motion
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import Diverged, NotConverged, UsageError
-from calib.estimation.correlated import scatter
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.triangles import condition_numbers
+from calib.estimation.whiteness import scatter
 from calib.identification.methods.least_squares import samples_of, weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.prior import residual_inflation
@@ -257,4 +257,7 @@ ML = _MaximumLikelihood(
     "ml",
     "positions have white noise of the level that each log's spectrum shows, torques of the level that is left; both "
     "small enough for the torque to be linear in them",
+    description="maximum likelihood: positions noisy too, noise levels estimated",
+    source="Olsen, Swevers & Verdonck 2002; Leboutet et al. 2021",
+    tunes=("tolerance 0.01 sigma", "40 rounds"),
 )

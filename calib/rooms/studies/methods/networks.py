@@ -141,8 +141,12 @@ _LIKE_WLS = "each joint's torque is as noisy as its own residuals say, q, v and 
 ADALINE = _Network(
     "adaline", f"{_LIKE_WLS}; samples in random order",
     lambda problem, std, tau: adaline(samples_of(problem), problem.pooled, std, tau),
+    description="adaptive linear neuron, trained sample by sample",
+    source="Widrow & Hoff 1960; Widrow & Stearns 1985", tunes=("decay of the learning rate", "60 epochs"),
 )  # fmt: skip
 HOPFIELD = _Network(
     "hopfield", f"{_LIKE_WLS}; no parameter is near the bound of its neuron",
     lambda problem, std, tau: hopfield(problem.pooled, std, tau),
+    description="Hopfield-Tank network at rest", source="Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
+    tunes=("bounds of its neurons", "200 steps"),
 )  # fmt: skip

@@ -7,7 +7,7 @@ q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, section
 Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
 ∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`)
 where differences take one simulation per parameter. What is left is what noise did in the loop, correlated over time;
-the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`calib.estimation.correlated`).
+the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`calib.estimation.whiteness`).
 
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
 """
@@ -20,9 +20,9 @@ import scipy.linalg
 from calib.data.signals.filtering import decimate
 from calib.errors import CalibError, NotConverged, UsageError
 from calib.estimation import nonlinear
-from calib.estimation.correlated import scatter
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
+from calib.estimation.whiteness import scatter
 from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.loop.simulated_motion import low_passed, simulated_samples
 from calib.identification.methods.least_squares import WLS
@@ -43,6 +43,7 @@ class _OutputError(Method):
 
     needs_controller: bool = field(default=True, kw_only=True)
     needs_simulation: bool = field(default=True, kw_only=True)
+    tunes: tuple[str, ...] = field(default=("damping", "tolerance 0.05 sigma"), kw_only=True)
     torques: bool
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -195,5 +196,11 @@ def _packed(
 
 
 _LOOP = "controller and reference are those of the loop, the model's friction that of the robot; "
-CLOE = _OutputError("cloe", _LOOP + "no measured torque takes part", False)
-CLIE = _OutputError("clie", _LOOP + "no measured position takes part", True)
+CLOE = _OutputError(
+    "cloe", _LOOP + "no measured torque takes part", False, source="Landau 1979; Leboutet et al. 2021",
+    description="closed-loop output error: simulated positions meet measured ones",
+)  # fmt: skip
+CLIE = _OutputError(
+    "clie", _LOOP + "no measured position takes part", True, source="Leboutet et al. 2021",
+    description="closed-loop input error: simulated torques meet measured ones",
+)  # fmt: skip

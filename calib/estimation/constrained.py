@@ -10,6 +10,9 @@ Constraints add knowledge, not consistency: where they bind at wrong values the 
 the bias of least squares in a loop.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# clarabel is a compiled extension without stubs
+
 from dataclasses import dataclass
 from itertools import count
 
@@ -17,10 +20,173 @@ import numpy as np
 import scipy.linalg
 
 from calib.arrays import frozen, shaped
-from calib.errors import CalibError, require
-from calib.estimation.convex.cone_program import Definite, minimise
-from calib.estimation.convex.constraint_relations import from_free
+from calib.errors import CalibError, NotConverged, require
 from calib.estimation.triangles import require_rank
+
+ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
+
+
+@dataclass(frozen=True, eq=False)
+class Definite:
+    """Matrices M_k(b) = Σ_j A_kj b_j whose eigenvalues must not be below `least`.
+
+    Attributes:
+        matrices: A (K, n, n, p), symmetric.
+        least: above zero.
+        likely: indices of those that bound the optimum of a problem much like this one, to begin with.
+    """
+
+    matrices: np.ndarray
+    least: float
+    likely: np.ndarray | None = None
+
+    def least_eigenvalues(self, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (K,) by how much the smallest eigenvalues are above `least`, and their slopes (K, p) by b (p,)."""
+        size, n, _, p = self.matrices.shape
+        flat = self.matrices.reshape(size, n * n, p)
+        values, vectors = np.linalg.eigh((flat @ b).reshape(size, n, n))
+        pairs = vectors[:, :, None, 0] * vectors[:, None, :, 0]
+        return values[:, 0] - self.least, np.asarray((pairs.reshape(size, 1, n * n) @ flat)[:, 0])
+
+    def satisfied(self, sizes: np.ndarray) -> bool:
+        """Say whether smallest eigenvalues (K,), as above `least`, are those of definite matrices."""
+        max_violation = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
+        return bool((sizes >= -max_violation * self.least).all())
+
+
+@dataclass(frozen=True, eq=False)
+class ConeOptimum:
+    """Optimum b (p,) of a cone program, and multipliers of rows (c,), of matrices (k, n, n), of equalities (e,)."""
+
+    values: np.ndarray
+    rows: np.ndarray
+    matrices: np.ndarray
+    equalities: np.ndarray
+
+
+def minimise(
+    upper: np.ndarray,
+    target: np.ndarray,
+    rows: np.ndarray,
+    offset: np.ndarray,
+    matrices: np.ndarray,
+    least: np.ndarray | float = 0.0,
+    equal: np.ndarray | None = None,
+    held: np.ndarray | None = None,
+) -> ConeOptimum:
+    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; t = R b - z is an unknown: no squares.
+
+    Args:
+        upper, target: R (m, p), z (m,), of order one.
+        rows, offset: A (c, p), c (c,).
+        matrices: (k, n, n, p), M_k = Σ_j A_kj b_j.
+        least: λ, one or (k,).
+        equal, held: E (e, p), d (e,); None for none.
+
+    Raises:
+        NotConverged: where no point satisfies all.
+    """
+    import clarabel
+    from scipy import sparse
+
+    (m, p), (size, n, _, _) = upper.shape, matrices.shape
+    equal, held = np.zeros((0, p)) if equal is None else equal, np.zeros(0) if held is None else held
+    i, j = np.tril_indices(n)[::-1]  # upper triangle, column by column
+    weight = np.where(i == j, 1.0, np.sqrt(2.0))
+    flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
+    system = np.vstack([upper, equal, -rows, -flat])
+    right = np.concatenate([target, held, offset, -np.outer(np.broadcast_to(least, size), i == j).ravel()])
+    ends = np.cumsum([m, len(equal), len(rows)])
+    cones = [clarabel.ZeroConeT(int(ends[1])), *[clarabel.NonnegativeConeT(len(rows))][: len(rows)]]
+    cones += [clarabel.PSDTriangleConeT(n)] * size
+    settings = clarabel.DefaultSettings()
+    settings.verbose, settings.max_threads = False, 1
+    cost = sparse.diags(np.repeat([0.0, 1.0], [p, m])).tocsc()
+    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
+    for accuracy in ACCURACIES:
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
+        found = clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings).solve()
+        if str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
+            break
+    b, dual = np.array(found.x)[:p], np.array(found.z)
+    if str(found.status) not in ("Solved", "AlmostSolved"):
+        raise NotConverged(f"the constraints may contradict each other: Clarabel says {found.status}", b)
+    pushes = np.zeros((size, n, n))
+    pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
+    pushes[:, j, i] = pushes[:, i, j]
+    return ConeOptimum(b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]])
+
+
+def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
+    """Return rows of lower <= A b <= upper that no b satisfies together; none where some b satisfies all.
+
+    A linear program over the excess of each row; the rows are those with a multiplier, Farkas' certificate.
+    """
+    from scipy.optimize import linprog
+
+    unit = np.linalg.norm(matrix, axis=0)
+    scaled = matrix / np.where(unit > 0.0, unit, 1.0)
+    low, high = np.isfinite(lower), np.isfinite(upper)
+    rows = np.vstack([-scaled[low], scaled[high]])
+    limit = np.concatenate([-lower[low], upper[high]])
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    count, p = rows.shape
+    found = linprog(
+        np.concatenate([np.zeros(p), np.ones(count)]), np.hstack([rows / size[:, None], -np.eye(count)]), limit / size,
+        bounds=[(None, None)] * p + [(0.0, None)] * count,
+    )  # fmt: skip
+    if found.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
+        return ()
+    places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
+    return tuple(sorted({int(places[k]) for k in np.flatnonzero(found.ineqlin.marginals < -1e-9)}))
+
+
+def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the estimate under A b = d from the free one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
+
+    Gouriéroux & Monfort (1995, section 10.3): under inequalities the same, A and d those that bind.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
+        free: (p,) b_f.
+        normals: A (k, p), of full rank.
+        held: d (k,).
+    """
+    p = len(free)
+    turned = scipy.linalg.solve_triangular(factor[:p, :p].T, normals.T, lower=True)  # R⁻ᵀ Aᵀ
+    push = np.linalg.lstsq(turned, np.linalg.lstsq(turned.T, normals @ free - held)[0])[0]
+    return np.asarray(free - scipy.linalg.solve_triangular(factor[:p, :p], turned @ push))
+
+
+def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the covariance of an estimate held on A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
+
+    C may be any covariance of the free estimate, that of correlated residuals too.
+
+    Args:
+        covariance: C (p, p).
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] that the estimate minimises.
+        normals: A (k, p), of any rank.
+    """
+    if not len(normals):
+        return covariance
+    p = len(covariance)
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    free = _null_space(normals / norms)
+    if not free.shape[1]:
+        return np.zeros((p, p))
+    upper = factor[:p, :p] / norms
+    shrink = free @ np.linalg.lstsq(upper @ free, upper)[0] * norms / norms[:, None]  # P
+    return np.asarray(shrink @ covariance @ shrink.T)
+
+
+def _null_space(rows: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (p, p - rank) of what the rows do not see; exact zeros where they fix a parameter."""
+    size = np.linalg.norm(rows, axis=1)
+    rows = rows[size > 0.0] / size[size > 0.0, None]
+    _, values, right = np.linalg.svd(rows)
+    basis = right[int(np.sum(values > 1e-9)) :].T
+    return np.where(np.abs(basis) < 1e-14, 0.0, basis)
 
 
 @dataclass(frozen=True, eq=False)
