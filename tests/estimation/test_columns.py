@@ -88,31 +88,3 @@ def test_the_tolerance_decides_on_a_nearly_dependent_column():
     matrix = np.column_stack([matrix, matrix @ rng.normal(size=4) + 1e-4 * rng.normal(size=50)])
     assert split_columns(matrix, tolerance=1e-6).rank == 5
     assert split_columns(matrix, tolerance=1e-2).rank == 4
-
-
-def weak_directions(matrix: np.ndarray, threshold: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-    """Return the singular values below `threshold` of the largest and their right vectors, for unit-norm columns.
-
-    Args:
-        matrix: (rows, b), full column rank.
-
-    Returns:
-        ratios (w,), falling, and directions (w, b) in the scaled columns' coordinates.
-    """
-    factor = np.linalg.qr(matrix, mode="r")
-    scaled = factor / np.linalg.norm(factor, axis=0)
-    _, values, vt = np.linalg.svd(scaled)
-    ratios = values / values[0]
-    weak = ratios < threshold
-    return ratios[weak], vt[weak]
-
-
-def test_weak_directions_name_the_two_columns_that_nearly_merge():
-    rng = np.random.default_rng(7)
-    matrix = rng.normal(size=(200, 6))
-    matrix[:, 4] = matrix[:, 1] + 1e-5 * rng.normal(size=200)
-    ratios, directions = weak_directions(matrix * np.array([1, 1e3, 1, 1, 1e-3, 1]))
-    assert len(ratios) == 1 and 1e-6 < ratios[0] < 1e-4
-    assert sorted(np.argsort(-np.abs(directions[0]))[:2]) == [1, 4]
-    assert np.abs(np.delete(directions[0], [1, 4])).max() < 1e-3
-    assert len(weak_directions(matrix, threshold=1e-9)[0]) == 0

@@ -7,8 +7,7 @@ import pytest
 import scipy.signal
 
 from calib.errors import Unidentifiable
-from calib.estimation.constrained import Definite, within
-from calib.estimation.instrumental_variables import exogeneity, instrument, iv, projected, settled, strength
+from calib.estimation.instrumental_variables import exogeneity, instrument, iv, settled, strength
 from calib.estimation.linear import ols
 
 TRUTH = np.array([2.0, -1.0, 0.5])
@@ -175,26 +174,3 @@ def test_an_instrument_without_motion_and_dependent_columns_are_named():
     with pytest.raises(Unidentifiable) as caught:
         iv(instrument(z, twice, y, names=["Ia1", "Fv2", "Fc3"]))
     assert caught.value.names == ("Ia1", "Fc3")
-
-
-def test_constraints_that_hold_change_nothing_and_bind_with_a_multiplier_where_they_do_not():
-    problem = instrument(*planted(10, 1.0), names=["a", "b", "c"])
-    triangle, free = projected(problem), iv(problem).estimate
-    easy = within(triangle, np.eye(3), np.full(3, -10.0), np.full(3, 10.0))
-    assert easy.values == pytest.approx(free.values, abs=1e-8)
-    tight = within(triangle, np.eye(3), np.array([0.0, 0.0, 0.0]), np.full(3, np.inf))
-    assert tight.binding.tolist() == [False, True, False]
-    assert tight.values[1] == pytest.approx(0.0, abs=1e-9)
-    q, u, c = triangle[:3, :3].T @ triangle[:3, :3], [0, 2], [1]
-    moved = free.values[u] + np.linalg.solve(q[np.ix_(u, u)], q[np.ix_(u, c)] @ free.values[c])
-    assert tight.values[u] == pytest.approx(moved, abs=1e-8)  # the slides' relation, in its two-stage form
-
-
-def test_a_definite_matrix_enters_iv_as_well():
-    triangle = projected(instrument(*planted(11, 1.0)))
-    arrow = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 1, 0], [0, 0, 1]]], dtype=float)  # of the truth it is singular
-    found = within(triangle, np.zeros((0, 3)), np.zeros(0), np.zeros(0), Definite(arrow[None], 0.1))
-    assert np.linalg.eigvalsh(arrow @ found.values)[0] == pytest.approx(0.1, abs=1e-7) and found.binding.all()
-    r, z = triangle[:3, :3], triangle[:3, 3]
-    slope = r.T @ (r @ found.values - z)
-    assert slope == pytest.approx(found.multipliers @ found.normals, abs=1e-7 * np.abs(r.T @ z).max())
