@@ -30,14 +30,11 @@ def test_linear_constraints_give_the_optimum_of_cvxpy_and_prove_it(seed, equal):
     lower[:equal] = upper[:equal] = [0.2, -0.1][:equal]
     found = within(combine(collect(matrix, target)), rows, lower, upper)
     b = cvxpy.Variable(8)  # columns of unit norm, for the solver's sake
-    conditions = [
-        (rows[equal:7] / unit) @ b >= -0.1,
-        (rows[5:] / unit) @ b <= 0.3,
-        (rows[:equal] / unit) @ b == lower[:equal],
-    ]
-    cvxpy.Problem(
-        cvxpy.Minimize(0.5 * cvxpy.sum_squares(target - (matrix / unit) @ b)), conditions[: 2 + (equal > 0)]
-    ).solve(solver="CLARABEL", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
+    conditions = [(rows[equal:7] / unit) @ b >= -0.1, (rows[5:] / unit) @ b <= 0.3]
+    conditions += [(rows[:equal] / unit) @ b == lower[:equal]] if equal else []
+    cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.sum_squares(target - (matrix / unit) @ b)), conditions).solve(
+        solver="CLARABEL", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12
+    )
     assert found.values * unit == pytest.approx(b.value, abs=1e-6 * np.abs(b.value).max())
     assert rows[:equal] @ found.values == pytest.approx(lower[:equal], rel=1e-9) and found.binding.any()
     slope = matrix.T @ (matrix @ found.values - target)
