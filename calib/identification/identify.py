@@ -19,13 +19,7 @@ from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.methods.bias import (
-    LoopDisagreement,
-    LoopTest,
-    compare_with_loop,
-    disagreement,
-    require_simulable,
-)
+from calib.identification.methods.bias import LoopDisagreement, LoopTest, compare_with_loop, disagreement
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
@@ -40,7 +34,7 @@ from calib.identification.prior import (
     tempered_prior,
 )
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
-from calib.identification.settings import IdentificationSettings, make_model, per_joint
+from calib.identification.settings import IdentificationSettings, make_model, per_joint, require_simulable
 from calib.identification.time_folds import estimate, regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain

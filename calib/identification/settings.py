@@ -158,3 +158,29 @@ def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
     if len(values) not in (1, n):
         refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
     return tuple(values) * n if len(values) == 1 else tuple(values)
+
+
+def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:
+    """Return the settings of a method that simulates, whose model is one that can be.
+
+    Args:
+        with_loop: whether it simulates the closed loop, or the robot alone.
+
+    Raises:
+        UsageError: where no loop is stated, or for other torques than the motors', or richer friction.
+    """
+    place = f"method '{settings.method}'"
+    if with_loop and settings.loop is None:
+        words = (
+            "state the controller that it simulates in the options file, [loop] controller = … (calib formats "
+            "identify-options), and log or state the reference; from q and torque alone use wls or irls"
+        )
+        refuse_option(place, words)
+    if not settings.torque_rows.motors_alone:
+        refuse_option(
+            place, f"explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
+        )
+    if settings.friction not in ("auto", "standard"):
+        words = f"simulates standard friction only, not friction = '{settings.friction}'"
+        refuse_option(place, f"{words}; use wls, whose estimate a [loop] then tests for bias")
+    return replace(settings, friction="standard")

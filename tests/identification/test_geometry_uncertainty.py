@@ -170,7 +170,7 @@ def run(folder: Path, tmp_path: Path, *more: str) -> tuple[dict, list[dict], Pat
 
 
 def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
-    found, rows, out = run(fitted_folder(tmp_path, 1e-6), tmp_path)
+    found, rows, out = run(fitted_folder(tmp_path, 1e-6), tmp_path, "-v")
     assert found["propagated"] and found["geometry_exceeds_torque"] and found["largest_growth_of_sigma"] > 1.4
     for row in rows:
         total = np.hypot(float(row["sigma_torque"]), float(row["sigma_geometry"]))

@@ -8,17 +8,16 @@ least squares not at all. Noise of the positions biases least squares, so parame
 torques must side against the loop as well, beside simulated motion, which is free of noise.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from calib.errors import CalibError, Finding, finding, refuse_option
+from calib.errors import CalibError, Finding, finding
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.methods.instrumental import Instrumental
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, MethodEstimate
 from calib.identification.methods.simulated import IV
-from calib.identification.settings import IdentificationSettings
 
 MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
 
@@ -45,32 +44,6 @@ class LoopTest:
             return []
         noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
         return noticed + (_blurred(self) if taken else _biased(self.found))
-
-
-def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:
-    """Return the settings of a method that simulates, whose model is one that can be.
-
-    Args:
-        with_loop: whether it simulates the closed loop, or the robot alone.
-
-    Raises:
-        UsageError: where no loop is stated, or for other torques than the motors', or richer friction.
-    """
-    place = f"method '{settings.method}'"
-    if with_loop and settings.loop is None:
-        words = (
-            "state the controller that it simulates in the options file, [loop] controller = … (calib formats "
-            "identify-options), and log or state the reference; from q and torque alone use wls or irls"
-        )
-        refuse_option(place, words)
-    if not settings.torque_rows.motors_alone:
-        refuse_option(
-            place, f"explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
-        )
-    if settings.friction not in ("auto", "standard"):
-        words = f"simulates standard friction only, not friction = '{settings.friction}'"
-        refuse_option(place, f"{words}; use wls, whose estimate a [loop] then tests for bias")
-    return replace(settings, friction="standard")
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
