@@ -38,12 +38,12 @@ def study(
         list_methods: all methods, and what each needs
         list_studies: the studies that come with the toolkit
     """
-    from calib.identification.methods.registry import LISTING
+    from calib.identification.methods.registry import METHODS
     from calib.procedure.report import page
     from calib.rooms.studies.reports import report
 
     if list_methods or list_studies:
-        say(*(map(str, LISTING) if list_methods else ()), *(report.study_lines() if list_studies else ()))
+        say(*(map(str, METHODS.values()) if list_methods else ()), *(report.study_lines() if list_studies else ()))
         return
     if not studies:
         raise UsageError("no study named: give a file, or a name out of calib study --list")
