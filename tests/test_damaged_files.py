@@ -27,7 +27,7 @@ from calib.geometry.observability import targets_of
 from calib.identification import identify_options
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import read_motion_limits
-from calib.procedure.excitation.waypoints import read_waypoints
+from calib.procedure.excitation.planning import read_waypoints
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.session.folder import Session, read_state
 from calib.procedure.session.settings import read_settings

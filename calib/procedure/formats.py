@@ -46,7 +46,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "the TOML file of calib excite --limits and calib plan --limits",
         ("calib.procedure.excitation.limits",),
     ),
-    "waypoints": ("the CSV of calib plan --waypoints", ("calib.procedure.excitation.waypoints",)),
+    "waypoints": ("the CSV of calib plan --waypoints", ("calib.procedure.excitation.planning",)),
     "excitation": (
         "trajectory.toml of calib excite, and what calib recall writes",
         ("calib.procedure.excitation.coefficients", "calib.procedure.excitation.recall"),

@@ -1,4 +1,11 @@
-"""Planning a motion: a path through waypoints, timed by the package `trajectories` on the best model there is."""
+"""Planning a motion: a path through waypoints, timed by the package `trajectories` on the best model there is.
+
+Waypoints are joint values, or places of the tool by inverse kinematics: a CSV, a row per waypoint, in order, with the
+robot's joints, or the tip's place ``x y z`` in the robot's base frame and its orientation ``qx qy qz qw`` (or ``r11``
+to ``r33``); without one only the position counts. Units stand in brackets, plain headers are SI. With both, the place
+is met and the joints say in which configuration; without joints each is reached from the configuration before it, the
+first one from --start, or near the middle of the joint limits.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,23 +17,27 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Expect, numbers
-from calib.data.poses.pose_lists import Targets
+from calib.data.csv_table import read_header
+from calib.data.poses.pose_lists import Targets, read_poses, read_targets
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.errors import RobotError, UsageError, require
+from calib.geometry import inverse
+from calib.geometry.installation import Installation
+from calib.geometry.inverse import Goal
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.torque_errors import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
-from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
 from calib.robot.kinematics import forward, tip_jacobian
+from calib.transforms import pose
 from trajectories.basis import SampledMotion
 from trajectories.setpoints import Setpoints, joined, slowed
 from trajectories.timing.limits import TimingLimits
@@ -36,6 +47,74 @@ from trajectories.timing.path import check_within, checked, spline
 from trajectories.timing.profile import track
 from trajectories.timing.shape import Shaped, shorten
 from trajectories.timing.time_scaling import Timing, time_optimal
+
+MAX_TRIES = 40  # random configurations from which a waypoint is sought (our choice)
+MAX_ERROR = 1e-6  # [m and rad] that may be left
+
+
+def read_waypoints(
+    given: Path | Targets | np.ndarray,
+    chain: Chain,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    start: Sequence[float] | None = None,
+) -> np.ndarray:
+    """Return waypoints (m, n) [rad or m].
+
+    Args:
+        given: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
+        chain: whose tip stands at the places, the best geometry there is.
+        lower, upper: (n,) joint limits to stay within.
+        start: (n,) where the robot stands: the first place is reached near it; else near the middle of the limits.
+
+    Raises:
+        UsageError: for a place out of reach: which one, and how far.
+    """
+    if not isinstance(given, Path):
+        targets = Targets.of(given)
+    elif {"x", "x_target"} & set(read_header(given)[0]):
+        targets = read_targets(given, chain.joint_names, kinds=joint_kinds(chain))
+    else:
+        targets = Targets.of(read_poses(given, chain.joint_names, kinds=joint_kinds(chain)))
+    if targets.position is None and targets.q is not None:
+        return read_poses(targets.q, chain.joint_names)
+    goal = Goal(Installation(chain), 3 if targets.rotation is None else 6, lower, upper)
+    wanted = pose(targets.rotation, targets.position)
+    low, high = (np.where(np.isfinite(x), x, s * np.pi) for x, s in ((lower, -1.0), (upper, 1.0)))
+    here = np.asarray(start, dtype=float) if start is not None else (low + high) / 2
+    others = np.random.default_rng(0).uniform(low, high, (MAX_TRIES, chain.n))
+    found = []
+    for k in range(len(targets)):
+        near = here if targets.q is None else np.array(targets.q[k])
+        here = _reached(goal, wanted[k : k + 1], near, others, targets, k)
+        found.append(here)
+    return np.array(found)
+
+
+def _reached(
+    goal: Goal, target: np.ndarray, near: np.ndarray, others: np.ndarray, targets: Targets, k: int
+) -> np.ndarray:
+    """Return joint values (n,) at a target (1, 4, 4): from where the arm is, else of many tries the nearest to it."""
+    q = inverse.nearest(goal, target, near[None], inverse.reach(goal, target, near[None]))
+    left = inverse.differences(goal, q, target)
+    if np.abs(left).max() <= MAX_ERROR:
+        return q[0]
+    many = np.repeat(target, len(others), axis=0)
+    tried = inverse.reach(goal, many, others)
+    left = inverse.differences(goal, tried, many)
+    met = np.abs(left).max(axis=1) <= MAX_ERROR
+    if not met.any():
+        best = left[np.argmin(np.linalg.norm(left, axis=1))]
+        turn = f" and {np.degrees(np.linalg.norm(best[3:])):.3g} deg" if goal.dof == 6 else ""
+        raise UsageError(
+            f"{targets.file}: waypoint {k + 1} is out of reach: of {len(others)} tries the nearest stays "
+            f"{1e3 * np.linalg.norm(best[:3]):.3g} mm{turn} short within the joint limits; are x y z those of the tip "
+            "in the robot's base frame, in metres?"
+        )
+    distance = np.where(met, np.abs(tried - near).max(axis=1), np.inf)
+    chosen = tried[np.argmin(distance)][None]
+    return inverse.nearest(goal, target, near[None], chosen)[0]
+
 
 DRIVES = ("Ia", "Fv", "Fc", "off")
 PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint")]
@@ -104,7 +183,7 @@ def plan(
 
     Args:
         robot, base, tip: see `calib.robot.load`.
-        waypoints: see `calib.procedure.excitation.waypoints`.
+        waypoints: see `calib.procedure.excitation.planning`.
         settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification; its geometry is planned with, the limits are the robot's.
         limits: see `calib.procedure.excitation.limits`; drives: see `_read_drives`.

@@ -20,8 +20,8 @@ from calib.dynamics.bodies import STANDARD
 from calib.errors import CalibError
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation import planning
+from calib.procedure.excitation.planning import read_waypoints
 from calib.procedure.excitation.settings import PlanSettings
-from calib.procedure.excitation.waypoints import read_waypoints
 from calib.robot import description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward

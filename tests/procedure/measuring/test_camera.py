@@ -17,10 +17,10 @@ from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
-from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.session.commands import begin, go_on
 from calib.procedure.session.folder import open_session
+from calib.procedure.session.questions import cell_tables
 from calib.robot.calibrated import Deflection
 from calib.robot.load import load
 from calib.rooms.camera.board import read_board

@@ -14,11 +14,11 @@ from calib.cli import run
 from calib.config import parse
 from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
-from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
 from calib.procedure.measuring.run import RunSettings, is_run, plan_run, rehearsed_samples, write_run
+from calib.procedure.session.questions import cell_tables
 from calib.robot.chain import Chain, random_joints
 from calib.robot.load import load
 from poses.candidates import draw_candidates
