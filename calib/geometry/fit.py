@@ -72,8 +72,7 @@ def fit(
     if drawn:
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
         return replace(_shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
-    start, found = cell, None
-    max_retries = 4
+    start, found, max_retries = cell, None, 4
     for attempt in range(1 + max_retries):
         plausible = np.where(np.isfinite(stated[free]), np.inf, plausible_deviation(cell, free))
         if attempt == 0 and not np.isfinite(plausible).any():
@@ -235,11 +234,6 @@ def _whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _frames_only(cell: Installation) -> np.ndarray:
-    """Return the positions of all station and tool elements."""
-    return layout(cell).frame_index
-
-
 def polish_frames(
     cell: Installation,
     measured: Sequence[PoseMeasurements],
@@ -247,7 +241,7 @@ def polish_frames(
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> GeometricFit:
     """Fit stations and tools only, the arm staying as it is: what 'nominal' errors are measured with."""
-    return fit(cell, measured, _frames_only(cell), settings=settings, torques=torques)
+    return fit(cell, measured, layout(cell).frame_index, settings=settings, torques=torques)
 
 
 def placed_on(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,7 +130,6 @@ def compare(
     nominal: Installation,
     calibrated: Installation,
     blocks: Sequence[PoseMeasurements],
-    torques: list[np.ndarray | None],
     frames: str,
     proves: bool = True,
     seed: int = 0,
@@ -139,7 +138,7 @@ def compare(
     shares_frames: bool = False,
 ) -> Comparison:
     """Return both arms' errors on some rows, and those of the calibrated geometry `alone` (`without_corrections`)."""
-    cells = nominal, calibrated
+    cells, torques = (nominal, calibrated), [gravity_of(nominal.chain, block) for block in blocks]
     one, two = (errors(cell, blocks, torques) for cell in cells)
     first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
     rigid = None if alone is None else errors(alone, blocks)
@@ -154,41 +153,38 @@ def compare_unseen(
     nominal: Installation,
     calibrated: Installation,
     unseen: Unseen,
-    torque_of: Callable[[PoseMeasurements], np.ndarray | None],
     settings: Settings,
     seed: int = 0,
     alone: Installation | None = None,
     expected: ErrorModel | None = None,
 ) -> Comparison:
     """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
-    block = unseen.block
-    torques, settled, thin = [torque_of(block)], True, None
+    block, torques, settled, thin = unseen.block, [gravity_of(nominal.chain, unseen.block)], True, None
     if unseen.own_frames:
         placed = [placed_on(cell, block, torques, settings) for cell in (nominal, calibrated)]
         nominal, calibrated = (each.cell for each in placed)
         alone = None if alone is None else placed_on(alone, block, torques, settings).cell
         settled = all(each.solution.status.good for each in placed)
         numbers, fitted = sum(piece.part.value.size for piece in placed[1].pieces), len(placed[1].free)
-        thin = (numbers, fitted) if numbers < MARGIN * fitted else None
         words = "base and tool placement refitted on these rows"
+        if not settled:
+            words = "base and tool placement did not settle on these rows"
+        elif numbers < MARGIN * fitted:
+            thin = numbers, fitted
+            words = f"base and tool placement: {fitted} parameters fitted to {numbers} numbers of these rows"
     elif unseen.held_out:
         words = "those of the fit"
     else:
         words = f"those of the fit, station '{block.station}'" if block.has_instrument else "tool of the fit"
-    shares = not (unseen.own_frames or unseen.held_out)
     found = compare(
-        nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
-    )
-    sizes = found.errors[1].position
+        nominal, calibrated, [block], words, settled and thin is None and not unseen.seen, seed, alone=alone,
+        shares_frames=not (unseen.own_frames or unseen.held_out),
+    )  # fmt: skip
+    sizes, intervals = found.errors[1].position, None
     if expected is not None and isinstance(block, Positions) and sizes is not None:
         sigma = expected.sigma_on(calibrated, block, torques[0], unseen.own_frames)
-        found = replace(found, intervals=_intervals(expected, block, sigma, sizes))
-    if settled and thin is not None:
-        words = f"base and tool placement: {thin[1]} parameters fitted to {thin[0]} numbers of these rows"
-        return replace(found, placed_by=thin, proves=False, frames=words)
-    if settled:
-        return found
-    return replace(found, settled=False, proves=False, frames="base and tool placement did not settle on these rows")
+        intervals = _intervals(expected, block, sigma, sizes)
+    return replace(found, settled=settled, placed_by=thin, intervals=intervals)
 
 
 def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes: np.ndarray) -> Intervals:

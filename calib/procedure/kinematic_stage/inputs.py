@@ -103,7 +103,7 @@ def gather(
     else:
         earlier = calibrated.read(source) if source.suffix == ".toml" else None
     blocks = _named(
-        [(path, block) for path, each in zip(files, measured) for block in _blocks(each, chain, options)],
+        [(path, block) for path, each in zip(files, measured) for block in read_file(each, chain, options)],
         options, settings.stations, settings.tools,
     )  # fmt: skip
     unseen: dict[str, Unseen] = {}
@@ -136,7 +136,7 @@ def with_unseen(
     unseen, notes, fit = dict(given.unseen), list[str](), given.fit
     files = {Path(block.file).resolve() for block in fit}
     for each in validate:
-        for block in _blocks(each, given.chain, options, fit):
+        for block in read_file(each, given.chain, options, fit):
             again = _path(each).resolve() in files
             if again:
                 notes.append(f"{block.file} is a fit file too: its errors there say nothing of unseen poses")
@@ -205,49 +205,32 @@ def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -
 
 
 def read_file(
-    path: Path, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
+    each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
     """Read one measurement file, or a folder of images, for a chain, held against its limits and what it can see.
 
     Args:
-        path, chain, options: what, for whom, and how.
+        each, chain, options: what (or a block in memory, which is checked alike), for whom, and how.
         like: blocks read before; images of the same size are taken to be by the same camera.
     """
-    limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
-    if is_image_folder(path):
-        images = needed("image_folders").read_images(
-            path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits
-        )
-        return _checked([images], chain, like)
-    return _checked(
-        read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits), chain
-    )
-
-
-def _blocks(
-    each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
-) -> list[PoseMeasurements]:
-    if isinstance(each, (str, Path)):
-        return read_file(Path(each), chain, options, like)
-    if tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n:
-        each = check_block(each, options.for_file(_path(each)), joint_kinds(chain), (chain.lower, chain.upper))
-    return _checked([each], chain, like)
-
-
-def _path(each: Path | PoseMeasurements) -> Path:
-    return Path(each) if isinstance(each, (str, Path)) else Path(each.file or "measured")
-
-
-def _checked(
-    blocks: list[PoseMeasurements], chain: Chain, like: Sequence[PoseMeasurements] = ()
-) -> list[PoseMeasurements]:
-    blocks = [
-        needed("camera_guess").complete_camera(chain, each, like) if each.kind == IMAGES else each for each in blocks
-    ]
+    path, limits, kinds = _path(each), (chain.lower, chain.upper), joint_kinds(chain)
+    own = options.for_file(path)
+    if not isinstance(each, (str, Path)):
+        fits = tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n
+        blocks = [check_block(each, own, kinds, limits) if fits else each]
+    elif is_image_folder(path):
+        blocks = [needed("image_folders").read_images(path, chain.joint_names, own, kinds=kinds, limits=limits)]
+    else:
+        blocks = read_measurements(path, chain.joint_names, own, kinds=kinds, limits=limits)
+    blocks = [needed("camera_guess").complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
     return blocks
+
+
+def _path(each: Path | PoseMeasurements) -> Path:
+    return Path(each) if isinstance(each, (str, Path)) else Path(each.file or "measured")
 
 
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
@@ -320,11 +303,8 @@ def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]
 
 def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
     """Return a file's name, or its path where a file of that name is there already."""
-    name = Path(file).name
-    number = 2
-    while name in taken:
-        name, number = (str(file), number) if str(file) not in taken else (f"{file} ({number})", number + 1)
-    return name
+    names = (Path(file).name, file, *(f"{file} ({number})" for number in range(2, len(taken) + 2)))
+    return next(name for name in names if name not in taken)
 
 
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:

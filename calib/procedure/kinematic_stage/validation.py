@@ -259,13 +259,10 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
         wanted: the model asked for, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
     both, settings = (arms.nominal, arms.calibrated), settings.combine(loss=findings.loss or settings.loss)
-    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
-    fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, wanted.seed, alone=alone)
+    fitted = compare(*both, inputs.fit, "fitted on these rows", False, wanted.seed, alone=alone)
     validation = {
-        name: compare_unseen(
-            *both, unseen, lambda b: gravity_of(inputs.chain, b), settings, wanted.seed, alone, arms.expected
-        )
+        name: compare_unseen(*both, unseen, settings, wanted.seed, alone, arms.expected)
         for name, unseen in inputs.unseen.items()
     }
     judged = judge_deliverables(fitted, validation, findings, wanted)
