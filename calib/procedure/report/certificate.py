@@ -13,7 +13,7 @@ from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from calib import files
 from calib.folders import CERTIFICATE
@@ -89,10 +89,13 @@ def certificate(
     marks = [(name, role, digest[:DIGEST_DIGITS]) for name, role, _, digest in filed[:MAX_LISTED_FILES]]
     if len(files) > MAX_LISTED_FILES:
         marks.append((f"and {len(files) - MAX_LISTED_FILES} more, see Files", "", ""))
-    when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
-    issued = f"{when}, armature-calib {metadata.version('armature-calib')}"
     return Page(
-        title, subtitle, issued, [(label, _shortened(value, most)) for label, value in first.items()], behind, marks
+        title,
+        subtitle,
+        issued(now),
+        [(label, _shortened(value, most)) for label, value in first.items()],
+        behind,
+        marks,
     )
 
 
@@ -135,18 +138,29 @@ def versions() -> str:
     return f"{known}, Python {platform.python_version()}"
 
 
+def issued(now: datetime | None = None) -> str:
+    """Return when, and by which version, a page is made."""
+    when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
+    return f"{when}, armature-calib {metadata.version('armature-calib')}"
+
+
 def render(page: Page) -> str:
     """Return the page as HTML."""
+    return filled("calib.procedure.report", CERTIFICATE, page=page)
+
+
+def filled(package: str, file: str, **values: Any) -> str:
+    """Return the template in a file of a package with values, in the style of all pages."""
     style = resources.files("calib.procedure.report").joinpath("certificate.css").read_text(encoding="utf-8")
-    return _template().render(page=page, style=style)
+    return _template(package, file).render(**values, style=style)
 
 
 @cache
-def _template() -> jinja2.Template:
-    """Return the page's template, compiled once for a process that writes many pages."""
+def _template(package: str, file: str) -> jinja2.Template:
+    """Return a template, compiled once for a process that writes many pages."""
     import jinja2  # slow to load, and not needed to write the rest
 
-    source = resources.files("calib.procedure.report").joinpath(CERTIFICATE).read_text(encoding="utf-8")
+    source = resources.files(package).joinpath(file).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
     return environment.from_string(source)

@@ -91,7 +91,7 @@ def outcome_section(metrics: FitMetrics) -> Section:
     blocks.append(Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
     if metrics.advice and not any(metrics.advice in line for line in metrics.warnings):
         blocks.append(Text("", [metrics.advice], "what to do"))
-    blocks += [Text("", _repeated_sentences(metrics)), Text("", _outlier_sentences(metrics), "outliers")]
+    blocks += [Text("", _repeated_sentences(metrics)), Text("", outlier_sentences(metrics), "outliers")]
     blocks += [Text("", metrics.warnings, "note"), Text("", metrics.not_identifiable, "identifiability")]
     return Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
@@ -268,7 +268,7 @@ def _parameter_table(report: Report) -> Table:
     return Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
 
 
-def _outlier_sentences(metrics: FitMetrics) -> list[str]:
+def outlier_sentences(metrics: FitMetrics) -> list[str]:
     """Return in a sentence how many rows do not fit, and the worst of them; none where all fit."""
     if not metrics.outliers:
         return []

@@ -4,7 +4,7 @@ What a session asks of people, in two lines: what to do at the robot, and which 
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -211,11 +211,10 @@ def begin(
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     copied, named = _limits(limits, chain, source, dynamics)
-    sigmas = {key: getattr(device, key) for key in ("measures", "sigma_position", "sigma_orientation")}
     table = {
         "name": chain.name, "created": "", "seed": seed, "fit": {},
         "robot": {"file": source.name, "given": robot, "base": base, "tip": tip},
-        "instrument": {"name": device.label, **sigmas, **({} if tool is None else {"tool": [*map(float, tool)]})},
+        "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
         "poses": {"fit": poses, "validation": validation, "constraints": named},
         "dynamics": {"wanted": dynamics, "limits": named, **(motion or {})},
     }  # fmt: skip

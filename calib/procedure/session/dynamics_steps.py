@@ -3,7 +3,7 @@
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -246,6 +246,14 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
     return _cut_paths(training, learnt), _cut_paths(training, held)
 
 
+def _gathered(
+    session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
+) -> inputs.IdentificationInputs:
+    """Return the calibrated robot with recordings, as paths with cuts, to identify and to judge it by."""
+    options, seed = options_of(session), session.settings.seed
+    return inputs.gather(session.fit.path, training, unseen, options=options, seed=seed, progress=say)
+
+
 def identify(session: Session, say: Say) -> list[str]:
     """Identify base parameters and friction on the calibrated geometry; validation files are not looked at."""
     from calib.procedure.dynamic_stage import folder as identification_outputs
@@ -253,10 +261,7 @@ def identify(session: Session, say: Say) -> list[str]:
     draw = None
     if session.plots:
         from calib.procedure.report.dynamics_figures import write as draw
-    given = inputs.gather(
-        session.fit.path, _divided(session)[0], options=options_of(session),
-        seed=session.settings.seed, progress=say,
-    )  # fmt: skip
+    given = _gathered(session, _divided(session)[0], (), say)
     outcome = identifying.run(given, progress=say)
     outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED))
     say("writing")
@@ -284,10 +289,7 @@ def predict(session: Session, say: Say) -> list[str]:
         aside[path.name], said = _check_recording(session, path, "validation")
         notes += said
     say("predicting unseen motion")
-    given = inputs.gather(
-        session.fit.path, training, [*held, *_cut_paths(unseen, aside)], options=options_of(session),
-        seed=session.settings.seed, progress=say,
-    )  # fmt: skip
+    given = _gathered(session, training, [*held, *_cut_paths(unseen, aside)], say)
     place = session.identification
     found = assess(given, place.dynamics(), place.findings(), place.errors(), progress=say)
     place.unseen.write(given, found)  # the export is judged by the torques written here

@@ -38,7 +38,7 @@ from calib.procedure.measuring.prediction import read as read_prediction
 from calib.procedure.measuring.prediction import write as write_prediction
 from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import certificate, fit_report
-from calib.procedure.report.geometry_section import error_words, parameter_words
+from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.session.folder import (
     POSES,
     POSES_CHECKED,
@@ -308,15 +308,10 @@ def fit(session: Session, say: Say) -> list[str]:
     draw = partial(certificate.write_fit, plots=session.plots, page=False)
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
     metrics = session.fit.metrics()
-    notes = [f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}", *outcome.warnings]
-    if outcome.outliers:
-        named = ", ".join(each.words for each in outcome.outliers[:3])
-        advice = (
-            "" if outcome.selection.loss != "none" else '; look at these rows, or set loss = "cauchy" in session.toml'
-        )
-        count = len({(each.file, each.row) for each in outcome.outliers})
-        notes.append(f"{count} row{'s do' if count > 1 else ' does'} not fit: {named}{advice}")
-    return notes
+    words = f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}"
+    advice = () if outcome.selection.loss != "none" else ('look at these rows, or set loss = "cauchy" in session.toml',)
+    outliers = ["; ".join((line, *advice)) for line in outlier_sentences(metrics)]
+    return [words, *outcome.warnings, *outliers]
 
 
 def validate(session: Session, say: Say) -> list[str]:

@@ -16,58 +16,34 @@ from calib.errors import UsageError, require
 from calib.extensions import needed
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.answers import CAMERA, CELL, Answers
-from calib.procedure.session.settings import NOTHING
+from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.robot.load import resolve
 from calib.transforms import pose, to_xyz_rpy
 
 MAX_MASS = 2000.0  # [kg]: of a payload (our choice)
 
 
-@dataclass(frozen=True)
-class InstrumentPreset:
-    """An instrument's starting values in ``session.toml``.
-
-    Attributes:
-        label: its name for people.
-        measures: ``pose``, ``position`` or ``pixels``.
-        sigma_position, sigma_orientation: of one measurement, per axis [m], [rad]; 0: to be estimated.
-        source: where the sigmas come from.
-    """
-
-    label: str
-    measures: str
-    sigma_position: float
-    sigma_orientation: float
-    source: str
-
-
-INSTRUMENTS = {
-    "cmm": InstrumentPreset(
-        "optical CMM", "pose", 60e-6, 0.2e-3, "Nikon K610: 60 µm volumetric; orientation our guess"
-    ),
-    "tracker": InstrumentPreset(
-        "laser tracker", "position", 20e-6, 0.0, "about 15 µm + 6 µm/m in a small cell; our guess"
-    ),
-    "tracker6d": InstrumentPreset("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3, "our guess"),
-    "mocap": InstrumentPreset("motion capture", "pose", 0.0, 0.0, "estimated from the residuals"),
-    "camera": InstrumentPreset("camera and board", "pixels", 0.0, 0.0, "estimated from the residuals"),
-    "camera-poses": InstrumentPreset(
-        "camera and board", "pose", 0.0, 0.0, "poses by another program; estimated from the residuals"
-    ),
-    "none": InstrumentPreset("no instrument", NOTHING, 0.0, 0.0, "dynamics alone"),
-    "other-pose": InstrumentPreset("instrument", "pose", 0.0, 0.0, "estimated from the residuals"),
-    "other-position": InstrumentPreset("instrument", "position", 0.0, 0.0, "estimated from the residuals"),
+INSTRUMENTS = {  # starting values in ``session.toml``; a sigma of 0 is estimated from the residuals
+    "cmm": InstrumentSection("optical CMM", "pose", 60e-6, 0.2e-3),  # Nikon K610: 60 µm volumetric; turn: our guess
+    "tracker": InstrumentSection("laser tracker", "position", 20e-6),  # about 15 µm + 6 µm/m in a small cell: our guess
+    "tracker6d": InstrumentSection("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3),  # our guess
+    "mocap": InstrumentSection("motion capture", "pose"),
+    "camera": InstrumentSection("camera and board", "pixels"),
+    "camera-poses": InstrumentSection("camera and board", "pose"),  # by another program
+    "none": InstrumentSection("no instrument", NOTHING),
+    "other-pose": InstrumentSection("instrument", "pose"),
+    "other-position": InstrumentSection("instrument", "position"),
 }
 
 
-def instrument_named(name: str) -> InstrumentPreset:
+def instrument_named(name: str) -> InstrumentSection:
     """Return an instrument by name.
 
     Raises:
         UsageError: with the names there are.
     """
     if name not in INSTRUMENTS:
-        known = ", ".join(f"{key} ({each.label}, {each.measures})" for key, each in INSTRUMENTS.items())
+        known = ", ".join(f"{key} ({each.name}, {each.measures})" for key, each in INSTRUMENTS.items())
         raise UsageError(f"no instrument '{name}'; there are {known}")
     return INSTRUMENTS[name]
 

@@ -29,20 +29,9 @@ EACH = 0.2  # that a pose stands still [s]
 FILE = "session.rrd"
 
 
-def available() -> bool:
-    """Say whether rerun is installed, without loading it."""
-    from importlib.util import find_spec
-
-    return find_spec("rerun") is not None
-
-
 def _rerun() -> Any:
-    with refused_as(
-        UsageError,
-        ImportError,
-        "this needs Rerun, which is not installed here (there is none for Macs with Intel processors): "
-        "pip install rerun-sdk",
-    ):
+    words = "Rerun is not installed here (there is none for Macs with Intel processors): pip install rerun-sdk"
+    with refused_as(UsageError, ImportError, words):
         import rerun
     return rerun
 
@@ -72,8 +61,6 @@ def write_beside(folder: str | Path) -> str:
 
     A recording is a convenience: neither a missing package nor a full disk stops what it belongs to.
     """
-    if not available():
-        return f"no {FILE}: Rerun is not installed (pip install rerun-sdk)"
     try:
         write(folder, Path(folder) / FILE)
     except Exception as error:  # whatever rerun may raise

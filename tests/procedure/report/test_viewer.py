@@ -159,7 +159,6 @@ def test_without_rerun_the_command_says_what_to_install_and_a_session_goes_on(fi
     assert cli.run(["view", str(fitted), "--save", str(tmp_path / "x.rrd")]) == 2
     assert "pip install rerun-sdk" in capsys.readouterr().err
     assert not (tmp_path / "x.rrd").exists()
-    monkeypatch.setattr(viewer, "available", lambda: False)
     assert "not installed" in viewer.write_beside(fitted)
 
 
@@ -167,7 +166,6 @@ def test_a_recording_that_fails_stops_nothing(fitted, monkeypatch):
     def broken(*arguments: object) -> None:
         raise RuntimeError("no room")
 
-    monkeypatch.setattr(viewer, "available", lambda: True)
     monkeypatch.setattr(viewer, "write", broken)
     assert viewer.write_beside(fitted) == "no session.rrd: no room"
 

@@ -9,13 +9,10 @@ summary.csv              one line per condition and method: of every figure its 
 report.html              tables, box plots, the decision rule; one file
 """
 
-import base64
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from importlib import metadata, resources
 from pathlib import Path
 
 import numpy as np
@@ -244,7 +241,7 @@ def make_page(
         rows: of these conditions.
         plots: with box plots.
     """
-    import jinja2  # slow to load
+    from calib.procedure.report.certificate import filled, issued
 
     head = [overview(conditions), *([torque_table(conditions)] if len(conditions) > 1 else [])]
     sections = [Section("", [*head, Text("How that was decided", RULE), Text("Figures", MEANING)])]
@@ -256,15 +253,9 @@ def make_page(
         drawn = [Pictures("", [boxes(one, own)])] if plots else []
         blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))
-    here, style = resources.files("calib.rooms.studies.reports"), resources.files("calib.procedure.report")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
-    source = here.joinpath("study.html").read_text(encoding="utf-8")
-    when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z").strip()
-    return environment.from_string(source).render(
-        title=study.name, about=study.about, sections=sections, notes=notes,
-        issued=f"{when}, armature-calib {metadata.version('armature-calib')}, {len(rows)} trials",
-        style=style.joinpath("certificate.css").read_text(encoding="utf-8"),
+    return filled(
+        "calib.rooms.studies.reports", "study.html", title=study.name, about=study.about, sections=sections,
+        notes=notes, issued=f"{issued()}, {len(rows)} trials",
     )  # fmt: skip
 
 
