@@ -15,10 +15,16 @@ from calib.errors import CalibError, UsageError
 from calib.rooms.studies.store import JOURNAL, WHOLE, opened, read_rows
 
 
-def test_rows_come_back_as_they_were(tmp_path: Path):
+@pytest.fixture
+def journal(tmp_path: Path) -> Path:
+    """Return the journal of a store of three rows that nobody holds."""
     with opened(tmp_path) as store:
         store.append(rows(3))
-    found = read_rows(tmp_path)
+    return tmp_path / JOURNAL
+
+
+def test_rows_come_back_as_they_were(journal: Path):
+    found = read_rows(journal.parent)
     assert [row.seed for row in found] == [0, 1, 2]
     assert math.isnan(found[0].beta_error)
     assert (found[0].torque_error, found[0].message) == (0.3, "odd, with a comma 0")
@@ -45,26 +51,21 @@ def test_settled_rows_are_the_same_and_written_the_same(tmp_path: Path):
     assert {row.key: str(row) for row in read_rows(tmp_path)} == plain
 
 
-def test_a_kill_between_settling_and_a_new_journal_counts_nothing_twice(tmp_path: Path):
-    with opened(tmp_path) as store:
-        store.append(rows(3))
-        journal = (tmp_path / JOURNAL).read_bytes()
+def test_a_kill_between_settling_and_a_new_journal_counts_nothing_twice(journal: Path):
+    before = journal.read_bytes()
+    with opened(journal.parent) as store:
         store.settle()
-    (tmp_path / JOURNAL).write_bytes(journal)
-    assert len(read_rows(tmp_path)) == 3
+    journal.write_bytes(before)
+    assert len(read_rows(journal.parent)) == 3
 
 
 @pytest.mark.parametrize("cut", [1, 10, 40])
-def test_a_half_written_line_is_taken_off_and_told(tmp_path: Path, cut: int):
-    with opened(tmp_path) as store:
+def test_a_half_written_line_is_taken_off_and_told(journal: Path, cut: int):
+    journal.write_bytes(journal.read_bytes()[:-cut])
+    with opened(journal.parent) as store:
+        assert (len(store.rows), store.dropped) == (2, 1)
         store.append(rows(3))
-    path = tmp_path / JOURNAL
-    path.write_bytes(path.read_bytes()[:-cut])
-    with opened(tmp_path) as store:
-        assert len(store.rows) == 2
-        assert store.dropped == 1
-        store.append(rows(3))
-    assert len(read_rows(tmp_path)) == 3
+    assert len(read_rows(journal.parent)) == 3
 
 
 def test_two_commands_do_not_share_a_folder(tmp_path: Path):
@@ -72,39 +73,25 @@ def test_two_commands_do_not_share_a_folder(tmp_path: Path):
         pass
 
 
-def test_a_store_of_another_version_is_refused_as_it_is(tmp_path: Path):
-    with opened(tmp_path) as store:
-        store.append(rows(1))
-    path = tmp_path / JOURNAL
-    old = path.read_text().replace("calib-study-1", "calib-study-0")
-    path.write_text(old)
-    with pytest.raises(UsageError, match="another version"), opened(tmp_path):
-        pass
-    assert path.read_text() == old
-
-
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [(",found,", ",foundd,", "status 'foundd'.*did you mean 'found'"), (",1e-06,", ",", "cells, not")],
+    ("line", "old", "new", "words"),
+    [
+        (0, "calib-study-1", "calib-study-0", "another version"),
+        (2, ",found,", ",foundd,", "line 3 is damaged .*status 'foundd'.*did you mean 'found'"),
+        (2, ",1e-06,", ",", "line 3 is damaged .*cells, not"),
+        (1, "tx40", "tx40,7", "line 2 is damaged"),
+    ],
 )
-def test_a_line_that_is_short_or_ends_as_no_trial_does_is_damaged(tmp_path: Path, old: str, new: str, words: str):
-    with opened(tmp_path) as store:
-        store.append(rows(3))
-    path = tmp_path / JOURNAL
-    lines = path.read_text().splitlines(keepends=True)
-    assert old in lines[2]
-    path.write_text("".join([*lines[:2], lines[2].replace(old, new), *lines[3:]]))
-    with pytest.raises(UsageError, match=f"line 3 is damaged .*{words}"), opened(tmp_path):
+def test_a_store_of_another_version_or_damaged_is_refused_as_it_is(
+    journal: Path, line: int, old: str, new: str, words: str
+):
+    lines = journal.read_text().splitlines(keepends=True)
+    assert old in lines[line]
+    spoiled = "".join([*lines[:line], lines[line].replace(old, new), *lines[line + 1 :]])
+    journal.write_text(spoiled)
+    with pytest.raises(UsageError, match=words), opened(journal.parent):
         pass
-
-
-def test_a_damaged_line_is_named(tmp_path: Path):
-    with opened(tmp_path) as store:
-        store.append(rows(2))
-    path = tmp_path / JOURNAL
-    path.write_text(path.read_text().replace("tx40", "tx40,7", 1))
-    with pytest.raises(UsageError, match="line 2 is damaged"), opened(tmp_path):
-        pass
+    assert journal.read_text() == spoiled
 
 
 @pytest.mark.slow

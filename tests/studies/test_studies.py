@@ -14,11 +14,11 @@ from study_rows import ROW
 from calib.errors import UsageError
 from calib.identification.methods.registry import VERSIONS
 from calib.procedure.report.page import rendered
-from calib.rooms.studies.conditions import Condition, read_study, shipped
+from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
 from calib.rooms.studies.experiment import make_experiment
 from calib.rooms.studies.reports.report import condition_table
 from calib.rooms.studies.summary import MIN_DATA_SETS, sign_test, summarise
-from calib.rooms.studies.trial import FOUND, NOT_RECORDED, run_trial
+from calib.rooms.studies.trial import FOUND, NOT_RECORDED, TrialRow, run_trial
 
 FILE = """
 name = "small"
@@ -39,6 +39,13 @@ def written(folder: Path, text: str = FILE) -> Path:
     path = folder / "small.toml"
     path.write_text(text)
     return path
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> tuple[Study, TrialRow]:
+    """Return the small study, and a row of its one condition."""
+    study = read_study([written(tmp_path)])
+    return study, replace(ROW, digest=study.conditions[0].digest)
 
 
 def test_the_surveys_conditions_are_there():
@@ -116,26 +123,24 @@ def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch
     assert row.message
 
 
-def test_failures_count_against_a_method(tmp_path: Path):
-    study = read_study([written(tmp_path)])
-    digest = study.conditions[0].digest
-    good = [replace(ROW, digest=digest, method="wls", seed=k, torque_error=1.0, cpu=9.0) for k in range(20)]
-    risky = [replace(ROW, digest=digest, method="iv", seed=k, torque_error=0.1, cpu=1.0) for k in range(18)]
-    lost = [replace(ROW, digest=digest, method="iv", seed=k, status="diverged") for k in (18, 19)]
+def test_failures_count_against_a_method(small):
+    study, row = small
+    good = [replace(row, method="wls", seed=k, torque_error=1.0, cpu=9.0) for k in range(20)]
+    risky = [replace(row, method="iv", seed=k, torque_error=0.1, cpu=1.0) for k in range(18)]
+    lost = [replace(row, method="iv", seed=k, status="diverged") for k in (18, 19)]
     (one,) = summarise(study, [*good, *risky, *lost])
     assert [method.method for method in one.methods] == ["wls", "iv"]
     assert one.chosen is not None and one.chosen.method == "wls"
     assert one.methods[1].failures == {"diverged": 2}
 
 
-def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(tmp_path: Path):
-    study = read_study([written(tmp_path)])
-    digest, rng = study.conditions[0].digest, np.random.default_rng(0)
+def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(small):
+    (study, row), rng = small, np.random.default_rng(0)
     found = []
     for seed in range(30):
         own = float(rng.lognormal())
-        found.append(replace(ROW, digest=digest, method="iv", seed=seed, torque_error=own, cpu=5.0))
-        found.append(replace(ROW, digest=digest, method="wls", seed=seed, torque_error=1.01 * own, cpu=1.0))
+        found.append(replace(row, method="iv", seed=seed, torque_error=own, cpu=5.0))
+        found.append(replace(row, method="wls", seed=seed, torque_error=1.01 * own, cpu=1.0))
     (one,) = summarise(study, found)
     assert one.chosen is not None and one.chosen.method == "wls"
     found = [replace(row, torque_error=1.2 * row.torque_error) if row.method == "wls" else row for row in found]
@@ -156,10 +161,9 @@ def test_what_is_there_stays_in_sight_of_a_study_that_asks_for_less(tmp_path: Pa
     assert {method.method for method in one.methods} == {"tls", "wls"}
 
 
-def test_where_none_is_taken_it_is_said_why(tmp_path: Path):
-    study = read_study([written(tmp_path)])
-    digest = study.conditions[0].digest
-    few = [replace(ROW, digest=digest, seed=k) for k in range(MIN_DATA_SETS - 1)]
+def test_where_none_is_taken_it_is_said_why(small):
+    study, row = small
+    few = [replace(row, seed=k) for k in range(MIN_DATA_SETS - 1)]
     (one,) = summarise(study, few)
     assert one.best is None and f"--runs {MIN_DATA_SETS}" in one.why_none
     (one,) = summarise(study, [replace(row, status="diverged") for row in [*few, replace(few[0], seed=99)]])
@@ -168,9 +172,9 @@ def test_where_none_is_taken_it_is_said_why(tmp_path: Path):
     assert one.best is one.chosen and not one.why_none
 
 
-def test_a_terminal_shows_figures_whole(tmp_path: Path):
-    study = read_study([written(tmp_path)])
-    found = [replace(ROW, digest=study.conditions[0].digest, seed=k, torque_error=0.00123 * (k + 1)) for k in range(9)]
+def test_a_terminal_shows_figures_whole(small):
+    study, row = small
+    found = [replace(row, seed=k, torque_error=0.00123 * (k + 1)) for k in range(9)]
     text = StringIO()
     Console(width=100, file=text).print(*rendered([condition_table(summarise(study, found)[0])]))
     assert "0.00369–0.00861" in text.getvalue()
