@@ -22,8 +22,9 @@ from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.rows import Case, make_case
 from calib.robot import description, library
 from calib.rooms.cells import known_robots
+from calib.rooms.cells.random_motions import random_fourier
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
-from calib.simulation.loop.references import Reference, random_fourier
+from calib.simulation.loop.references import Reference
 
 STATES = 20_000
 REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])

@@ -16,9 +16,9 @@ from calib.robot.formats import urdf_write
 from calib.robot.load import load
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.cell import measure
+from calib.rooms.cells.random_motions import random_fourier
 from calib.rooms.cells.virtual_arm import moving_arm, record
 from calib.rooms.cells.virtual_cells import virtual_cell
-from calib.simulation.loop.references import random_fourier
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()

@@ -33,11 +33,12 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.load import load
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
+from calib.rooms.cells.random_motions import random_fourier
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
 from calib.rooms.studies.conditions import Condition
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.simulation.loop.controllers import Controller
-from calib.simulation.loop.references import Reference, random_fourier
+from calib.simulation.loop.references import Reference
 
 # our choices
 MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each
