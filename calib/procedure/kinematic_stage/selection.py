@@ -45,14 +45,12 @@ class PoseOutlook:
 
     Attributes:
         poses: of the fit on the chosen poses.
-        typical: (s, n) poses at which the tool was looked at [rad or m].
         others: with other numbers of poses, chosen greedily.
         blind: index and prediction if no pose had to be seen; None where nothing is asked of the sight.
         comparable: the index of the chosen poses by the same choice as `blind`.
     """
 
     poses: Prediction
-    typical: np.ndarray
     others: tuple[Prediction, ...]
     blind: tuple[float, Prediction] | None
     comparable: float
@@ -215,31 +213,20 @@ def _outlook(
     before: np.ndarray | None,
     comparable: float,
 ) -> PoseOutlook:
-    """Return the predicted accuracy with chosen poses q (m, n), and with others."""
+    """Return the predicted accuracy with chosen poses q (m, n), with others, and with line of sight ignored."""
     space, free = limits.space(seen), limits.space(seen, sight=False)
-    typical = _typical_poses(limits, seen, search.seed)
-    rows = space.jacobian(q)
-    past = np.zeros((0, *rows.shape[1:])) if before is None else before
-    blind = _blind(seen, free, typical, search, m, past) if limits.sight is not None else None
-    others = by_count(seen, space.jacobian(candidates), typical, before)
-    own = foretold(seen, np.concatenate([rows, past]), typical, m)
-    return PoseOutlook(own, typical, others, blind, comparable)
+    stream = np.random.default_rng([search.seed, 2])
+    typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
+    past = [] if before is None else [before]
 
+    def known(chosen: np.ndarray) -> Prediction:
+        return foretold(seen, np.concatenate([free.jacobian(chosen), *past]), typical, m)
 
-def _typical_poses(limits: Limits, seen: Observation, seed: int) -> np.ndarray:
-    """Return poses (s, n) all over the workspace, seen or not, at which the tool's σ is predicted."""
-    free = limits.space(seen, sight=False)
-    stream = np.random.default_rng([seed, 2])
-    return draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
-
-
-def _blind(
-    seen: Observation, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
-) -> tuple[float, Prediction]:
-    """Return index and predicted σ when line-of-sight constraints are ignored."""
-    quick = replace(search, method="detmax", climbs=0)
-    other = select_poses(None, m, quick, space=free, existing=past if len(past) else None)
-    return other.value, foretold(seen, np.concatenate([free.jacobian(other.joints), past]), typical, m)
+    blind = None
+    if limits.sight is not None:
+        other = select_poses(None, m, replace(search, method="detmax", climbs=0), space=free, existing=before)
+        blind = other.value, known(other.joints)
+    return PoseOutlook(known(q), by_count(seen, space.jacobian(candidates), typical, before), blind, comparable)
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
@@ -296,20 +283,18 @@ def record(chosen: Chosen) -> dict[str, Any]:
 def table(chosen: Chosen) -> list[tuple[str, str]]:
     """Return what the selection came to, as pairs of words and numbers."""
     found = chosen.selection
-    rows = [
+    known = [] if chosen.existing is None else [("existing poses alone", f"{chosen.existing:.6g}")]
+    return [
         ("index", f"{found.index}" + (" (its ranking does not depend on units)" if found.index == "O1" else "")),
         ("identifiable parameters", str(chosen.parameters)),
         ("best of 1000 random sets", f"{found.random_baseline:.6g}"),
-    ]
-    if chosen.existing is not None:
-        rows.append(("existing poses alone", f"{chosen.existing:.6g}"))
-    rows += [
+        *known,
         ("start of the search", f"{float(found.history[0]):.6g}"),
         ("chosen poses", f"{found.value:.6g}"),
         ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p); {bound_words(found)})"),
         ("seconds", f"{found.seconds:.2f}"),
+        *predicted_rows(chosen),
     ]
-    return [*rows, *predicted_rows(chosen)]
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
