@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq
@@ -20,6 +21,16 @@ CHAIN = load("lwr4plus")
 WAYPOINTS = np.array(
     [[0, 0.5, 0, -1, 0, 0.5, 0], [0.8, 1.0, 0.3, -1.4, 0.5, 0.2, 0.7], [1.5, 0.3, -0.4, -0.6, 1, -0.8, 0]]
 )
+
+
+def read_setpoints(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a motion's file: t (N,), and q, v, a, tau (N, n) as far as they are there."""
+    rows = np.genfromtxt([line for line in path.read_text().splitlines() if line[0] != "#"], delimiter=",", names=True)
+    found = {"t": rows["t"]}
+    for letter in ("q", "v", "a", "tau"):
+        names = [name for name in rows.dtype.names if name.rstrip("0123456789") == letter]
+        found |= {letter: np.column_stack([rows[name] for name in names])} if names else {}
+    return found
 
 
 @cache

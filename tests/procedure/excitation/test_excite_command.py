@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from differences import check
+from planned import read_setpoints
 
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics import base, drives
@@ -67,11 +67,8 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
     assert all(one["margin"] >= 0 for one in metrics["margins"].values())
     for name in ("plot_motion.png", "plot_path.png", "plot_history.png"):
         assert (Path("e") / name).stat().st_size > 5000
-    with Path("e/trajectory.csv").open(newline="") as file:
-        table = csv.DictReader(line for line in file if line[0] != "#")
-        rows = np.array([[float(x) for x in row.values()] for row in table])
-    assert rows.shape == (1601, 22) and np.allclose(np.diff(rows[:, 0]), 0.01)
-    q, v, a = np.split(rows[:, 1:], 3, axis=1)
+    t, q, v, a = read_setpoints(Path("e/trajectory.csv")).values()
+    assert q.shape == (1601, 7) and np.allclose(np.diff(t), 0.01)
     chain = load("lwr4plus")
     assert (q < chain.upper).all() and (q > chain.lower).all() and (np.abs(a) < 12).all()
     assert (np.abs(v) <= 0.9 * np.array([joint.velocity for joint in chain.joints])).all()
@@ -81,20 +78,13 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
     assert np.allclose((q[2:] - q[:-2]) / 0.02, v[1:-1], atol=0.01)
     table = tomllib.loads(Path("e/trajectory.toml").read_text())
     series = [np.concatenate([[joint["q0"]], joint["a"], joint["b"]]) for joint in table["joint"]]
-    assert np.allclose(evaluate(series, table["period"], rows[:, 0]), q, atol=1e-9)
+    assert np.allclose(evaluate(series, table["period"], t), q, atol=1e-9)
     check_playback(q, np.array(stands.split(","), dtype=float), metrics["playback"])
-
-
-def columns(name: str) -> dict[str, np.ndarray]:
-    with Path(name).open(newline="") as file:
-        table = list(csv.DictReader(line for line in file if line[0] != "#"))
-    result = {letter: np.array([[float(r[f"{letter}{j}"]) for j in range(1, 8)] for r in table]) for letter in "qva"}
-    return result | {"tau": np.array([[float(r[f"tau{j}"]) for j in range(1, 8)] for r in table])}
 
 
 def check_playback(q: np.ndarray, stands: np.ndarray, metrics: dict) -> None:
     """The run is the approach and two periods without a jump; messages say the same; the rehearsal is slower."""
-    run, lead, slow = (columns(f"e/{name}.csv") for name in ("run", "approach", "rehearsal"))
+    run, lead, slow = (read_setpoints(Path(f"e/{name}.csv")) for name in ("run", "approach", "rehearsal"))
     assert np.allclose(run["q"][0], stands) and np.abs(run["v"][[0, -1]]).max() < 1e-9
     assert len(run["q"]) == len(lead["q"]) + 2 * 1600 and metrics["seconds"] == pytest.approx((len(run["q"]) - 1) / 100)
     assert np.allclose(run["q"][len(lead["q"]) - 1 :][:1601], q) and np.allclose(run["q"][-1601:], q)
@@ -152,9 +142,8 @@ def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
     assert len(told) < 64 and f"condition number of {len(told)} columns" in out
     assert not {"Fv4", "Fc4", "off4"} & set(told) and {"Fv3", "Fc5"} < set(told)
     assert metrics["condition_number"]["normalised"] < 100
-    with Path("e/trajectory.csv").open(newline="") as file:
-        rows = list(csv.DictReader(line for line in file if line[0] != "#"))
-    assert {float(row["q4"]) for row in rows} == {0.5} and {float(row["v4"]) for row in rows} == {0.0}
+    rows = read_setpoints(Path("e/trajectory.csv"))
+    assert (rows["q"][:, 3] == 0.5).all() and (rows["v"][:, 3] == 0.0).all()
 
 
 def test_the_columns_told_with_a_joint_held_are_all_there_are():
