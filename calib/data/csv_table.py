@@ -200,7 +200,7 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
 
 
 def _headless(cells: Sequence[str], path: str | Path) -> bool:
-    """Tell whether a first line is one of numbers."""
+    """Return whether a first line is one of numbers."""
     if sum(bool(_DECIMAL_COMMA.match(cell)) for cell in cells) > len(cells) / 2:
         refuse_data(path, _not_a_number(cells[0]), row=1)
     return sum(_is_number(cell) for cell in cells) > len(cells) / 2

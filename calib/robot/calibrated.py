@@ -18,7 +18,7 @@
 ``chain_covariance.csv`` beside it: the covariance [m, rad] of the element values of the best geometry without
 corrections (``provenance.rigid``, where there are any), by name; elements that are not in it were not fitted.
 
-What the joint angles do not say: compliance under gravity, coupled axes, encoder and gear errors.
+Deflections, what the joint angles do not say: compliance under gravity, coupled axes, encoder and gear errors.
 
 Every effect is linear in its coefficients and adds to the displacement of one element of the chain:
 
@@ -120,27 +120,15 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
         elif term.basis == "joint":
             result[e] = q[:, term.source]
     if where := [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]:
-        levers = _Levers(deflection, q)
-        for e in where:
-            result[e] = levers.moment(deflection.terms[e])
-    return result
-
-
-class _Levers:
-    """Directions of the elements and links of the reference chain, for one batch of poses."""
-
-    def __init__(self, deflection: Deflection, q: np.ndarray):
-        chain = deflection.reference
-        if chain is None:
+        if (chain := deflection.reference) is None:
             raise CalibError("sag terms need the reference chain of the deflection")
-        self.gravity = chain.gravity / np.linalg.norm(chain.gravity)
-        self.across = np.cross(self.gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))
-        self.links = joint_frames(chain, q)[:, :, :3, :3]
-        self.index = {name: k for k, name in enumerate(chain.names)}
-
-    def moment(self, term: Term) -> np.ndarray:
-        """Return (z × u) · ĝ = (ĝ × z) · u for every pose (m,)."""
-        return np.einsum("mi,mi->m", self.across[self.index[term.element]], self.links[term.source, :, :, term.order])
+        gravity = chain.gravity / np.linalg.norm(chain.gravity)
+        across = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))  # (z × u) · ĝ = (ĝ × z) · u
+        links, place = joint_frames(chain, q), {name: k for k, name in enumerate(chain.names)}
+        for e in where:
+            term = deflection.terms[e]
+            result[e] = np.einsum("mi,mi->m", across[place[term.element]], links[term.source, :, :3, term.order])
+    return result
 
 
 def extra_displacements(
@@ -270,7 +258,7 @@ class CalibratedChain:
 
 
 def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:
-    """Return a robot as it is, and a plain chain as a robot of which nothing else is known."""
+    """Return a calibrated robot as it is, and a plain chain as a robot without covariance and nominal geometry."""
     return robot if isinstance(robot, CalibratedChain) else CalibratedChain(robot)
 
 

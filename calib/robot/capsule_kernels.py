@@ -19,7 +19,7 @@ OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @njit(**OPTIONS)
 def clear(q, form, place, stand, targets, own, radii, faces, margin):
-    """Tell (m,) where every distance between `own` and from `faces` is above `margin` [m], at joint values q (m, n).
+    """Return (m,) whether all distances between `own` and to `faces` are above `margin` [m] at joint values q (m, n).
 
     Args:
         stand: height of the foot of the base's capsule [m].

@@ -34,7 +34,7 @@ TARGET_RADIUS = 0.02
 
 
 def usual_radius(chain: Chain) -> float:
-    """Return the radius [m] of capsules that stand for the links of an arm where none is stated."""
+    """Return the default radius [m] of the capsules that represent an arm's links."""
     return max(MIN_RADIUS, round(RADIUS_SHARE * chain.stretched_length(), 3))
 
 
@@ -68,7 +68,7 @@ class Capsules:
         world: (W, 2) which capsules with which of walls and obstacles, walls first.
         walls: the floor among them.
         obstacles: in the base frame.
-        excluded: pairs left out because no posture parts them.
+        excluded: pairs that are not compared, since they touch in nearly every posture.
     """
 
     chain: Chain
@@ -100,12 +100,13 @@ class Capsules:
         lines = self._lines(q)
         _, normal, one, two = self._measured(lines)
         count = len(self.own)
-        slope = self._closing(lines, normal, two, self._second)
+        second = np.concatenate([self.bodies[self.own[:, 1]], self.bodies[self.world[:, 0]]])
+        slope = self._closing(lines, normal, two, second)
         slope[:, :count] -= self._closing(lines, normal[:, :count], one[:, :count], self.bodies[self.own[:, 0]])
         return slope
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
+        """Return (m,) whether all distances are larger than `margin` [m] at joint values q (m, n)."""
         from calib.robot.capsule_kernels import clear  # numba
 
         q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
@@ -145,7 +146,7 @@ class Capsules:
         return replace(self, own=self.own[:0], world=world) if len(world) else None
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Measure the links against lines of sight from a target that the last body carries.
+        """Return the links' distances from lines of sight to a target on the last body.
 
         Args:
             q: (m, n).
@@ -201,10 +202,6 @@ class Capsules:
                 distance[:, at] -= np.linalg.norm(end - start, axis=-1) / 2 if rough else 0.0
             distance[:, at] -= self.radii[body]
         return distance, normal, one, two
-
-    @cached_property
-    def _second(self) -> np.ndarray:
-        return np.concatenate([self.bodies[self.own[:, 1]], self.bodies[self.world[:, 0]]])
 
     def _closing(self, lines: _Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
         return closing(self.chain, lines.axes, lines.places, normal, point, bodies)

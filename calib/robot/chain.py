@@ -64,6 +64,11 @@ class Joint:
     def unit(self) -> str:
         return "rad" if self.kind == "revolute" else "m"
 
+    @property
+    def unlimited(self) -> bool:
+        """Whether it turns without end."""
+        return self.kind == "revolute" and not np.isfinite([self.lower, self.upper]).any()
+
 
 @dataclass(frozen=True)
 class Element:
@@ -261,8 +266,4 @@ def element_length(chain: Chain, k: int) -> float:
 
 def joint_kinds(chain: Chain) -> list[str]:
     """Return URDF's names of the joints' kinds: a revolute joint of a URDF without limits is continuous there."""
-    return ["continuous" if chain.links and _unlimited(joint) else joint.kind for joint in chain.joints]
-
-
-def _unlimited(joint: Joint) -> bool:
-    return joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()
+    return ["continuous" if chain.links and joint.unlimited else joint.kind for joint in chain.joints]

@@ -3,9 +3,9 @@
 Shapes come from the URDF's ``<collision>``: boxes, spheres, cylinders, capsules, and meshes by their convex hull (our
 choice: faster and on the safe side). A robot without shapes is made of capsules (`calib.robot.capsules`).
 
-Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that no
-posture parts (`calib.robot.obstacles.inseparable`); the last are listed in `Collision.excluded`. A floor or an obstacle
-that a link never leaves is refused (`calib.robot.obstacles.check_reachable`).
+Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that
+touch in nearly every posture (`calib.robot.obstacles.inseparable`, listed in `Collision.excluded`). A floor or an
+obstacle that a link never leaves is refused (`calib.robot.obstacles.check_reachable`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,7 +38,7 @@ class Collision:
 
     Attributes:
         pairs: names of the shapes compared, in the order of the columns of `distances`.
-        excluded: pairs left out because no posture parts them.
+        excluded: pairs that are not compared, since they touch in nearly every posture.
         missing: meshes of the URDF that were not found or not readable; their shapes are left out.
     """
 
@@ -72,7 +72,7 @@ class Collision:
         return slope - self._closing(q, normal, first, [pair.first for pair in pairs])
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Measure the links against lines of sight; see `calib.robot.capsules.Capsules.beam`."""
+        """Return the links' distances from lines of sight; see `calib.robot.capsules.Capsules.beam`."""
         pin, coal = _libraries()
         data, placed = self._model.createData(), pin.GeometryData(self._geometry)
         tip = self._model.frames[self._model.getFrameId(self._chain.tip)].parentJoint
@@ -123,7 +123,7 @@ class Collision:
         return np.array([sum(joint in driven for joint in above) for above in carriers], dtype=int)
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
+        """Return (m,) whether all distances are larger than `margin` [m] at joint values q (m, n)."""
         return np.all(self.distances(q) > margin, axis=1)
 
 
@@ -199,7 +199,7 @@ def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | 
 
 
 def _without_inseparable(found: Collision, margin: float, seed: int) -> Collision:
-    """Drop the pairs that no posture parts."""
+    """Drop the pairs that touch in nearly every posture."""
     geometry = found._geometry
     fixed = np.array([pair.second >= found._links for pair in geometry.collisionPairs])
     distances = found.distances(random_joints(found._chain, SAMPLES, seed))
@@ -230,16 +230,16 @@ def _surround(model: Any, geometry: Any, base: str, walls: Sequence[Wall], obsta
     pin, coal = _libraries()
     stand = _stand(model, base)
     things: list[Any] = [(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4)) for wall in walls]
-    things += [(obstacle.name, _solid(obstacle), obstacle.placement) for obstacle in obstacles]
+    things += [(obstacle.name, _solid(obstacle.kind, obstacle.size), obstacle.placement) for obstacle in obstacles]
     for name, shape, placed in things:
         placement = stand * pin.SE3(placed[:3, :3], placed[:3, 3])
         geometry.addGeometryObject(pin.GeometryObject(name, 0, 0, placement, shape))
 
 
-def _solid(obstacle: Obstacle) -> Any:
+def _solid(kind: str, sizes: Sequence[float]) -> Any:
     _, coal = _libraries()
-    makers = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder}
-    return makers[obstacle.kind](*map(float, obstacle.size))
+    makers = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder, "capsule": coal.Capsule}
+    return makers[kind](*map(float, sizes))
 
 
 def _stand(model: Any, base: str) -> Any:
@@ -252,21 +252,17 @@ def _stand(model: Any, base: str) -> Any:
 
 def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
     """Return the coal shape of a <geometry>; None, with an entry in `missing`, for a mesh that cannot be had."""
-    _, coal = _libraries()
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
         refuse_robot(place, "<collision> without a shape")
-    match kind.tag:
-        case "box":
-            return coal.Box(*numbers(kind, "size", place))
-        case "sphere":
-            return coal.Sphere(*numbers(kind, "radius", place, count=1))
-        case "cylinder" | "capsule":
-            maker = coal.Cylinder if kind.tag == "cylinder" else coal.Capsule
-            return maker(*numbers(kind, "radius", place, count=1), *numbers(kind, "length", place, count=1))
-        case "mesh":
-            return _hull(kind, folders, missing, place)
-    refuse_robot(place, f"<{kind.tag}> is none of box, sphere, cylinder, capsule, mesh")
+    if kind.tag == "mesh":
+        return _hull(kind, folders, missing, place)
+    if kind.tag == "box":
+        return _solid(kind.tag, numbers(kind, "size", place).tolist())
+    if kind.tag not in ("sphere", "cylinder", "capsule"):
+        refuse_robot(place, f"<{kind.tag}> is none of box, sphere, cylinder, capsule, mesh")
+    keys = ("radius",) if kind.tag == "sphere" else ("radius", "length")
+    return _solid(kind.tag, [numbers(kind, key, place, count=1)[0] for key in keys])
 
 
 def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:

@@ -42,25 +42,9 @@ import numpy as np
 
 from calib import files
 from calib.errors import RobotError, refuse_robot, require
-from calib.robot import mdh
+from calib.robot import mdh, tables
 from calib.robot.chain import Chain, Element, Joint
-from calib.robot.tables import (
-    LIMITS,
-    chain_head,
-    chain_table,
-    check_keys,
-    dumps,
-    finite_limits,
-    load,
-    number,
-    placement,
-    placement_table,
-    vector,
-    word,
-)
 from calib.words import listing
-
-TURNS = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
 
 
 def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
@@ -69,37 +53,23 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
     Args:
         bodies: with those that cannot exist.
     """
-    found = (*chain.remarks, *unstated_limits(chain), *_turns(chain), *_massless(chain))
-    return (*found, *impossible_bodies(chain)) if bodies else found
-
-
-def unstated_limits(chain: Chain) -> tuple[str, ...]:
-    """Return in words the limits of 0 or below, joints that share them together."""
-    found: dict[str, list[str]] = {}
+    found = list(chain.remarks)
+    unstated: dict[str, list[str]] = {}
     for joint in chain.joints:
         for what in joint.unstated:
-            found.setdefault(what, []).append(joint.name)
-    return tuple(
+            unstated.setdefault(what, []).append(joint.name)
+    found += [
         f"{', '.join(names)}: {what} in the robot's description is no limit; taken as not stated"
-        for what, names in found.items()
-    )
-
-
-def _turns(chain: Chain) -> tuple[str, ...]:
-    """Return in words the limits of revolute joints beyond two turns either way."""
+        for what, names in unstated.items()
+    ]
     wide = {joint.name: max(-joint.lower, joint.upper) for joint in chain.joints if joint.unit != "m"}
-    wide = {name: angle for name, angle in wide.items() if TURNS < angle < np.inf}
-    if not wide:
-        return ()
-    return (f"{listing(wide, 4)}: limits up to {max(wide.values()):g} rad in the robot's description; degrees?",)
-
-
-def _massless(chain: Chain) -> tuple[str, ...]:
-    """Return in words the bodies of which nothing is stated where others have masses."""
-    if chain.inertias is None:
-        return ()
-    names = [joint.name for joint, body in zip(chain.joints, chain.inertias) if not body.any()]
-    return (f"body behind {listing(names, 4)}: its mass is not stated, and counts as zero",) if names else ()
+    if wide := {name: angle for name, angle in wide.items() if MAX_TURN < angle < np.inf}:
+        furthest = max(wide.values())
+        found.append(f"{listing(wide, 4)}: limits up to {furthest:g} rad in the robot's description; degrees?")
+    masses = () if chain.inertias is None else chain.inertias
+    if bare := [joint.name for joint, body in zip(chain.joints, masses) if not body.any()]:
+        found.append(f"body behind {listing(bare, 4)}: its mass is not stated, and counts as zero")
+    return (*found, *(impossible_bodies(chain) if bodies else ()))
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
@@ -153,9 +123,10 @@ def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_exc
     return ""
 
 
+MAX_TURN = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
 EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
 _TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
-_JOINT = ("name", "kind", *LIMITS, "link", "inertia")
+_JOINT = ("name", "kind", *tables.LIMITS, "link", "inertia")
 _ELEMENT = tuple(field.name for field in fields(Element))
 
 
@@ -174,7 +145,7 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
 
 def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict[str, Any]]:
     """Return what `read` and `read_extra` do, the file parsed once."""
-    table = load(path)
+    table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
             f"{path} is a parallel robot (legs and a platform), and this is for serial arms yet; calib "
@@ -190,7 +161,7 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
 
 def read_extra(path: str | Path) -> dict[str, Any]:
     """Return the tables beside the robot (`EXTRA`) as plain dictionaries."""
-    return _beside(load(path))
+    return _beside(tables.load(path))
 
 
 def _beside(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,23 +177,25 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None
         extra: tables by name, of `EXTRA`, kept as they are.
         source: where the numbers come from.
     """
-    check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
+    tables.check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
     table = mdh.to_table(chain) if mdh.is_table(chain) and not chain.links else _to_elements(chain)
     head = {key: value for key, value in table.items() if not isinstance(value, (list, dict)) or key == "gravity"}
     head |= {"source": source} if source else {}
-    return files.write(path, dumps(head | table | dict(extra or {})))
+    return files.write(path, tables.dumps(head | table | dict(extra or {})))
 
 
 def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
-    check_keys(table, _TOP, where)
+    tables.check_keys(table, _TOP, where)
     joints, inertias, links = [], [], []
     for index, entry in enumerate(_tables(table, "joint", where)):
         place = f"{where}, [[joint]] number {index + 1}"
-        check_keys(entry, _JOINT, place)
-        limits: dict[str, Any] = {key: number(entry[key], f"{place}, {key}") for key in LIMITS if key in entry}
-        joints.append(Joint(word(entry, "name", place), word(entry, "kind", place, "revolute"), **limits))
-        inertias.append(vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
-        links.append(word(entry, "link", place) if "link" in entry else None)
+        tables.check_keys(entry, _JOINT, place)
+        limits: dict[str, Any] = {
+            key: tables.number(entry[key], f"{place}, {key}") for key in tables.LIMITS if key in entry
+        }
+        joints.append(Joint(tables.word(entry, "name", place), tables.word(entry, "kind", place, "revolute"), **limits))
+        inertias.append(tables.vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
+        links.append(tables.word(entry, "link", place) if "link" in entry else None)
     if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
         refuse_robot(where, "some joints have an inertia and some have none")
     elements = enumerate(_tables(table, "element", where), 1)
@@ -231,37 +204,37 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
         elements=tuple(_element(one, len(joints), f"{where}, [[element]] number {i}") for i, one in elements),
         inertias=None if inertias[0] is None else np.array(inertias),
         links=tuple(links) if all(links) else (),
-        **chain_head(table, where),
+        **tables.chain_head(table, where),
     )
 
 
 def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
-    check_keys(entry, _ELEMENT, where)
-    name = word(entry, "name", where)
+    tables.check_keys(entry, _ELEMENT, where)
+    name = tables.word(entry, "name", where)
     where = f"{where} ('{name}')"
     for key, most in (("owner", n), ("joint", n - 1)):
         value = entry.get(key, 0)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
             refuse_robot(where, f"{key} {value!r} is not a whole number from 0 to {most}")
-    axis = word(entry, "axis", where)
-    sign = number(entry.get("sign", 1.0), f"{where}, sign")
+    axis = tables.word(entry, "axis", where)
+    sign = tables.number(entry.get("sign", 1.0), f"{where}, sign")
     require(abs(sign) == 1.0, f"{where}: sign {sign:g} is neither 1 nor -1", RobotError)
     return Element(
         name=name,
         axis=axis,
-        value=number(entry.get("value", 0.0), f"{where}, value", "length" if axis[:1] == "t" else "angle"),
+        value=tables.number(entry.get("value", 0.0), f"{where}, value", "length" if axis[:1] == "t" else "angle"),
         owner=entry.get("owner", 0),
         joint=entry.get("joint"),
-        ratio=number(entry.get("ratio", 1.0), f"{where}, ratio"),
+        ratio=tables.number(entry.get("ratio", 1.0), f"{where}, ratio"),
         sign=sign,
-        placement=placement(entry["placement"], f"{where}, placement") if "placement" in entry else None,
+        placement=tables.placement(entry["placement"], f"{where}, placement") if "placement" in entry else None,
     )
 
 
 def _to_elements(chain: Chain) -> dict[str, Any]:
     joints, elements = [], []
     for index, joint in enumerate(chain.joints):
-        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind, **finite_limits(joint)}
+        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind, **tables.finite_limits(joint)}
         if chain.links:
             entry["link"] = chain.links[index]
         if chain.inertias is not None:
@@ -271,9 +244,9 @@ def _to_elements(chain: Chain) -> dict[str, Any]:
         entry = {key: getattr(element, key) for key in ("name", "axis", "value", "owner", "joint")}
         entry |= {key: getattr(element, key) for key in ("ratio", "sign") if getattr(element, key) != 1.0}
         if element.placement is not None:
-            entry["placement"] = placement_table(element.placement)
+            entry["placement"] = tables.placement_table(element.placement)
         elements.append(entry)
-    return chain_table(chain, joint=joints, element=elements)
+    return tables.chain_table(chain, joint=joints, element=elements)
 
 
 def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:

@@ -37,7 +37,7 @@ def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> 
 
 
 def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
-    """Return the robot that `robot` names, with what a fit has left beside it; arguments as of `load`."""
+    """Return the robot that `robot` names with a fit's covariance and corrections; arguments as of `load`."""
     path = resolve(robot)
     if path.suffix == ".urdf":
         return CalibratedChain(load(path, base, tip), source=str(robot))

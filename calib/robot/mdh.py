@@ -48,13 +48,13 @@ from typing import Any
 import numpy as np
 
 from calib.errors import RobotError, one_of, refuse_robot, require
+from calib.robot import tables
 from calib.robot.chain import Chain, Element, Joint
-from calib.robot.tables import LIMITS, chain_head, chain_table, check_keys, finite_limits, number, spelled, vector, word
 
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
 TOP = ("name", "base", "tip", "gravity", "floor", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
-_ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *LIMITS, "inertia")
+_ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *tables.LIMITS, "inertia")
 _ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
 
 
@@ -82,7 +82,7 @@ class Row:
 
 def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
-    check_keys(table, TOP, where)
+    tables.check_keys(table, TOP, where)
     if not isinstance(proposed := table.get("propose_beta", True), bool):
         refuse_robot(where, f"propose_beta has to be true or false, found {proposed!r}")
     rows: list[Row] = []
@@ -90,7 +90,7 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
     for position, entry in enumerate(table["joint"]):
         rows.append(_row(entry, rows[-1].index + 1 if rows else 1, f"{where}, [[joint]] number {position + 1}"))
-    return chain(rows=rows, propose_beta=propose_beta and proposed, **chain_head(table, where))
+    return chain(rows=rows, propose_beta=propose_beta and proposed, **tables.chain_head(table, where))
 
 
 def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **more: Any) -> Chain:
@@ -142,7 +142,7 @@ def rows(chain: Chain) -> tuple[Row, ...]:
 
 
 def is_table(chain: Chain) -> bool:
-    """Tell whether a chain has the form of an MDH table."""
+    """Return whether a chain has the form of an MDH table."""
     try:
         return bool(rows(chain))
     except RobotError:
@@ -152,7 +152,7 @@ def is_table(chain: Chain) -> bool:
 def to_table(chain: Chain) -> dict[str, Any]:
     """Return the table (schema above) that `from_table` reads back exactly."""
     entries = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
-    return chain_table(chain, propose_beta=False, joint=entries)
+    return tables.chain_table(chain, propose_beta=False, joint=entries)
 
 
 def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
@@ -199,18 +199,18 @@ def _row(entry: Any, index: int, where: str) -> Row:
     index = entry.get("index", index)
     if isinstance(index, bool) or not isinstance(index, int) or index < 0:
         refuse_robot(where, f"index {index!r} is not a whole number from 0 on")
-    name = word(entry, "name", where, f"joint{index}")
+    name = tables.word(entry, "name", where, f"joint{index}")
     where = f"{where} ('{name}')"
-    check_keys(entry, _ROW, where)
-    kind = word(entry, "kind", where, "revolute")
+    tables.check_keys(entry, _ROW, where)
+    kind = tables.word(entry, "kind", where, "revolute")
     quantity = dict.fromkeys(("alpha", "beta", "theta", "lower", "upper"), "angle") | {"d": "length", "r": "length"}
     quantity |= {"velocity": "angular speed", "effort": "torque"}
     if kind == "prismatic":
         quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
-    if kind == "fixed" and (extra := [key for key in (*LIMITS, "inertia") if key in entry]):
+    if kind == "fixed" and (extra := [key for key in (*tables.LIMITS, "inertia") if key in entry]):
         refuse_robot(where, f"a fixed row has no '{extra[0]}'")
-    numbers = {key: number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
-    inertia = tuple(vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
+    numbers = {key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
+    inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
     return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)
 
 
@@ -223,7 +223,7 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     position = moved[0].joint or 0
     joint = chain.joints[position]
     inertia = None if chain.inertias is None else tuple(chain.inertias[position].tolist())
-    limits = {key: getattr(joint, key) for key in LIMITS}
+    limits = {key: getattr(joint, key) for key in tables.LIMITS}
     return Row(name=joint.name, index=index, kind=joint.kind, inertia=inertia, **values, **limits)
 
 
@@ -236,8 +236,8 @@ def _entry(row: Row, expected: int) -> dict[str, Any]:
         entry["index"] = row.index
     for key in ("alpha", "d", "beta", "theta", "r"):
         if (value := getattr(row, key)) is not None:
-            entry[key] = spelled(value) if AXES[key][0] == "r" else value
-    entry |= finite_limits(row)
+            entry[key] = tables.spelled(value) if AXES[key][0] == "r" else value
+    entry |= tables.finite_limits(row)
     if row.inertia is not None:
         entry["inertia"] = list(row.inertia)
     return entry

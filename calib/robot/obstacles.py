@@ -1,4 +1,4 @@
-"""Fixed things around an arm, how far points and lines are from them, and which pairs no posture can part.
+"""Fixed things around an arm, how far points and lines are from them, and which pairs always touch.
 
 Distances are signed: negative is the depth inside. Those of convex bodies are convex functions of the point, so that
 the nearest point of a line is found by golden sections, inside as outside.
@@ -117,7 +117,7 @@ def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> 
 
 
 def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: float = 0.0) -> np.ndarray:
-    """Tell (pairs,) which pairs of shapes no posture parts, by their distances (N, pairs) [m] in random postures.
+    """Return (pairs,) which shapes touch in nearly every posture, by their distances (N, pairs) [m] in random ones.
 
     Parts of an arm: those nearer than `margin` in at least 95 % of the postures (MoveIt's setup assistant: that touch),
     or never further apart than margin + slack: neighbours, whose shapes overlap by construction. Against what stands

@@ -68,18 +68,17 @@ class Sheet:
 
     def unit(self, column: str, family: str) -> str:
         """Return the unit that header or options state for a column; "" for none."""
-        ours = {theirs: name for name, theirs in self.options.columns.items()}
-        return self.table.units[self.table.index(column)] or self._stated(ours.get(column, column), column, family)
+        return self.table.units[self.table.index(column)] or self._stated(column, family)
 
-    def _stated(self, ours: str, column: str, family: str) -> str:
+    def _stated(self, column: str, family: str) -> str:
         units = self.options.units
+        ours = next((name for name, theirs in self.options.columns.items() if theirs == column), column)
         return units.get(ours, units.get(column, units.get(family, "")))
 
     def numbers(self, names: Sequence[str], column: Column, gaps: bool = False) -> np.ndarray:
         """Return columns (m, k) in SI, within the bounds of what they are; a gap is NaN."""
-        ours = {theirs: name for name, theirs in self.options.columns.items()}
-        stated = [self._stated(ours.get(name, name), name, column.family) for name in names]
-        values = [self.table.numbers(name, column.dimension, unit, gaps) for name, unit in zip(names, stated)]
+        family, dimension = column.family, column.dimension
+        values = [self.table.numbers(name, dimension, self._stated(name, family), gaps) for name in names]
         return column.check(np.stack(values, axis=1), self.table, names)
 
     def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -142,21 +141,24 @@ class Sheet:
         ours = [name + mark for name in names]
         if any(name in self.options.columns for name in ours):
             return tuple(self._mapped(name, ours) for name in ours)
-        forms = [[name + suffix for name in ours] for suffix in self.suffixes]
-        complete = [form for form in forms if all(name in self.table for name in form)]
-        if len(complete) > 1:
-            first, second = (", ".join(form) for form in complete[:2])
-            one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, complete[-1]))
-            message = f"the header has {first} and {second}: which of them are to be read? Map them in the options"
-            self.fail(f"{message}: [columns] {one}", complete[0][0])
-        if complete:
-            return tuple(complete[0])
+        forms = [tuple(name + suffix for name in ours) for suffix in self.suffixes]
+        if complete := self.one_of([form for form in forms if all(name in self.table for name in form)], ours):
+            return complete
         for form in forms:
             missing = [name for name in form if name not in self.table]
             if len(missing) < len(form):
                 near = suggestion(missing[0], self.table.header)
                 self.fail(f"missing{near}: {', '.join(form)} go together", missing[0])
         return ()
+
+    def one_of(self, families: Sequence[tuple[str, ...]], ours: Sequence[str]) -> tuple[str, ...]:
+        """Return the one of several families of columns that the file has, () where there is none; two are refused."""
+        if len(families) > 1:
+            first, second = (", ".join(family) for family in families[:2])
+            one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, families[-1]))
+            message = f"the header has {first} and {second}: which of them are to be read? Map them in the options"
+            self.fail(f"{message}: [columns] {one}", families[0][0])
+        return families[0] if families else ()
 
     def _mapped(self, name: str, together: Sequence[str]) -> str:
         """Return the file's name of one of the columns `together`, of which the options map some."""
@@ -316,11 +318,7 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     known = {name.lower(): name for name in any_name if options.euler or len(name) > 1 or name.isupper()}
     forms = [[name + suffix for name in names] for names in ANGLES for suffix in SUFFIXES]
     complete = [tuple(known[name] for name in form) for form in forms if all(name in known for name in form)]
-    if len(complete) > 1:
-        one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(first, complete[-1]))
-        message = f"the header has {', '.join(complete[0])} and {', '.join(complete[1])}: which are to be read?"
-        sheet.fail(f"{message} Map them in the options: [columns] {one}", complete[0][0])
-    return complete[0] if complete else ()
+    return sheet.one_of(complete, first)
 
 
 def _find_kind(sheet: Sheet, joints: Sequence[str]) -> str:

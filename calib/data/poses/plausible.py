@@ -51,7 +51,7 @@ def check_joints(
     def says(row: int, j: int) -> str:
         unit, other, factor = joint_unit(kinds[j])
         found = f"{q[row, j]:g} {unit} is outside the limits {lower[j]:g} to {upper[j]:g} {unit} of {joints[j]}"
-        inside = ~_outside(q[:, j] * factor, lower[j], upper[j])
+        inside = ~outside(q[:, j] * factor, lower[j], upper[j])
         if stated[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and inside.all():
             return f"{found}: {advice(j, other)}"
         return (
@@ -60,7 +60,7 @@ def check_joints(
         )
 
     if sheet.options.check_limits:
-        refuse(table, _outside(q, lower, upper) & bounded, columns, says)
+        refuse(table, outside(q, lower, upper) & bounded, columns, says)
     sliding = np.array([kind == "prismatic" for kind in kinds])
     free = ~bounded if sheet.options.check_limits else sliding
     check_travel(q, np.where(free, max_travel(kinds), math.inf), table, columns, joints, kinds, advice)
@@ -78,7 +78,8 @@ def check_joints(
     return tuple(notes)
 
 
-def _outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return which joint values (m, n) are beyond their limits (n,), by more than encoders are."""
     return (q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)
 
 

@@ -177,7 +177,7 @@ def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndar
     if block.sigma is not None:
         covariance = 2.0 * _diagonal(block.sigma)
         if stated is not None:
-            cross = _cross(lever)
+            cross = np.swapaxes(np.cross(lever[:, None], np.eye(3)), 1, 2)  # [l]×, its columns l × e
             covariance = covariance + cross @ _diagonal(stated) @ np.swapaxes(cross, 1, 2)
         changes["sigma"] = _turned(turn, covariance)
     note = (
@@ -193,14 +193,6 @@ def _diagonal(sigma: np.ndarray) -> np.ndarray:
 def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (m, 3) of covariances (m, 3, 3) in turned axes."""
     return np.sqrt(np.einsum("mij,mjk,mik->mi", turn, covariance, turn))
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Return [l]× (m, 3, 3) of vectors (m, 3)."""
-    result = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -z, y, -x
-    return result - np.swapaxes(result, 1, 2)
 
 
 def read_measurements(

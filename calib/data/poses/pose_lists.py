@@ -82,7 +82,7 @@ def write_poses(
 
 
 def filled_in(path: Path, joints: int) -> bool:
-    """Tell whether a list of planned poses of an arm holds anything beside its joints: measurements, by hand."""
+    """Return whether a list of planned poses has more than joint values: measurements added by hand."""
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:]
     return any(cell.strip() for line in lines for cell in re.split("[,;\t]", line)[joints:])
 
@@ -120,7 +120,7 @@ def check_planned(
 
 
 def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX_JOINT_DIFFERENCE) -> tuple[str, ...]:
-    """Hold the joints of a measurement against the poses (m, n) [rad or m] that were to be measured.
+    """Compare the joints of a measurement with the poses (m, n) [rad or m] that were to be measured.
 
     A planned and a measured pose are the same where no joint differs by more than `near`.
 
@@ -151,7 +151,7 @@ def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _matched(these: np.ndarray, those: np.ndarray, near: float) -> np.ndarray:
-    """Tell which of `those` has one of `these` within `near` (largest joint difference)."""
+    """Return which of `those` has one of `these` within `near` (largest joint difference)."""
     distance, _ = KDTree(these).query(those, p=math.inf)
     return distance <= near
 
@@ -268,7 +268,9 @@ def read_targets(
     q, columns, notes = None, (), ()
     if any(name in table for name in forms):
         q, columns = sheet.joints(joints)
-        notes = check_planned(q, sheet, columns, joints, kinds, _kept_by_most(q, limits))
+        # limits count where most rows (our choice) are outside: it is the file then, not the row
+        outside = limits is not None and plausible.outside(q, *np.asarray(limits, dtype=float)).any(axis=1).mean() > 0.5
+        notes = check_planned(q, sheet, columns, joints, kinds, limits if outside else None)
     if not columns and not position and not turned:
         needed = f"joints ({', '.join(joints)}, or q1 to q{len(joints)}), or x y z with or without qx qy qz qw"
         sheet.fail(f"no targets found: expected {needed}; found {', '.join(table.header)}")
@@ -286,15 +288,3 @@ def read_targets(
         notes,
         table.file,
     )
-
-
-def _kept_by_most(q: np.ndarray, limits: Limits | None, max_outside: float = 0.5) -> Limits | None:
-    """Return `limits` where most rows of q (m, n) are outside: it is the file then, not the row.
-
-    `max_outside`: of all rows outside the limits: it is the file, not the row (our choice).
-    """
-    if limits is None:
-        return None
-    lower, upper = (np.asarray(side, dtype=float) for side in limits)
-    outside = ((q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)).any(axis=1)
-    return limits if outside.mean() > max_outside else None

@@ -37,7 +37,7 @@ Read = tuple[Table, FileOptions, tuple[str, ...]]
 
 
 def recognises(header: Sequence[str]) -> bool:
-    """Tell whether a header is RoboDK's: J1 to J6 (or ``Joint 1`` to ``Joint 6``) first.
+    """Return whether a header is RoboDK's: J1 to J6 (or ``Joint 1`` to ``Joint 6``) first.
 
     ``joint1`` in one word is a name that robots have: such a file is read by its names.
     """

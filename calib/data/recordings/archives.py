@@ -62,16 +62,11 @@ def read_archived_positions(path: Path, joints: Joints, options: RecordingOption
 
 @contextmanager
 def _opened(path: Path) -> Iterator["_Archive"]:
+    packed = (RuntimeError, NotImplementedError)  # zipfile's for a password, and for unknown compression
     damaged = (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, UnicodeError)
     with (
         refused_as(MeasurementError, OSError, "cannot be read: {}", path),
-        # zipfile's words for a password, and for unknown compression
-        refused_as(
-            MeasurementError,
-            (RuntimeError, NotImplementedError),
-            "cannot be unpacked ({}): save it with np.savez",
-            path,
-        ),
+        refused_as(MeasurementError, packed, "cannot be unpacked ({}): save it with np.savez", path),
         refused_as(MeasurementError, damaged, "is a damaged archive ({}): was it copied whole?", path),
         zipfile.ZipFile(path) as archive,
     ):
@@ -170,11 +165,8 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
     if gain is not None and (gain == 0.0).any():
         archive.fail("has a gain of zero: no current makes a torque there", "drive_gain")
     variance = f"variance_{found.get(kind, '')}"
-    unused = [
-        name
-        for name in archive.members
-        if name not in (*found.values(), *KEYS_BESIDE_SERIES, *RATES, "periods", variance)
-    ]
+    used = (*found.values(), *KEYS_BESIDE_SERIES, *RATES, "periods", variance)
+    unused = [name for name in archive.members if name not in used]
     noise = _variance(archive, variance, q.shape, rows)
     return Recording(
         t[rows],

@@ -4,7 +4,6 @@ What cannot be is refused; what is odd but possible becomes a note. Thresholds: 
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -60,7 +59,10 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
         MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
             for radians, a torque that is one number while its joint moves.
     """
-    _check_count(recording)
+    few = (
+        f"{len(recording)} samples are too few to filter and to identify from; at least {LIMITS.min_samples} are needed"
+    )
+    require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     _check_finite(recording)
     recording = _drop_spikes(recording, joints)
     _check_finite(recording, LIMITS.max_number)
@@ -72,25 +74,13 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     return replace(_noted(recording, *notes, *_work_notes(recording)), jumps=tuple(_jumps(recording, joints)))
 
 
-def _check_count(recording: Recording) -> None:
-    message = (
-        f"{len(recording)} samples are too few to filter and to identify from; at least {LIMITS.min_samples} are needed"
-    )
-    require(len(recording) >= LIMITS.min_samples, message, MeasurementError, recording.file)
-
-
 def _check_finite(recording: Recording, most: float = np.inf) -> None:
     """Refuse NaN, infinities and what is beyond `most`; NaN in `q_link` says that a joint has no second encoder."""
     for name in NEEDED:
-        if (values := getattr(recording, name)) is not None and not (np.abs(values) < most).all():
-            values = values.reshape(len(recording), -1)
+        if (values := getattr(recording, name)) is not None and (bad := ~(np.abs(values) < most)).any():
             columns = ["t"] if name == "t" else _columns(recording, name)
-            bad = ~(np.abs(values) < most)
-            refuse(recording, bad, columns, partial(_not_finite, values))
-
-
-def _not_finite(values: np.ndarray, row: int, k: int) -> str:
-    return f"found {values[row, k]:g}; cut that part out, or leave the rows out"
+            worst = values[bad][0]
+            refuse(recording, bad, columns, lambda *_: f"found {worst:g}; cut that part out, or leave the rows out")  # noqa: B023
 
 
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
@@ -152,12 +142,8 @@ def _check_time(recording: Recording) -> None:
     t = recording.t
     step = np.diff(t)
     back, stands = np.append(False, step < 0), np.append(False, step == 0)
-    require(
-        not len(step) or not back[1:].all(),
-        "time runs backwards in every row: turn the rows around, last one first",
-        MeasurementError,
-        recording.file,
-    )
+    if len(step) and back[1:].all():
+        refuse_data(recording.file, "time runs backwards in every row: turn the rows around, last one first")
     refuse(
         recording, back, ["t"],
         lambda i, _: f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "

@@ -188,7 +188,7 @@ def one_effort(
 
 
 def _cure(found: Mapping[str, str], members: Sequence[str]) -> str:
-    """Say how the options name what was not found: as columns that share a word with it, else the first and last."""
+    """Return how the options can name what is missing: columns that share a word with it, else the first and last."""
     stems = [stem for member in members for stem in [stem_of(member)[0]] if stem not in (*found.values(), "")]
     several = [stem for stem in stems if stems.count(stem) > 1] or stems or ["..."]
     likely = {}
@@ -202,7 +202,7 @@ def _cure(found: Mapping[str, str], members: Sequence[str]) -> str:
 
 
 def _two_torques(found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:
-    """Put the motors' torque (or, where the sensors' alone are wanted, theirs) among `found` as the effort."""
+    """Add the motors' torque (or the sensors', where only theirs is needed) to `found` as the effort."""
     own = "tau_motor" if "tau_motor" in found else "tau_link"
     if "tau_link" not in found or (options.motors and own == "tau_link"):
         what = "two torques, of motors and of sensors" if options.motors else "torques of sensors"

@@ -150,15 +150,11 @@ def _choose(per_joint: np.ndarray, stated: float | None, max_cutoff: float = 20.
         where = f"ends at {found:.2g} Hz" if found else "hardly stands out of the noise"
         return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {where}, but friction turns faster"
     if found > max_cutoff:
-        return (
-            max_cutoff,
-            f"f_dyn = {max_cutoff:g} Hz: joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid",
-        )
+        why = f"joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
+        return max_cutoff, f"f_dyn = {max_cutoff:g} Hz: {why}"
     if found < top:
-        return (
-            found,
-            f"f_dyn = {found:.3g} Hz, {max_spread:g} times the median: joint {fastest + 1}'s {top:.3g} Hz stands apart",
-        )
+        why = f"{max_spread:g} times the median: joint {fastest + 1}'s {top:.3g} Hz stands apart"
+        return found, f"f_dyn = {found:.3g} Hz, {why}"
     return found, f"f_dyn = {found:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
 
 

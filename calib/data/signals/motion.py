@@ -16,21 +16,8 @@ from calib.arrays import frozen
 from calib.config import strict
 from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.recording import Recording, read_only
+from calib.data.signals import filtering
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
-from calib.data.signals.filtering import KINDS as DECIMATORS
-from calib.data.signals.filtering import (
-    ORDER,
-    Decimator,
-    border,
-    curvature,
-    decimate,
-    design_decimator,
-    factor_for,
-    kept,
-    low_pass,
-    slope,
-    too_short,
-)
 from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample
 from calib.errors import UsageError, refuse_data
 
@@ -60,14 +47,14 @@ class FilterOptions:
 
     cutoff: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
     velocity_cutoff: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
-    order: Annotated[int, Whole(1, 12)] = ORDER
+    order: Annotated[int, Whole(1, 12)] = filtering.ORDER
     band: Positive | None = None
     dynamics: Positive | None = None
     width: Annotated[int, Whole(1, 4)] = 4
     clock: Annotated[str, OneOf(("auto", *CLOCKS))] = "auto"
     gap: Positive = GAP
     borders: Positive | None = None
-    decimator: Annotated[str, OneOf(DECIMATORS)] = "kaiser"
+    decimator: Annotated[str, OneOf(filtering.KINDS)] = "kaiser"
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +96,7 @@ class Motion:
     band: float
     cutoff: np.ndarray
     velocity_cutoff: np.ndarray
-    decimator: Decimator
+    decimator: filtering.Decimator
     joint_names: tuple[str, ...]
     file: str
     sampling: SamplingReport
@@ -136,7 +123,7 @@ class Motion:
     def in_band(self, values: np.ndarray) -> np.ndarray:
         """Return `values` (N, ...) below the identification band at the full rate, without phase shift; by segments."""
         parts = [
-            low_pass(values[self.segment == i], self.rate, min(self.band, USABLE * self.rate / 2))
+            filtering.low_pass(values[self.segment == i], self.rate, min(self.band, USABLE * self.rate / 2))
             for i in np.unique(self.segment)
         ]
         return np.concatenate(parts)
@@ -181,15 +168,17 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
         check_cutoff(float(value), sampled.rate, recording.file)
     decimator = _decimator(cutoffs, options, sampled, recording.file)
     q, mask = _smooth(sampled, cutoff, options.order), _inside(sampled, cutoff, options, recording.file)
-    a = _differences(curvature, q, sampled, options.width)
+    a = _differences(filtering.curvature, q, sampled, options.width)
     if faster is None:
         faster = cutoff if options.cutoff is not None else _velocity_cutoff(cutoffs, cutoff, a[mask], sampled.rate)
     less = q if np.array_equal(faster, cutoff) else _smooth(sampled, faster, options.order)
-    v = _differences(slope, less, sampled, options.width)
-    while options.band is None and decimator.factor > 1 and not len(kept(sampled.segment[mask], decimator)):
-        decimator = design_decimator(sampled.rate, decimator.factor // 2, options.decimator)  # whose window fits
-    if not len(kept(sampled.segment[mask], decimator)):
-        raise too_short(int(mask.sum()), decimator)
+    v = _differences(filtering.slope, less, sampled, options.width)
+    while options.band is None and decimator.factor > 1 and not len(filtering.kept(sampled.segment[mask], decimator)):
+        decimator = filtering.design_decimator(
+            sampled.rate, decimator.factor // 2, options.decimator
+        )  # whose window fits
+    if not len(filtering.kept(sampled.segment[mask], decimator)):
+        raise filtering.too_short(int(mask.sum()), decimator)
     inside = _span(mask)
     others = {name: read_only(value[inside]) for name, value in sampled.series.items() if name not in ("q", "v")}
     v_measured = read_only(sampled.series["v"][inside]) if "v" in sampled.series else None
@@ -207,7 +196,7 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
         file=recording.file,
         sampling=sampled.report,
         cutoffs=cutoffs,
-        notes=(*recording.notes, *sampled.report.lines(), *_told(cutoffs, options)),
+        notes=(*recording.notes, *sampled.report.lines(), *_reasons(cutoffs, options)),
         drive_gain=recording.drive_gain,
         effort_variance=recording.effort_variance,
         v_measured=v_measured,
@@ -226,15 +215,17 @@ def thin(motion: Motion) -> Motion:
 
     W for it is that of the *whole* motion, decimated; building W from the thinned q, v, a would not be parallel.
     """
-    index = kept(motion.segment, motion.decimator)
+    index = filtering.kept(motion.segment, motion.decimator)
     efforts = {
-        name: None if (value := getattr(motion, name)) is None else decimate(value, motion.decimator, motion.segment)
+        name: None
+        if (value := getattr(motion, name)) is None
+        else filtering.decimate(value, motion.decimator, motion.segment)
         for name in ("effort", "tau_link", "tau_motor")
     }
     picked = {name: value[index] for name in ROWS if (value := getattr(motion, name)) is not None}
     rate = motion.rate / motion.decimator.factor
-    whole = design_decimator(rate, 1)
-    weight = decimate(motion.weight, motion.decimator, motion.segment)
+    whole = filtering.design_decimator(rate, 1)
+    weight = filtering.decimate(motion.weight, motion.decimator, motion.segment)
     return replace(motion, **(picked | efforts | {"weight": weight}), rate=rate, decimator=whole)
 
 
@@ -261,7 +252,7 @@ def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
     result = np.empty_like(q)
     for own in _segments(sampled):
         for j, f in enumerate(cutoff):
-            result[own, j] = low_pass(q[own, j], sampled.rate, float(f), order)
+            result[own, j] = filtering.low_pass(q[own, j], sampled.rate, float(f), order)
     return result
 
 
@@ -275,7 +266,7 @@ def _differences(
 def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
     """Return the mask (N,) of the samples that the filters' ends do not spoil; at least one, or it is refused."""
     inside = np.zeros(len(sampled.t), dtype=bool)
-    edge = border(sampled.rate, float(cutoff.min()))
+    edge = filtering.border(sampled.rate, float(cutoff.min()))
     edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))
     edge = max(edge, options.width)
     for own in _segments(sampled):
@@ -298,17 +289,17 @@ def _span(mask: np.ndarray) -> np.ndarray | slice:
     return slice(first, stop) if mask[first:stop].all() else mask
 
 
-def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, file: str) -> Decimator:
+def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, file: str) -> filtering.Decimator:
     rate = sampled.rate
     if options.band is None:
-        return design_decimator(rate, cutoffs.factor, options.decimator)
+        return filtering.design_decimator(rate, cutoffs.factor, options.decimator)
     if not 0 < options.band < rate / 2:
         message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
         refuse_data(file, message)
-    if (factor := factor_for(rate, options.band)) > len(sampled.t):
+    if (factor := filtering.factor_for(rate, options.band)) > len(sampled.t):
         message = f"an identification band of {options.band:g} Hz keeps one sample of {factor}, of {len(sampled.t)}"
         refuse_data(file, f"{message} there are: raise the band, or leave it to the data")
-    return design_decimator(rate, factor_for(rate, options.band), options.decimator)
+    return filtering.design_decimator(rate, filtering.factor_for(rate, options.band), options.decimator)
 
 
 def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.ndarray:
@@ -318,14 +309,11 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
     return np.broadcast_to(values, (recording.n,))
 
 
-def _hertz(value: float | tuple[float, ...]) -> str:
-    return " ".join(f"{one:.4g}" for one in np.atleast_1d(value))
-
-
-def _told(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
-    stated = [name for name in ("cutoff", "band") if getattr(options, name) is not None]
+def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
+    """Return in words where the cut-offs come from."""
+    stated = {name: value for name in ("cutoff", "band") if (value := getattr(options, name)) is not None}
     lines = [
-        f"{name} = {_hertz(getattr(options, name))} Hz, not from this recording: stated, or the training's"
-        for name in stated
+        f"{name} = {' '.join(f'{one:.4g}' for one in np.atleast_1d(value))} Hz, as stated or as in the training motion"
+        for name, value in stated.items()
     ]
     return (*lines, *cutoffs.reasons) if len(stated) < 2 else tuple(lines)

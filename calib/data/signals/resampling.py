@@ -199,22 +199,22 @@ class SamplingReport:
 
     def lines(self) -> list[str]:
         """Return notes for the user, one finding per line."""
-        told = [f"{self.rate:.6g} Hz; the stamps' steps jitter by {self.jitter[0] * 1e3:.3g} ms rms"]
-        told[0] += f", {self.jitter[1] * 1e3:.3g} ms at most"
+        lines = [f"{self.rate:.6g} Hz; the stamps' steps jitter by {self.jitter[0] * 1e3:.3g} ms rms"]
+        lines[0] += f", {self.jitter[1] * 1e3:.3g} ms at most"
         if self.clock != "stamps":
             share = self.roughness[self.clock]
-            told.append(f"samples dated {self.clock}, not by their stamps: positions {1 / share:.3g} times smoother")
+            lines.append(f"samples dated {self.clock}, not by their stamps: positions {1 / share:.3g} times smoother")
         if self.clock == "counted" and abs(self.times - 1.0) > APART:
-            told.append(f"a step is {self.times:.4g} times as long by the measured velocities as by the stamps")
+            lines.append(f"a step is {self.times:.4g} times as long by the measured velocities as by the stamps")
         if self.repeated:
-            told.append(f"{self.repeated} samples were read twice; the second is left out")
+            lines.append(f"{self.repeated} samples were read twice; the second is left out")
         if self.lost:
-            told.append(f"{self.lost} samples are missing one by one or a few at a time; interpolated, with weight 0")
-        told += [f"gap of {length:.3g} s at {start:.6g} s: split there" for start, length in self.gaps]
-        told += [
+            lines.append(f"{self.lost} samples are missing one by one or a few at a time; interpolated, with weight 0")
+        lines += [f"gap of {length:.3g} s at {start:.6g} s: split there" for start, length in self.gaps]
+        lines += [
             f"{length:.3g} s at {start:.6g} s between gaps are too short; left out" for start, length in self.dropped
         ]
-        return told
+        return lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,17 +279,14 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
         frozen(np.concatenate(grids)),
         {
             name: _interpolate(value if found.keep.all() else value[found.keep], t, used, grids)
-            for name, value in _present(recording)
+            for name in SERIES
+            if (value := getattr(recording, name)) is not None
         },
         frozen(np.concatenate(weight)),
         frozen(np.concatenate([np.full(len(grid), i) for i, grid in enumerate(grids)]), int),
         1 / period,
         report,
     )
-
-
-def _present(recording: Recording) -> list[tuple[str, np.ndarray]]:
-    return [(name, value) for name in SERIES if (value := getattr(recording, name)) is not None]
 
 
 def _interpolate(values: np.ndarray, t: np.ndarray, used: list[tuple[int, int]], grids: list[np.ndarray]) -> np.ndarray:
@@ -311,7 +308,7 @@ def _interpolate(values: np.ndarray, t: np.ndarray, used: list[tuple[int, int]],
 
 
 def _on_grid(t: np.ndarray, grid: np.ndarray) -> bool:
-    """Say whether the samples lie on the grid as they are."""
+    """Return whether the samples lie on the grid as they are."""
     return len(t) == len(grid) and bool(np.abs(grid - t).max() < 1e-6 * (grid[1] - grid[0]))
 
 

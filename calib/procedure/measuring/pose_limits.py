@@ -34,7 +34,7 @@ from calib.procedure.measuring.constraints_file import (
     rising,
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
-from calib.robot.description import TURNS, remarks
+from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import placement
@@ -223,7 +223,7 @@ def _joints(
             raise UsageError(f"{place}: expected a list of 2 numbers, lower and upper, found {span}")
         low, high = _span(span, place, "length" if cell.chain.joints[j].unit == "m" else "angle")
         turns, own = cell.chain.joints[j].unit != "m", (cell.chain.lower[j], cell.chain.upper[j])
-        if far := turns and max(-low, high) > TURNS:
+        if far := turns and max(-low, high) > MAX_TURN:
             notes.append(f'{place}: {low:g} to {high:g} rad; in degrees? Then write ["{low:g} deg", "{high:g} deg"]')
         if low <= own[0] and high >= own[1] and not far and (low, high) != own:
             notes.append(

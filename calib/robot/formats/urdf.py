@@ -78,7 +78,8 @@ def ends(
     tree.link(base, "base")
     if tip is None:
         last = _last_named(tree, base, joint_names) if joint_names else _longest(tree, base)
-        tip = _leaf(tree, last)
+        leaves = [name for name, _ in tree.rigid(last) if not any(one.kind == "fixed" for one in tree.below[name])]
+        tip = leaves[0] if len(leaves) == 1 else last
     path = tree.path(base, tree.link(tip, "tip"))
     _check_path(tree, path, base, tip, joint_names)
     return base, tip
@@ -244,11 +245,6 @@ def _last_named(tree: UrdfTree, base: str, joint_names: Sequence[str]) -> str:
             known = ", ".join(joint.name for joint in tree.joints.values() if joint.actuated)
             refuse_robot(tree.where, f"no joint '{name}'{suggestion(name, tree.joints)} (joints: {known})")
     return max((tree.joints[name].child for name in joint_names), key=lambda link: len(tree.ancestry(link)))
-
-
-def _leaf(tree: UrdfTree, link: str) -> str:
-    leaves = [name for name, _ in tree.rigid(link) if not any(joint.kind == "fixed" for joint in tree.below[name])]
-    return leaves[0] if len(leaves) == 1 else link
 
 
 def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:

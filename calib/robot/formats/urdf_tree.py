@@ -33,7 +33,7 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class JointTag:
-    """One <joint>: origin (4, 4) in its parent link, unit axis (3,) in its own frame."""
+    """One <joint>: origin (4, 4) in its parent link, unit axis (3,) in its own frame; limits as of `_limits`."""
 
     name: str
     kind: str
@@ -42,11 +42,7 @@ class JointTag:
     origin: np.ndarray
     axis: np.ndarray
     mimic: Mimic | None
-    lower: float
-    upper: float
-    velocity: float
-    effort: float
-    unstated: tuple[str, ...]
+    limits: tuple[float, float, float, float, tuple[str, ...]]
     node: Node
 
     @property
@@ -59,8 +55,7 @@ class JointTag:
 
     def as_joint(self) -> Joint:
         """Return what the chain keeps of it."""
-        kind = "prismatic" if self.kind == "prismatic" else "revolute"
-        return Joint(self.name, kind, self.lower, self.upper, self.velocity, self.effort, self.unstated)
+        return Joint(self.name, "prismatic" if self.kind == "prismatic" else "revolute", *self.limits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +108,11 @@ class UrdfTree:
         Raises:
             RobotError: where `tip` does not hang on `base`.
         """
-        result: list[JointTag] = []
-        link = tip
-        while link != base:
-            if link not in self.above:
-                refuse_robot(self.where, f"link '{tip}' does not hang on '{base}'; choose another base or tip")
-            result.append(self.above[link])
-            link = result[-1].parent
-        return result[::-1]
+        joints = self.ancestry(tip)
+        links = [*(joint.parent for joint in joints), tip]
+        if base not in links:
+            refuse_robot(self.where, f"link '{tip}' does not hang on '{base}'; choose another base or tip")
+        return joints[links.index(base) :]
 
     def rigid(self, link: str) -> list[tuple[str, np.ndarray]]:
         """Return the links fixed to `link`, itself first, each with its pose (4, 4) in the frame of `link`."""
@@ -205,7 +197,7 @@ def _skew(v: np.ndarray) -> np.ndarray:
 
 
 def _is_macro(node: Node) -> bool:
-    """Tell a xacro call or include from what xacro leaves behind harmlessly."""
+    """Return whether a node is a xacro call or include; properties and arguments that xacro leaves are harmless."""
     return node.tag.startswith("xacro:") and node.tag not in ("xacro:property", "xacro:arg")
 
 
@@ -223,7 +215,6 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     if kind not in KINDS:
         refuse_robot(place, f"type '{kind}' is none of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
     ends = [_end(node, role, links, place) for role in ("parent", "child")]
-    lower, upper, velocity, effort, unstated = _limits(node, kind, place)
     return JointTag(
         name=name,
         kind=kind,
@@ -232,11 +223,7 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
         origin=origin(node, place),
         axis=_axis(node, kind, place),
         mimic=_mimic(node, place),
-        lower=lower,
-        upper=upper,
-        velocity=velocity,
-        effort=effort,
-        unstated=unstated,
+        limits=_limits(node, kind, place),
         node=node,
     )
 

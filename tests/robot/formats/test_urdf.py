@@ -170,7 +170,8 @@ def test_wrong_choices(options, message):
         urdf.parse(TWO_ARMS, "two.urdf", **options)
 
 
-BASE = '<robot name="x"><link name="a"/><link name="b"/><link name="c"/>\n'
+def three(*joints: str) -> str:
+    return "".join(['<robot name="x"><link name="a"/><link name="b"/><link name="c"/>\n', *joints, "</robot>"])
 
 
 @pytest.mark.parametrize(
@@ -179,45 +180,42 @@ BASE = '<robot name="x"><link name="a"/><link name="b"/><link name="c"/>\n'
         ("<robot><link name='a'></robot>", r"bad, line 1, column 25: not XML \(mismatched tag\)"),
         ("", r"not XML \(no element found\)"),
         ("<sdf/>", r"the root element is <sdf>, a URDF has <robot>"),
-        (BASE + "</robot>", r"several roots: a, b, c; choose one as base"),
+        (three(), r"several roots: a, b, c; choose one as base"),
         ("<robot name='x'/>", r"no <link> found"),
         ("<robot name='x'><link name='a'/></robot>", r"no actuated joint \(revolute, continuous or prismatic\) found"),
         ("<robot name='x'><link name='a'/><link name='a'/></robot>", r"line 1: a second link named 'a'"),
         ("<robot name='x'><link/></robot>", r"line 1: a <link> without a name"),
         ("<robot name='x'><link name='a'/><joint type='fixed'/></robot>", r"line 1: a <joint> without a name"),
+        (three(joint("j", "revolut", "a", "b")), r"line 2, joint 'j': type 'revolut' is none of .*'revolute'"),
+        (three(joint("j", "revolute", "a", "bb")), r"its child 'bb' is no link of this file"),
+        (three('<joint name="j" type="fixed"><child link="b"/></joint>'), r"joint 'j': no <parent link"),
+        (three(joint("j", "fixed", "a", "b") * 2), r"line 3: a second joint named 'j'"),
         (
-            BASE + joint("j", "revolut", "a", "b") + "</robot>",
-            r"line 2, joint 'j': type 'revolut' is none of .*'revolute'",
-        ),
-        (BASE + joint("j", "revolute", "a", "bb") + "</robot>", r"its child 'bb' is no link of this file"),
-        (BASE + '<joint name="j" type="fixed"><child link="b"/></joint></robot>', r"joint 'j': no <parent link"),
-        (BASE + joint("j", "fixed", "a", "b") * 2 + "</robot>", r"line 3: a second joint named 'j'"),
-        (
-            BASE + joint("j", "fixed", "a", "c") + joint("k", "fixed", "b", "c") + "</robot>",
+            three(joint("j", "fixed", "a", "c"), joint("k", "fixed", "b", "c")),
             r"line 3: link 'c' has two parents, joints 'j' and 'k'; a URDF is a tree",
         ),
         (
-            BASE + joint("j", "fixed", "b", "c") + joint("k", "fixed", "c", "b") + "</robot>",
+            three(joint("j", "fixed", "b", "c"), joint("k", "fixed", "c", "b")),
             r"links b, c hang on each other in a loop",
         ),
-        (BASE + joint("j", "revolute", "a", "b", axis("0 0 0")) + "</robot>", r"joint 'j': its axis is zero"),
+        (three(joint("j", "revolute", "a", "b", axis("0 0 0"))), r"joint 'j': its axis is zero"),
         (
-            BASE + joint("j", "revolute", "a", "b", axis("0 0 nan")) + "</robot>",
+            three(joint("j", "revolute", "a", "b", axis("0 0 nan"))),
             r'xyz="0 0 nan" of <axis> in line 2 is not 3 finite numbers',
         ),
-        (BASE + joint("j", "fixed", "a", "b", xyz="0 0") + "</robot>", r'xyz="0 0" of <origin> .* 3 finite numbers'),
-        (BASE + joint("j", "fixed", "a", "b", rpy="0 x 0") + "</robot>", r'rpy="0 x 0" of <origin>'),
-        (BASE + joint("j", "fixed", "a", "b", xyz="0 0 ${h}") + "</robot>", r"this is a xacro file, expand it first"),
+        (three(joint("j", "fixed", "a", "b", xyz="0 0")), r'xyz="0 0" of <origin> .* 3 finite numbers'),
+        (three(joint("j", "fixed", "a", "b", rpy="0 x 0")), r'rpy="0 x 0" of <origin>'),
+        (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file, expand it first"),
         (
             "<robot xmlns:xacro='x'><xacro:include filename='f'/></robot>",
             r"found <xacro:include>: this is a xacro file",
         ),
         (
-            BASE + joint("j", "revolute", "a", "b", '<limit lower="1" upper="1"/>') + "</robot>",
+            three(joint("j", "revolute", "a", "b", '<limit lower="1" upper="1"/>')),
             r"joint 'j': lower limit 1 is not below the upper 1; correct them, or make the joint fixed",
         ),
         (
-            BASE + joint("j", "revolute", "a", "b", '<limit lower="one" upper="1"/>') + "</robot>",
+            three(joint("j", "revolute", "a", "b", '<limit lower="one" upper="1"/>')),
             r'lower="one" of <limit> in line 2 is not a number',
         ),
     ],

@@ -132,7 +132,9 @@ def other_frames(nominal: Chain) -> str:
         xyz, rpy = to_xyz_rpy(pending @ tag.origin @ (screw if tag.moves else np.eye(4)))
         pending = np.linalg.inv(screw)
         limit = (
-            "" if tag.kind == "fixed" else f'<limit lower="{tag.lower}" upper="{tag.upper}" velocity="1" effort="1"/>'
+            ""
+            if tag.kind == "fixed"
+            else f'<limit lower="{tag.limits[0]}" upper="{tag.limits[1]}" velocity="1" effort="1"/>'
         )
         numbers = [" ".join(map(repr, values.tolist())) for values in (xyz, rpy)]
         tags.append(joint(tag.name, tag.kind, tag.parent, tag.child, axis("0 0 1") + limit, *numbers))
