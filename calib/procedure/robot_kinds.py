@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from calib.data.recordings.recording import Joints
 from calib.errors import UsageError
 from calib.extensions import merged, offered
 from calib.procedure.findings import Verdict
@@ -36,7 +35,6 @@ class Mechanism(Protocol):
     Attributes:
         kind: what it is, in words: ``parallel robot``.
         source: the file it came from.
-        joints: what recordings are held against: names, kinds, limits.
         chain: its actuated joints as those of an arm: name, n, joint_names, joints.
         instead: verb that it does not have → what to do, in a clause.
     """
@@ -47,8 +45,6 @@ class Mechanism(Protocol):
     def source(self) -> Path: ...
     @property
     def instead(self) -> Mapping[str, str]: ...
-    @property
-    def joints(self) -> Joints: ...
     @property
     def chain(self) -> Any: ...
 

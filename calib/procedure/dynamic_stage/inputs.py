@@ -93,7 +93,7 @@ class IdentificationInputs:
         names = case_names([*(case.name for case in (*self.cases, *self.unseen)), *paths])[-len(paths) :]
         cases, notes = [], []
         for name, path, each in zip(names, paths, validate):
-            joints = joints_of(self.chain) if isinstance(self.robot, CalibratedChain) else self.robot.joints
+            joints = joints_of(self.chain)
             motion = read_motion(each, joints, self.options.file_settings(path), self.cases[0].motion)
             cases.append(_read_case(path, name, motion, self.options, self.currents))
             notes += [f"{name}: {note}" for note in motion.notes]
@@ -134,7 +134,7 @@ def gather(
     known = load_calibrated(robot, base, tip) if isinstance(robot, (str, Path)) else robot
     source = resolve(robot) if isinstance(robot, (str, Path)) else Path(known.source or known.chain.name)
     chain, arm = known.chain, isinstance(known, CalibratedChain)
-    joints = joints_of(chain) if isinstance(known, CalibratedChain) else known.joints
+    joints = joints_of(chain)
     if options.settings.loop is not None:
         options.settings.loop.check_lengths(chain.n)
     names = case_names(paths)
@@ -246,12 +246,10 @@ def _joints(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(one) for one in values)
 
 
-def joints_of(chain: Chain) -> Joints:
-    """Return what a recording is held against."""
-    return Joints(
-        chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
-        np.array([joint.effort for joint in chain.joints]),
-    )  # fmt: skip
+def joints_of(chain: Any) -> Joints:
+    """Return what a recording is held against: names and limits of an arm's, or a mechanism's, joints."""
+    limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
+    return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:

@@ -17,6 +17,7 @@ from calib.api.motions import MotionPlan
 from calib.arrays import shaped
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
+from calib.procedure.dynamic_stage.inputs import joints_of
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.excite import actuator_bounds, read_model, write_motion
@@ -143,8 +144,9 @@ def plan_parallel(
     say("timing")
     timings = tuple(time_optimal(path, kept, law, rate=settings.rate) for path in own)
     motion = joined([track(one.path, one.profile, settings.rate, law.torque) for one in timings])
+    joints = joints_of(known.robot)
     return ParallelPlan(
-        chain=cast(Any, known.robot), bounds=bounds, limits=kept, lower=robot.joints.lower, upper=robot.joints.upper,
+        chain=cast(Any, known.robot), bounds=bounds, limits=kept, lower=joints.lower, upper=joints.upper,
         timings=timings, track=motion, notes=() if model else (FRICTIONLESS,), robot=robot,
         coordinates=coordinates_of(known, known.locate(motion.q)),
     )  # fmt: skip

@@ -7,9 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from calib.data.recordings.recording import Joints
 from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism import parallel_files
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
@@ -59,15 +56,6 @@ class ParallelMechanism:
             "values": dict(zip(model.names, map(float, dynamics.values))),
             "base": dict(zip(base.names, expressions(base))), "covariance": COVARIANCE,
         }  # fmt: skip
-
-    @property
-    def joints(self) -> Joints:
-        """What recordings are held against: the actuated joints."""
-        joints = self.known.robot.joints
-        return Joints(
-            self.known.robot.joint_names, tuple(joint.kind for joint in joints),
-            *(np.array([getattr(joint, key) for joint in joints]) for key in ("lower", "upper", "effort")),
-        )  # fmt: skip
 
     def __repr__(self) -> str:
         robot = self.known.robot

@@ -93,6 +93,7 @@ class ParallelRobot:
     upper: np.ndarray
     platform: np.ndarray | None = None
     gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
+    links = ()  # names of a URDF's, which there is none of
 
     def __post_init__(self) -> None:
         for key in ("home", "lower", "upper", "gravity"):
