@@ -28,8 +28,10 @@ the band explains; ``whiteness`` of the residuals; ``motion_share``: part of the
 ones have ``interval95``: share of the errors within the 95 % interval that the model states, of all rows and by joint,
 its median half width, and how the motion leaves the training range. Then ``parameters`` (standard, base,
 essential), ``condition_number`` (raw, and with columns of unit norm), ``friction`` and its ``ladder``, ``elimination``,
-``loop``, ``tracking`` by file (or ``tracking_failure``), ``filters`` by file, ``geometry``, ``warnings``, ``verdict``,
-its ``reason``, ``seed``, ``schema`` (3; files without one are of earlier versions and are read, too). No number: null.
+``loop``, ``tracking`` by file (or ``tracking_failure``), ``filters`` by file, ``geometry``, ``warnings`` and the
+findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdict``, its ``reason``, and ``code`` and
+``advice`` of the finding that decided it, ``seed``, ``schema`` (3; files without one are of earlier versions and are
+read, too). No number: null.
 
 Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual);
 ``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_friction.png`` (over velocity), and, where the

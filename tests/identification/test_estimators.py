@@ -18,7 +18,7 @@ from calib.identification.identify import identify as fit
 from calib.identification.methods.least_squares import scaled_tls
 from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage.inputs import gather
-from calib.procedure.dynamic_stage.verdict import model_warnings
+from calib.procedure.dynamic_stage.verdict import model_findings
 
 
 def identify(robot: Path, log: Path, method: str, out: Path, code: int = 0) -> dict[str, tuple[float, float]]:
@@ -100,7 +100,7 @@ def test_what_a_joint_lacks_widens_the_sigmas_of_all_least_squares(robot: Path, 
     assert found["hopfield"].fitted.inflation[2] > 3.0
     sigma = {method: one.fitted.estimate.sigma for method, one in found.items()}
     assert all(np.median(sigma[method] / sigma["hopfield"]) > 0.9 for method in ("irls", "tls"))
-    assert any("autocorrelated" in line for line in model_warnings(inputs.cases, found["tls"], {}))
+    assert "autocorrelated-residual" in {one.code for one in model_findings(inputs.cases, found["tls"])}
 
 
 def test_a_parameter_on_its_bound_has_no_sigma(robot: Path, tmp_path: Path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from calib.dynamics.base import expressions
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.gains import GainRecord
+from calib.identification.methods.instrumental import Instrumental
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
@@ -23,7 +24,6 @@ from calib.identification.uncertainty.torque_errors import TorqueErrorModel, Tor
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.loop_tables import INSTRUMENTAL, write_instrumental
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -32,6 +32,7 @@ from calib.records import plain, read_json
 from calib.robot import calibrated
 from calib.units import per_ampere
 
+INSTRUMENTAL = "instrumental.csv"
 OURS = (
     calibrated.ROBOT, MODEL, ESTIMATE, COVARIANCE, information.INFORMATION, INSTRUMENTAL,
     METRICS, "drive_gains.csv",
@@ -41,6 +42,7 @@ OURS = (
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces."""
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
+INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
 
 
@@ -159,12 +161,13 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
     write_covariance(folder / COVARIANCE, found.names, covariance)
     geometry_tables.write(outcome, folder)
-    write_instrumental(found.bias, folder)
+    if (instrumental := found.bias.found) is not None:
+        files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, _instrumental_rows(instrumental))
     held = found.fitted.held is not None and found.fitted.held.solution.binding.any()
     if found.prior is not None or held:  # else estimate and covariance say it all
         information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
-    expected = outcome.assessment.intervals.get(first.name)
+    expected = outcome.intervals.get(first.name)
     _write_torques(first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
     made = inputs.robot.model_table if isinstance(inputs.robot, Mechanism) else to_table
@@ -200,6 +203,15 @@ def read_torques(path: Path) -> dict[str, np.ndarray]:
     table = read_table(path)
     found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}
     return {name.rstrip("_"): one for name, one in found.items() if one is not None} if found["v"] is not None else {}
+
+
+def _instrumental_rows(found: Instrumental) -> Iterator[tuple[Any, ...]]:
+    """Yield both estimates of the standard model, parameter by parameter."""
+    estimate = found.fit.estimate
+    columns = (estimate.values, estimate.sigma, found.ordinary.estimate.values, found.shift)
+    explained = 100.0 * found.strength.partial_r2
+    for name, unit, *numbers in zip(estimate.names, estimate.units, *columns, explained):
+        yield name, unit, *map(float, numbers)
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

@@ -139,16 +139,6 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
     return FoundGains(options, found.gains, found, f"A of joint {reference + 1}", notes)
 
 
-def relative_warnings(unit: str) -> tuple[str, ...]:
-    """Say what a model is whose torques are not in newton metres; nothing for one whose are."""
-    if unit == TORQUE:
-        return ()
-    return (
-        f"torques are {without_gains(unit)}: no masses, no URDF, no motion planning: state gains, or identify them "
-        "with a load",
-    )
-
-
 def _identify(
     chain: Chain,
     cases: Sequence[Case],

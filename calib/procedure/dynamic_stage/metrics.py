@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from calib.data.signals.motion import Motion
+from calib.errors import Finding
 from calib.estimation.essential import EliminationStep
+from calib.estimation.instrumental_variables import ExogeneityTest
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.loop.replay import Replay
+from calib.identification.methods.bias import LoopTest
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import Binding
 from calib.identification.rows import Case
@@ -26,9 +29,9 @@ from calib.identification.scores import Score
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.loop_tables import LoopMetrics
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.records import Array, Number
+from calib.simulation.loop.controllers import Controller
 
 SCHEMA, UNSEEN_SCHEMA = 3, 2  # of metrics.json, and of unseen/report.json
 MAX_POINTS = 400  # samples per curve of the certificate (our choice)
@@ -85,14 +88,96 @@ class ConstraintMetrics:
 
 
 @dataclass(frozen=True, eq=False)
-class ModelMetrics:
+class LoopMetrics:
+    """What instruments from a simulated loop say of an estimate; a record.
+
+    Attributes:
+        failure: why there are no instruments.
+        notes: of the loops.
+        instruments: the method that simulates; `beside`: whether the estimate is another method's.
+        rounds: simulations until it settled.
+        durbin_wu_hausman: whether least squares is biased.
+        largest_shift_sigma: of a parameter from least squares.
+        cragg_donald, instruments_weak, least_partial_r2: how strong the instruments are.
+        distance_percent, simulated_torque_error_percent, strays_times: (n,) see `Instrumental`.
+        valid, explains: whether the instruments may be trusted, and explain as much as the model.
+        controller: that was simulated; of its torque, `controller_explains_percent` (n,) where it was identified.
+    """
+
+    failure: str = ""
+    notes: tuple[str, ...] = ()
+    instruments: str = ""
+    beside: bool = False
+    rounds: int = 0
+    durbin_wu_hausman: ExogeneityTest | None = None
+    largest_shift_sigma: float = 0.0
+    cragg_donald: Number = 0.0
+    instruments_weak: bool = False
+    least_partial_r2: float = 0.0
+    distance_percent: Array = ()  # type: ignore[assignment]
+    simulated_torque_error_percent: Array = ()  # type: ignore[assignment]
+    strays_times: Array = ()  # type: ignore[assignment]
+    valid: bool = True
+    explains: bool = True
+    controller: Controller | None = None
+    controller_explains_percent: Array | None = None
+
+    @classmethod
+    def of(cls, bias: LoopTest, beside: bool) -> LoopMetrics | None:
+        """Return the record of a test by simulation; None where no loop was stated."""
+        found, loops = bias.found, bias.loops
+        notes = () if loops is None else loops.notes
+        if found is None or loops is None:
+            return cls(bias.failure, notes) if bias.failure or notes else None
+        identified, strength = loops.identified, found.strength
+        return cls(
+            "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
+            strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
+            found.stray, found.valid, found.explains, loops.controller, identified and identified.explained,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JudgedMetrics:
+    """What a model beside recordings came to, as both files store it.
+
+    Attributes:
+        verdict, reason: of the model.
+        code, advice: of the finding that decided the verdict; empty for a pass, and in files of earlier versions.
+        noticed: the findings behind the warnings; what else is known of recordings and estimate is text only.
+        rows: what the torque rows are called.
+        tracking: by recording that was replayed; or why none was.
+    """
+
+    verdict: str
+    reason: str
+    code: str = ""
+    advice: str = ""
+    warnings: tuple[str, ...]
+    noticed: tuple[Finding, ...] = ()
+    rows: tuple[str, ...]
+    validation: Mapping[str, Score]
+    tracking: Mapping[str, Replay] = field(default_factory=dict)
+    tracking_failure: str = ""
+
+
+def _judged(found: Assessment) -> dict[str, Any]:
+    """Return what both records say of an assessment, but for the names of the rows."""
+    replays = {one.name: one for one in found.tracking.replays}
+    return {
+        **dict(zip(("verdict", "reason", "code", "advice"), vars(found.verdict).values())),
+        "warnings": found.warnings, "noticed": found.noticed, "validation": found.validation,
+        "tracking": replays, "tracking_failure": found.tracking.failure,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelMetrics(JudgedMetrics):
     """The content of ``metrics.json``; see `calib.identification.model_file`."""
 
     identification: Mapping[str, Score]
-    validation: Mapping[str, Score]
     parameters: ParameterCounts
     counts: ColumnCounts
-    rows: tuple[str, ...]
     condition_number: ConditionNumber
     friction: str
     method: str
@@ -100,16 +185,11 @@ class ModelMetrics:
     ladder: tuple[FrictionTrial, ...]
     ripple: tuple[RippleWaves, ...]
     elimination: tuple[EliminationStep, ...]
-    warnings: tuple[str, ...]
-    verdict: str
-    reason: str
     unit: str = "N m"
     switched_off: tuple[str, ...] = ()
     drive_gains: GainRecord | None = None
     loop: LoopMetrics | None = None
     constraints: ConstraintMetrics | None = None
-    tracking: Mapping[str, Replay] = field(default_factory=dict)
-    tracking_failure: str = ""
     filters: Mapping[str, FilterMetrics] = field(default_factory=dict)
     geometry: geometry_tables.GeometryMetrics | None = None
     repeated: Mapping[str, float] = field(default_factory=dict)
@@ -133,37 +213,31 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
     """Return the record of an identification."""
     found, inputs, held = outcome.found, outcome.inputs, outcome.found.fitted.held
     base, count = found.base, found.base.b + len(found.friction.terms)
+    kept = count if found.elimination is None else len(found.elimination.kept)
     return ModelMetrics(
-        outcome.fit,
-        outcome.validation,
-        ParameterCounts(
-            len(base.standard), count, count if found.elimination is None else len(found.elimination.kept)
-        ),
-        ColumnCounts(len(base.without_effect), len(base.regrouped)),
-        found.settings.torque_rows.numbered(inputs.chain.n),
-        ConditionNumber(*found.condition),
-        found.friction.chosen,
-        found.fitted.method,
-        METHODS[found.fitted.method].assumes,
-        found.friction.steps,
-        tuple(one.found for one in found.ripples),
-        () if found.elimination is None else found.elimination.steps,
-        outcome.warnings,
-        outcome.verdict.level,
-        outcome.verdict.reason,
-        inputs.unit,
-        found.friction.off,
-        inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
-        LoopMetrics.of(found.bias, found.fitted.instrumental is None),
-        held and ConstraintMetrics(held.constraints.names, held.binding, held.postures),
-        {one.name: one for one in outcome.tracking.replays},
-        outcome.tracking.failure,
-        {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
-        outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
-        outcome.repeated,
-        outcome.findings,
-        outcome.seed,
-    )  # fmt: skip
+        **_judged(outcome),
+        rows=found.settings.torque_rows.numbered(inputs.chain.n),
+        identification=outcome.fit,
+        parameters=ParameterCounts(len(base.standard), count, kept),
+        counts=ColumnCounts(len(base.without_effect), len(base.regrouped)),
+        condition_number=ConditionNumber(*found.condition),
+        friction=found.friction.chosen,
+        method=found.fitted.method,
+        method_assumes=METHODS[found.fitted.method].assumes,
+        ladder=found.friction.steps,
+        ripple=tuple(one.found for one in found.ripples),
+        elimination=() if found.elimination is None else found.elimination.steps,
+        unit=inputs.unit,
+        switched_off=found.friction.off,
+        drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
+        loop=LoopMetrics.of(found.bias, found.fitted.instrumental is None),
+        constraints=held and ConstraintMetrics(held.constraints.names, held.binding, held.postures),
+        filters={case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
+        geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
+        repeated=outcome.repeated,
+        findings=outcome.findings,
+        seed=outcome.seed,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,20 +261,13 @@ def _five_digits(values: np.ndarray) -> np.ndarray:
     return np.array([float(f"{x:.5g}") for x in values.ravel()]).reshape(values.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class UnseenReport:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class UnseenReport(JudgedMetrics):
     """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.validation`."""
 
-    verdict: str
-    reason: str
-    warnings: tuple[str, ...]
-    rows: tuple[str, ...]
     units: tuple[str, ...]
     fit: Mapping[str, Score]
-    validation: Mapping[str, Score]
     curves: tuple[TorqueCurves, ...]
-    tracking: Mapping[str, Replay] = field(default_factory=dict)
-    tracking_failure: str = ""
     schema: int = UNSEEN_SCHEMA
 
     @classmethod
@@ -209,9 +276,8 @@ class UnseenReport:
         rows = inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
         curves = (TorqueCurves.of(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases))
         return cls(
-            found.verdict.level, found.verdict.reason, found.warnings, tuple(rows), tuple(inputs.row_units), found.fit,
-            found.validation, tuple(curves), {one.name: one for one in found.tracking.replays}, found.tracking.failure,
-        )  # fmt: skip
+            **_judged(found), rows=tuple(rows), units=tuple(inputs.row_units), fit=found.fit, curves=tuple(curves)
+        )
 
     @property
     def proofs(self) -> dict[str, Score]:

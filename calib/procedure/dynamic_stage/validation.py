@@ -11,9 +11,10 @@ from os.path import realpath
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
-from calib.errors import finding
+from calib.errors import CalibError, Finding, finding
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.friction.passivity import driven
+from calib.identification.loop.replay import Replay, replay
 from calib.identification.methods.bias import LoopDisagreement
 from calib.identification.possible.solve import Contradiction
 from calib.identification.prediction import Dynamics, predict
@@ -26,16 +27,16 @@ from calib.identification.uncertainty.torque_errors import (
     intervals,
 )
 from calib.procedure.dynamic_stage import plausibility
-from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
-from calib.procedure.dynamic_stage.tracking import Tracking, track
 from calib.procedure.dynamic_stage.verdict import (
     Resting,
+    beyond,
+    excitation_notes,
     extrapolates,
     friction_drives,
     judge,
+    motion_findings,
     too_narrow,
-    warnings,
     with_duration,
     with_prior,
 )
@@ -46,13 +47,30 @@ from calib.units import TORQUE, without_gains
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
 
+MAX_REPLAYS = 3  # recordings that are replayed
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """What replaying recordings came to.
+
+    Attributes:
+        replays: one per recording.
+        failure: why there is none.
+    """
+
+    replays: tuple[Replay, ...] = ()
+    failure: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
     """What an identification says of its model and a verdict needs beside the recordings; a record of its folder.
 
     Attributes:
         rests: its parameters that rest on a prior.
-        notes: what a user should know of the model, whatever the unseen recordings are.
+        notes: what folders of earlier versions say of the model, as text.
+        noticed: findings on the model, whatever the unseen recordings are.
         controller: that was stated or identified; None without any.
         errors: what makes errors of its torques likely; None where too little was recorded to say.
         contradiction: how far it is from every possible robot; None where nobody knows.
@@ -61,6 +79,7 @@ class ModelFindings:
 
     rests: Resting
     notes: tuple[str, ...] = ()
+    noticed: tuple[Finding, ...] = ()
     controller: Controller | None = None
     errors: TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
@@ -78,6 +97,7 @@ class Assessment:
         excitation: case name → what the motion can tell.
         verdict: as of `calib.procedure.dynamic_stage.verdict`.
         warnings: what a user should know of the recordings, and of the model.
+        noticed: the findings behind the warnings.
         tracking: with the model fed forward.
         intervals: unseen case (without any, the first of the training) → what errors were expected there, and found.
     """
@@ -89,7 +109,8 @@ class Assessment:
     excitation: Mapping[str, ExcitationReport]
     verdict: Verdict
     warnings: tuple[str, ...]
-    tracking: Tracking
+    noticed: tuple[Finding, ...]
+    tracking: Tracking = Tracking()
     intervals: Mapping[str, TorqueIntervals] = field(default_factory=dict)
 
 
@@ -99,15 +120,14 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
     return {name: share for name, share in shares.items() if share >= REPEAT}
 
 
-def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[str]:
-    """Return which samples of files are to be unseen and yet training data, in words."""
-    told = []
+def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
+    """Return which samples of files are to be unseen and yet training data."""
+    found = []
     for case, own in product(unseen, cases):
         first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
         if own.motion.file and realpath(case.motion.file) == realpath(own.motion.file) and first < last:
-            span = f"{first:.3g} s to {last:.3g} s"
-            told.append(f"{case.name} is to be unseen, yet {span} of it are learnt from, too ({own.name})")
-    return told
+            found.append(finding("unseen-overlaps", file=case.name, training=own.name, first=first, last=last))
+    return found
 
 
 def assess(
@@ -164,27 +184,50 @@ def assess(
     rules += too_narrow({name: expected[name] for name in proofs if name in expected}, labels)
     verdict = with_duration(with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), excitation)
     say("tracking with the model fed forward")
-    amperes = relative_warnings(inputs.unit)
+    relative = inputs.unit != TORQUE
+    amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
     tracking = (
-        Tracking(failure=amperes[0]) if amperes
+        Tracking(failure=lines_of(amperes)[0]) if relative
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
-    verdict = _with_replays(verdict, tracking)
-    verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}") if amperes else verdict
-    said = (
-        *amperes, *lines_of([*odd, *rules]), *overlaps(inputs.cases, inputs.unseen),
-        *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
-        *(line for name in validation if name in expected for line in extrapolates(name, expected[name])),
-        *findings.notes,
+    if any(one.inertia_added.any() for one in tracking.replays):
+        use = lines_of([finding("prediction-not-simulation")])
+        verdict = replace(verdict, reason="; ".join([verdict.reason, *use]))
+    if relative:
+        verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}")
+    noticed = (
+        *amperes, *odd, *rules, *overlaps(inputs.cases, inputs.unseen),
+        *(one for case in (*inputs.cases, *inputs.unseen) for one in beyond(case, inputs.chain)),
+        *motion_findings(validation, repeated),
+        *(one for name in validation if name in expected for one in extrapolates(name, expected[name])),
+        *findings.noticed,
     )  # fmt: skip
+    said = dict.fromkeys((*lines_of(noticed), *excitation_notes(excitation), *findings.notes))
     return Assessment(
-        fit, validation, predictions, repeated, excitation, verdict, tuple(dict.fromkeys(said)), tracking, expected,
-    )  # fmt: skip
+        fit, validation, predictions, repeated, excitation, verdict, tuple(said), noticed, tracking, expected
+    )
 
 
-def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
-    """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
-    if not any(one.inertia_added.any() for one in tracking.replays):
-        return verdict
-    (use,) = lines_of([finding("prediction-not-simulation")])
-    return replace(verdict, reason=f"{verdict.reason}; {use}")
+def track(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    predictions: Mapping[str, np.ndarray],
+    controller: Controller | None = None,
+) -> Tracking:
+    """Replay unseen recordings (or, without any, one of the fit's own); see `calib.identification.loop.replay`.
+
+    Args:
+        predictions: case name → torques by the model.
+        controller: that was identified, where the loop's is not stated.
+    """
+    chain, chosen = inputs.chain, list(inputs.unseen)[:MAX_REPLAYS] or list(inputs.cases)[:1]
+    loop = inputs.options.settings.loop if inputs.unit == "N m" else None
+    read = None if loop is None else controller
+    try:
+        if loop is not None and loop.controller != "identify":
+            read = loop.stated_controller(chain.n)
+        rate = None if read is None or loop is None else loop.rate
+        replays = (replay(chain, dynamics, case, predictions[case.name], read, rate) for case in chosen)
+        return Tracking(tuple(replace(one, unseen=bool(inputs.unseen)) for one in replays))
+    except CalibError as error:
+        return Tracking(failure=str(error))

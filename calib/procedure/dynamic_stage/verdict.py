@@ -151,14 +151,13 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
     return []
 
 
-def extrapolates(name: str, expected: TorqueIntervals) -> list[str]:
-    """Say how a recording leaves the training range."""
+def extrapolates(name: str, expected: TorqueIntervals) -> list[Finding]:
+    """Return how a recording leaves the training range."""
     if not (share := float(expected.beyond.mean())):
         return []
     joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]
-    return lines_of(
-        [finding("outside-training-range", file=name, share=max(share, 0.01), ways="; ".join(expected.ways(joints)))]
-    )
+    ways = "; ".join(expected.ways(joints))
+    return [finding("outside-training-range", file=name, share=max(share, 0.01), ways=ways)]
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
@@ -169,44 +168,32 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
     return replace(verdict, reason=f"{verdict.reason}; {sentence(one)}")
 
 
-def warnings(
-    cases: Sequence[Case],
-    unseen: Sequence[Case],
-    validation: Mapping[str, Score],
-    repeated: Mapping[str, float],
-    excitation: Mapping[str, ExcitationReport],
-    chain: Chain,
-) -> list[str]:
-    """Return what a user should know of the recordings, whatever model was identified, worst first."""
-    found = [one for case in (*cases, *unseen) for one in beyond(case, chain)]
-    return lines_of(found) + motion_warnings(validation, repeated, excitation)
-
-
-def motion_warnings(
-    validation: Mapping[str, Score], repeated: Mapping[str, float], excitation: Mapping[str, ExcitationReport]
-) -> list[str]:
+def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
     """Return what a user should know of the recordings' motion, whatever the robot."""
     return [
-        *lines_of(finding("repeats-training", file=name, share=share) for name, share in repeated.items()),
-        *(f"{name}: {note}" for name, report in excitation.items() for note in report.notes),
-        *lines_of(finding("stands", file=name) for name, one in validation.items() if one.motion_share < MOVES),
+        *(finding("repeats-training", file=name, share=share) for name, share in repeated.items()),
+        *(finding("stands", file=name) for name, one in validation.items() if one.motion_share < MOVES),
     ]
 
 
-def model_warnings(
-    cases: Sequence[Case], found: Identification, excitation: Mapping[str, ExcitationReport]
-) -> tuple[str, ...]:
+def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
+    """Return what training motion cannot tell, by file."""
+    return [f"{name}: {note}" for name, report in excitation.items() for note in report.notes]
+
+
+def model_findings(cases: Sequence[Case], found: Identification) -> tuple[Finding, ...]:
     """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
     loop = found.bias.findings(found.fitted.instrumental is not None)
-    noticed = [*loop, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)]
-    return (*parameter_warnings(found), *lines_of(noticed))
+    return *parameter_findings(found), *loop, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)
 
 
-def parameter_warnings(found: Identification[Any]) -> list[str]:
-    """Return what a user should know of the parameters, whatever the robot: condition, bounds, prior."""
+def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
+    """Return what a user should know of the parameters, whatever the robot: condition, bounds, signs, prior."""
+    rests = resting_parameters(found)
+    prior = finding("regularised", count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
     condition = settle([finding("motion-condition", condition=found.condition[1])])
     held = found.fitted.held.findings() if found.fitted.held is not None else []
-    return lines_of([*condition, *held, *_negative(found), *_rests(found)])
+    return *condition, *held, *_negative(found), *([prior] if rests.names else [])
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:
@@ -238,13 +225,6 @@ def _negative(found: Identification[Any]) -> list[Finding]:
         if one is not None and one.nonnegative and value < -SURELY * sigma
     ]
     return [finding("negative-drives", names=wrong)] if wrong else []
-
-
-def _rests(found: Identification[Any]) -> list[Finding]:
-    """Return the parameters that the motion does not identify."""
-    rests = resting_parameters(found)
-    given = dict(count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
-    return [finding("regularised", **given)] if rests.names else []
 
 
 def _unmodelled(found: Identification) -> list[Finding]:

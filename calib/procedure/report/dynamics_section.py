@@ -16,8 +16,7 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.loop_tables import LoopMetrics
-from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
+from calib.procedure.dynamic_stage.metrics import LoopMetrics, ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
 from calib.procedure.report.page import Block, Column, KeyFigure, Pictures, Section, Table, Text, relative_sigma, table
 from calib.records import read_rows, typed_rows

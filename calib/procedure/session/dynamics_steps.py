@@ -263,7 +263,7 @@ def identify(session: Session, say: Say) -> list[str]:
         from calib.procedure.report.dynamics_figures import write as draw
     given = _gathered(session, _divided(session)[0], (), say)
     outcome = identifying.run(given, progress=say)
-    outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED))
+    outcome = replace(outcome, verdict=UNJUDGED)
     say("writing")
     identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
     found = outcome.found

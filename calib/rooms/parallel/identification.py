@@ -22,13 +22,13 @@ from calib.identification.rows import Case
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
-from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, repeated_motion
 from calib.procedure.dynamic_stage.verdict import (
+    excitation_notes,
     friction_drives,
     judge,
-    motion_warnings,
-    parameter_warnings,
+    motion_findings,
+    parameter_findings,
     resting_parameters,
     with_duration,
     with_prior,
@@ -101,9 +101,10 @@ def identify_parallel(
     noticed = [*_payloads(model, found, inputs.cases)]
     if known.robot.redundant:
         noticed.append(finding("torques-projected", actuators=known.robot.n, freedoms=known.robot.r))
-    notes = (*parameter_warnings(found), *lines_of(settle(noticed)))
-    findings = ModelFindings(resting_parameters(found), notes)
-    return ParallelDynamics(inputs, found, findings, assess(inputs, found, findings), seed=settings.seed)
+    noticed = (*parameter_findings(found), *settle(noticed))
+    findings = ModelFindings(resting_parameters(found), noticed=noticed)
+    judged = assess(inputs, found, findings)
+    return ParallelDynamics(**vars(judged), inputs=inputs, found=found, findings=findings, seed=settings.seed)
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
@@ -117,11 +118,12 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
     proofs = {name: one for name, one in validation.items() if name not in repeated}
     validation |= {name: replace(one, evidence=name in proofs) for name, one in validation.items()}
     verdict, rules = _judged(model, found, cases, fit, proofs, repeated, excitation)
-    notes = (
-        *lines_of(rules), *motion_warnings(validation, repeated, excitation), *findings.notes,
-        *lines_of(settle(_encoders(model.known, (*cases, *unseen)))),
+    noticed = (
+        *rules, *motion_findings(validation, repeated), *findings.noticed,
+        *settle(_encoders(model.known, (*cases, *unseen))),
     )  # fmt: skip
-    return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, Tracking())
+    notes = (*lines_of(noticed), *excitation_notes(excitation), *findings.notes)
+    return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, noticed)
 
 
 def _judged(

@@ -103,7 +103,7 @@ def test_drives_below_zero_are_told_with_their_sigma() -> None:
     target = own.target.copy()
     target[:, 1] -= 6.0 * own.motion.v[:, 1]
     found = identify(robot, [replace(own, target=target)], settings)
-    told = [line for line in verdict.model_warnings([own], found, {}) if line.startswith("below zero")]
-    assert len(told) == 1 and "Fv2 = -" in told[0] and "Fv1" not in told[0]
+    (told,) = [one.values["names"] for one in verdict.model_findings([own], found) if one.code == "negative-drives"]
+    assert [name.split(" = -")[0] for name in told] == ["Fv2"]
     sound = identify(robot, [own], settings)
-    assert not [line for line in verdict.model_warnings([own], sound, {}) if line.startswith("below zero")]
+    assert "negative-drives" not in {one.code for one in verdict.model_findings([own], sound)}

@@ -62,7 +62,8 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     assert run(robot, f"{train}@0:10", "--validate", f"{train}@10:", "--out", out, "--friction", "standard") == 0
     found = json.loads((out / "metrics.json").read_text())
     assert found["validation"]["train.npz@10:"]["evidence"] is False
-    assert found["verdict"] == "marginal" and "repeats" in found["reason"]
+    assert (found["verdict"], found["code"]) == ("marginal", "validation-repeats") and found["advice"]
+    assert {"validation-repeats", "repeats-training"} <= {one["code"] for one in found["noticed"]}
     assert "it is no evidence" in capsys.readouterr().out
 
 

@@ -29,8 +29,8 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.identify import judged
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.validation import overlaps, repeated_motion
-from calib.procedure.dynamic_stage.verdict import motion_warnings
-from calib.procedure.findings import Verdict
+from calib.procedure.dynamic_stage.verdict import motion_findings
+from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.report.page import Block, Column, Section, Text, table
 
 APART, SLACK, ALIKE, QUICK = 2.0, 0.05, 2.0, 1.0  # our choices; the last in seconds
@@ -107,7 +107,7 @@ def compare_methods(
     """
     require(inputs.unseen, "methods are ranked by motion that none has seen: give some with --validate", UsageError)
     if shared := overlaps(inputs.cases, inputs.unseen):
-        raise UsageError(f"{shared[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
+        raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     proofs = tuple(case for case in inputs.unseen if case.name not in repeated)
     inputs = replace(inputs, unseen=proofs or inputs.unseen)
@@ -144,7 +144,7 @@ def compare_methods(
 def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> list[str]:
     """Return what a user should know of a ranking, and why none is to be taken where none is."""
     repeated = repeated_motion(inputs.cases, inputs.unseen)
-    told = [*inputs.currents.notes, *motion_warnings({}, repeated, {})]
+    told = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
     told += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
         told.append("none to take: give motion that is no repeat with --validate")
