@@ -135,21 +135,15 @@ def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimit
         return _identified(chain, folder)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     terms = drives.standard([sets] * chain.n, V0, linear)
-    values, notes = None, []
+    known = {} if limits.friction is None else dict(zip(("velocity", "sign"), limits.friction))
+    values, notes = None, ()
     if chain.inertias is not None:
         check_bodies(chain, limits.torque)
-        known = {"velocity": 0, "sign": 1}
-        own = [
-            0.0 if limits.friction is None or one.shape not in known
-            else limits.friction[known[one.shape], one.acts[0][0]]
-            for one in terms
-        ]  # fmt: skip
+        own = [known[one.shape][one.acts[0][0]] if one.shape in known else 0.0 for one in terms]
         values = np.concatenate([standard_parameters(chain), own])
-    friction = limits.friction is not None
-    if values is not None and not friction:
-        notes.append("friction is not known (no model, no [friction]): torques are predicted without it")
-    model = IdentificationModel(bodies_of(chain), terms)
-    return _dynamics(model, values, None, friction, tuple(notes))
+        if not known:
+            notes = ("friction is not known (no model, no [friction]): torques are predicted without it",)
+    return _dynamics(IdentificationModel(bodies_of(chain), terms), values, bool(known), notes)
 
 
 def _identified(chain: Chain, folder: Path) -> ExcitedModel:
@@ -176,7 +170,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
         raise UsageError(f"{folder}: parameter {names[int(np.argmin(np.isfinite(values)))]} of the model is not finite")
     notes = [f"terms without slopes are left out of the predicted torque: {', '.join(left)}"] if left else []
     model = IdentificationModel(bodies, tuple(one for one, _ in kept))
-    made = _dynamics(model, values, None, any(one.shape == "sign" for one, _ in kept), ())
+    made = _dynamics(model, values, any(one.shape == "sign" for one, _ in kept))
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv does not fit the design's columns: the torque has no margin from it")
@@ -184,7 +178,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
 
 
 def _dynamics(
-    model: IdentificationModel, values: np.ndarray | None, covariance: np.ndarray | None, friction: bool, notes: tuple
+    model: IdentificationModel, values: np.ndarray | None, friction: bool, notes: tuple[str, ...] = ()
 ) -> ExcitedModel:
     smoothed = (
         replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
@@ -192,7 +186,7 @@ def _dynamics(
     smooth = replace(model, terms=tuple(smoothed))
     found = base_parameters.find(model)
     chosen = None if values is None else found.transform @ values
-    return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, covariance, friction, notes)
+    return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, None, friction, notes)
 
 
 def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:

@@ -259,7 +259,6 @@ def read_motion_limits(
     speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
     velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
     acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
-    acceleration = np.full(chain.n, np.inf) if acceleration is None else acceleration
     jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
     amounts = {key: value for key, value in own.items() if key not in MARGINS}
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
@@ -406,8 +405,8 @@ def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionCon
 def _per_joint(
     stated: Mapping[str, Any], where: str, chain: Chain, default: np.ndarray | None = None,
     quantities: tuple[str, str] = ("", ""),
-) -> Any:  # fmt: skip
-    """Return limits (n,) of a table with joints' names, q1 …, ``all`` and ``share``; the default without the table.
+) -> np.ndarray:  # fmt: skip
+    """Return limits (n,) of a table with joints' names, q1 …, ``all`` and ``share``; infinite where nothing is stated.
 
     Args:
         quantities: of a revolute joint's limit, and of a prismatic one's.
@@ -422,8 +421,7 @@ def _per_joint(
     share = number(stated.get("share", 1.0), f"{where}.share")
     if not 0 < share <= 1:
         raise UsageError(f"{where}.share: expected a share of the limits above 0 and up to 1, found {share:g}")
-    bounds = bounds * share
-    return None if default is None and not np.isfinite(bounds).any() else bounds
+    return bounds * share
 
 
 def _points(stated: Sequence[PointTable], chain: Chain, where: str) -> Points:

@@ -212,37 +212,25 @@ class _Predicted:
 
 
 def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> str:
-    """Return a line that holds what an excitation's folder predicted against what an identification states.
-
-    Raises:
-        UsageError: where the folder holds no prediction, or one of other parameters.
-    """
-    limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
-    rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
-    known = len(rms) == len(limits) and np.isfinite(rms / limits).all()
-    residual = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
-    return compared(folder, outcome.found.names, outcome.found.fitted.estimate.sigma, residual)
-
-
-def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, residual: float | None = None) -> str:
-    """Return a line that holds what an excitation predicted against what an identification states.
-
-    Args:
-        folder: that `calib excite` wrote.
-        names, sigmas: (b,) parameters of the estimate, and what it states of them.
-        residual: rms of its residuals as a share of the torque limits; None: not known.
+    """Return a line that compares the sigmas an excitation's folder predicted with those an identification states.
 
     Raises:
         UsageError: where the folder holds no prediction, or one of other parameters.
     """
     check_folder(folder)
     noise = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction.noise_share
-    stated = dict(zip(names, sigmas.tolist()))
     try:
         predicted = {row.name: row.sigma for row in read_rows(PredictedSigma, folder / NAME)}
     except ValueError as error:
         raise UsageError(f"{error}; give the folder that calib excite wrote") from error
+    limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
+    rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
+    known = len(rms) == len(limits) and np.isfinite(rms / limits).all()
+    residual = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
+    stated = dict(zip(outcome.found.names, outcome.found.fitted.estimate.sigma.tolist()))
     found = sigma_ratio(predicted, stated, residual=residual, assumed=noise)
     if found is None:
-        raise UsageError(f"{folder} predicts none of the {len(stated)} parameters identified: it is of another robot")
+        raise UsageError(
+            f"{folder} predicts none of the {len(stated)} parameters identified: it belongs to another robot"
+        )
     return sentence(found)

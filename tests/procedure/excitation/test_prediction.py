@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -82,5 +83,7 @@ def test_sigmas_go_with_the_noise(designed):
 def test_a_folder_without_a_prediction_is_refused(motion, outcome, tmp_path):
     with pytest.raises(UsageError, match=r"holds no prediction\.csv"):
         prediction.check_folder(tmp_path)
+    fitted = SimpleNamespace(estimate=SimpleNamespace(sigma=np.ones(2)))
+    other = replace(outcome, found=SimpleNamespace(names=["one", "two"], fitted=fitted))
     with pytest.raises(UsageError, match="none of the 2 parameters identified"):
-        prediction.compared(motion, ["one", "two"], np.ones(2))
+        prediction.compared_with_identification(motion, other)
