@@ -4,8 +4,8 @@ Shapes come from the URDF's ``<collision>``: boxes, spheres, cylinders, capsules
 choice: faster and on the safe side). A robot without shapes is made of capsules (`calib.robot.capsules`).
 
 Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that
-touch in nearly every posture (`calib.robot.obstacles.inseparable`, listed in `Collision.excluded`). A floor or an
-obstacle that a link never leaves is refused (`calib.robot.obstacles.check_reachable`).
+touch in nearly every posture (`calib.robot.capsules.inseparable`, listed in `Collision.excluded`). A floor or an
+obstacle that a link never leaves is refused (`calib.robot.capsules.check_reachable`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,14 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen, shaped
 from calib.errors import refuse_robot
-from calib.robot.capsules import TARGET_RADIUS, closing
+from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, check_reachable, closing, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
-from calib.robot.formats.markup import Node, parse, text
 from calib.robot.formats.readback import configurations, driven_joints
-from calib.robot.formats.urdf_tree import numbers, origin
+from calib.robot.formats.urdf_tree import Node, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
-from calib.robot.obstacles import SAMPLES, Obstacle, Wall, check_reachable, inseparable
 from calib.transforms import pose
 
 DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer shows

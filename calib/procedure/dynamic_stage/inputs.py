@@ -13,8 +13,7 @@ from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.filtering import SHARE
-from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
-from calib.data.signals.reference_files import with_reference
+from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample, with_reference
 from calib.data.signals.resampling import Resampled
 from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
 from calib.identification.gains import DriveGains

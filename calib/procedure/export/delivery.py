@@ -67,8 +67,8 @@ from calib.procedure.kinematic_stage.folder import (
 from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
-from calib.robot.formats.markup import text, with_comment
 from calib.robot.formats.origin_files import joint_origins
+from calib.robot.formats.urdf_tree import text, with_comment
 
 README, UR_KINEMATICS = "README.txt", "ur_kinematics.yaml"
 GEOMETRY, DYNAMICS = "geometry", "dynamics"

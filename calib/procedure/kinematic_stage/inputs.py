@@ -20,8 +20,8 @@ from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.description import remarks
-from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.formats.urdf_tree import text
 from calib.robot.load import load, resolve
 
 

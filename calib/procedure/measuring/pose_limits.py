@@ -34,9 +34,9 @@ from calib.procedure.measuring.constraints_file import (
     rising,
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
+from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.description import MAX_TURN, remarks
-from calib.robot.formats.markup import text
-from calib.robot.obstacles import Obstacle, Wall, signed_distance
+from calib.robot.formats.urdf_tree import text
 from calib.robot.tables import placement
 from calib.words import listing
 from poses import constraints

@@ -12,8 +12,8 @@ import numpy as np
 
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
-from calib.robot.obstacles import ALWAYS, SAMPLES
 from poses import constraints
 from poses.space import PoseConstraint, constraint_gradient
 

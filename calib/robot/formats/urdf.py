@@ -20,8 +20,7 @@ import numpy as np
 
 from calib.errors import RobotError, refuse_robot, require, suggestion
 from calib.robot.chain import AXES, Chain, Element
-from calib.robot.formats.markup import text
-from calib.robot.formats.urdf_tree import JointTag, Mimic, UrdfTree, transform_body
+from calib.robot.formats.urdf_tree import JointTag, Mimic, UrdfTree, text, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert, pose
 

@@ -25,9 +25,18 @@ from scipy.spatial.transform import Rotation
 from calib import files
 from calib.errors import RobotError, refuse_robot
 from calib.robot.chain import AXES, Chain, Element, Joint, random_joints
-from calib.robot.formats.markup import Node, edited, insert_child, parse, set_attributes, text
 from calib.robot.formats.urdf import drive, ends
-from calib.robot.formats.urdf_tree import UNLIMITED, JointTag, UrdfTree
+from calib.robot.formats.urdf_tree import (
+    UNLIMITED,
+    JointTag,
+    Node,
+    UrdfTree,
+    edited,
+    insert_child,
+    parse,
+    set_attributes,
+    text,
+)
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, moving_frames
 from calib.transforms import invert, pose, to_xyz_rpy
