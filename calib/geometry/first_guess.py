@@ -217,49 +217,28 @@ Guess = tuple[np.ndarray | None, np.ndarray]
 def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    """Place one target of a block, and its station where it is not placed yet; by the type of the measurements."""
+    """Place one target of a block, and its station where it is not placed yet; rooms register those of their kinds."""
+    arm = arm[rows]
+    if isinstance(block, Positions) and len(arm) < (least := 3 if isinstance(block, Poses) else 4):
+        refuse_data(
+            block.file,
+            f"{len(arm)} usable rows: placing the instrument and the target takes at least {least} different poses, "
+            "and a calibration some 20 or more; measure more poses",
+        )
+    if isinstance(block, Poses):
+        seen = from_quaternion(block.position[rows], block.quaternion[rows])
+        if station is not None:
+            return station, average_pose(invert(arm) @ invert(station) @ seen)
+        return place_pose(arm, seen) if tool is None else (average_pose(seen @ invert(arm @ tool)), tool)
+    if isinstance(block, Positions):
+        return _place_position(arm, block.position[rows], station, tool)
+    if isinstance(block, Sockets) and tool is None:
+        return None, pose(None, _place_sockets(arm, block.group[rows]))
     return None, np.eye(4) if tool is None else tool
 
 
-@guess.register
-def _guess_from_poses(
-    block: Poses, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
-) -> Guess:
-    _enough(block, rows, 3)
-    seen = from_quaternion(block.position[rows], block.quaternion[rows])
-    if station is not None:
-        return station, average_pose(invert(arm[rows]) @ invert(station) @ seen)
-    if tool is not None:
-        return average_pose(seen @ invert(arm[rows] @ tool)), tool
-    return place_pose(arm[rows], seen)
-
-
-@guess.register
-def _guess_from_positions(
-    block: Positions, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
-) -> Guess:
-    _enough(block, rows, 4)
-    return _place_position(arm[rows], block.position[rows], station, tool)
-
-
-@guess.register
-def _guess_from_sockets(
-    block: Sockets, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
-) -> Guess:
-    return None, pose(None, _place_sockets(arm[rows], block.group[rows])) if tool is None else tool
-
-
-def _enough(block: PoseMeasurements, rows: np.ndarray, needed: int) -> None:
-    if rows.sum() < needed:
-        refuse_data(
-            block.file,
-            f"{int(rows.sum())} usable rows: placing the instrument and the target takes at least {needed} different "
-            "poses, and a calibration some 20 or more; measure more poses",
-        )
-
-
 def _place_position(
-    arm: np.ndarray, seen: np.ndarray, station: np.ndarray | None = None, tool: np.ndarray | None = None
+    arm: np.ndarray, seen: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve y_i = S (R_i t + a_i) for S and t, linearly; given S or t, for the other.
 

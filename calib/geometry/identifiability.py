@@ -21,70 +21,51 @@ PLACES = {"station": "the placement of the instrument", "tool": "the mounting of
 
 def unidentified(found: GeometricFit) -> list[Finding]:
     """Return what a fit's poses could not identify: its rank first, then parameters, then placements."""
-    return [*_rank(found), *_merged(found), *_at_nominal(found), *_loose(found)]
+    if (split := found.split) is None:
+        return _loose(found)
+    values, rank = split.singular_values, split.rank
+    below = float(values[rank]) if rank < len(values) else None
+    known = {"rank": rank, "parameters": len(values), "tolerance": split.tolerance}
+    first = finding("rank", last=values[rank - 1], next=below, **known)
+    return [first, *_merged(found, split), *_at_nominal(found, split), *_loose(found)]
 
 
-def _rank(found: GeometricFit) -> list[Finding]:
-    split = found.split
-    if split is None:
-        return []
-    values = split.singular_values
-    below = float(values[split.rank]) if split.rank < len(values) else None
-    return [
-        finding(
-            "rank",
-            rank=split.rank,
-            parameters=len(values),
-            tolerance=split.tolerance,
-            last=values[split.rank - 1],
-            next=below,
-        )
-    ]
-
-
-def _merged(found: GeometricFit, max_named: int = 4) -> list[Finding]:
+def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list[Finding]:
     """Return the arm parameters that are linear combinations of others, by what they merge with.
 
     `max_named`: parameters by which families of merged ones are distinguished.
     """
-    split = found.split
-    if split is None:
-        return []
     table = layout(found.start)
-    families: dict[object, list[str]] = {}
-    kin: dict[object, dict[str, tuple[str, ...]]] = {}
+    families: dict[object, tuple[list[str], list[str]]] = {}
     for column, dropped in enumerate(split.dropped):
         if table.group(int(found.candidates[dropped])) != "arm":
             continue
-        key: object = None
+        key, into = None, list[str]()
         if dropped not in split.without_effect:
             weight = np.abs(split.coefficients[:, column])
             partners = found.candidates[split.kept[weight > 0.1 * weight.max()]]
             groups = {table.group(int(k)) for k in partners}
             arm = tuple(table.names[k] for k in partners if table.group(int(k)) == "arm")
             key = "station" in groups, "tool" in groups, arm[:max_named], len(arm)
-            frames = [PLACES[group] for group in PLACES if group in groups]
-            kin.setdefault(key, {"into": (*frames, *arm)})
-        families.setdefault(key, []).append(table.names[found.candidates[dropped]])
+            into = [*(PLACES[group] for group in PLACES if group in groups), *arm]
+        families.setdefault(key, (into, []))[1].append(table.names[found.candidates[dropped]])
     return [
-        finding("no-effect", names=names) if key is None else finding("merged", names=names, **kin[key])
-        for key, names in families.items()
+        finding("merged", names=names, into=into) if into else finding("no-effect", names=names)
+        for into, names in families.values()
     ]
 
 
-def _at_nominal(found: GeometricFit) -> list[Finding]:
+def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
     """Return arm parameters that are independent but identified no better than they are known beforehand."""
-    if found.split is None:
-        return []
     table = layout(found.start)
     if found.prior is not None:
         sigma = found.estimate.sigma
         loose = np.isfinite(found.prior) & (sigma > 0.7 * found.prior) & (found.free < table.arm)
-        held = tuple(table.names[k] for k in found.free[loose])
-        return [finding("near-prior", names=held)] if held else []
-    kept = found.candidates[found.split.kept]
-    left = tuple(table.names[k] for k in np.setdiff1d(kept, found.free) if k < table.arm)
-    return [finding("left-nominal", names=left)] if left else []
+        names, code = [table.names[k] for k in found.free[loose]], "near-prior"
+    else:
+        lost = np.setdiff1d(found.candidates[split.kept], found.free)
+        names, code = [table.names[k] for k in lost if k < table.arm], "left-nominal"
+    return [finding(code, names=names)] if names else []
 
 
 def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:
