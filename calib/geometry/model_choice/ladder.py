@@ -142,6 +142,11 @@ class ModelSelection:
     offered: tuple[Term, ...] = ()
     rigid_cross_validated: float | None = None
 
+    @property
+    def cross_validated(self) -> float:
+        """The error of the chosen model on held-out rows [m]: that of the last rung kept."""
+        return ([rung.cross_validated for rung in self.rungs if rung.kept] or [np.inf])[-1]
+
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
         """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
         if not self.rigid.cell.known.terms:

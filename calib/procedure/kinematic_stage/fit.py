@@ -182,7 +182,7 @@ def _found_of(
 ) -> Findings:  # fmt: skip
     """Return what a fit says of itself, whatever rows it has not seen; `notes` are findings on its residuals."""
     long = inputs.chain.stretched_length()
-    left = _cross_validated(found)
+    left = found.cross_validated
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
     blind = [finding("transfer-by-regions", stations=found.folds.blind)] if found.folds.blind else []
     return Findings(
@@ -198,11 +198,6 @@ def _found_of(
     )
 
 
-def _cross_validated(found: ModelSelection) -> float:
-    """Return the error of the chosen model on held-out rows [m]: that of the last rung kept."""
-    return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
-
-
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
     """Say that several files share one station where stations of their own explain them far better."""
     own = [block for block in blocks if block.has_instrument]
@@ -210,13 +205,9 @@ def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], se
         return []
     apart = [replace(block, station=f"{number}") for number, block in enumerate(own)]
     torques = [gravity_of(nominal.chain, block) for block in own]
-    before = _rms(nominal, own, torques)
+    before = errors(nominal, own, torques).rms
     placed = polish_frames(install(nominal.chain, apart, nominal.known), apart, settings, torques).cell
-    after = _rms(placed, apart, torques)
+    after = errors(placed, apart, torques).rms
     if before < MOVED * after:
         return []
     return [finding("instrument-moved", before=before, after=after, files=len(own))]
-
-
-def _rms(cell: Installation, blocks: Sequence[PoseMeasurements], torques: list[np.ndarray | None]) -> float:
-    return float(np.sqrt(np.mean(errors(cell, blocks, torques).main ** 2)))

@@ -52,7 +52,9 @@ def misfit(found: ModelSelection, reach: float) -> Finding | None:
     best = min(rung.cross_validated for rung in rigid)
     if min(best, _left(found.rigid)) <= FLOOR * reach:
         return None
-    return finding("rigid-misfit", rms=best, reach=reach, healthy=FLOOR * reach, left=_remains(found, reach))
+    return finding(
+        "rigid-misfit", rms=best, reach=reach, healthy=FLOOR * reach, left=found.cross_validated / (FLOOR * reach)
+    )
 
 
 def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
@@ -69,7 +71,7 @@ def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> F
     best = min(rung.cross_validated for rung in robust.rungs)
     return finding(
         "gross-rows", count=len({(row.file, row.row) for row in off}), rows=[row.words for row in off], loss=found.loss,
-        rms=best, left=_remains(found, reach),
+        rms=best, left=found.cross_validated / (FLOOR * reach),
     )  # fmt: skip
 
 
@@ -81,11 +83,6 @@ def _left(found: GeometricFit) -> float:
     if not sizes or rows <= used:
         return np.inf
     return float(np.sqrt(np.mean(np.concatenate(sizes) ** 2) * rows / (rows - used)))
-
-
-def _remains(found: ModelSelection, reach: float) -> float:
-    """Return what the chosen model leaves on held-out rows, over `FLOOR` of the reach."""
-    return ([rung.cross_validated for rung in found.rungs if rung.kept] or [np.inf])[-1] / (FLOOR * reach)
 
 
 MAX_TURN, MAX_SHIFT = 0.1, 0.03  # of a healthy arm's elements [rad], of the reach (our choice)
