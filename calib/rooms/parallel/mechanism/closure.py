@@ -20,7 +20,7 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen, shaped
-from calib.errors import NoPosture, refuse_robot
+from calib.errors import NoPosture
 from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links, pseudo_inverse, times
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 
@@ -87,21 +87,18 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     links = leg_links(robot, start)
     for leg, one in zip(robot.legs, links):
         if (apart := float(np.abs(one.gap).max())) > 1e3 * CLOSED:
-            refuse_robot(
-                f"robot '{robot.name}'",
+            robot.refuse(
                 f"the loop of {leg.name} does not close at the platform's home: its end stays "
-                f"{1e3 * apart:.3g} mm (or mrad) from its attachment; look at its home, base, attachment and lengths",
+                f"{1e3 * apart:.3g} mm (or mrad) from its attachment; look at its home, base, attachment and lengths"
             )
         if (rcond := float(_leg_rcond(one, one)[0])) < SINGULAR:
-            refuse_robot(f"robot '{robot.name}'", f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
+            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
     minors = tuple(_best_rows(one.jacobian[0]) for one in links)
     fixed = _check_freedom(robot, start, links)
     opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
     rows = _reading_rows(opened, links)
     if (rcond := float(_platform_rcond(opened, rows, rows)[0])) < SINGULAR:
-        refuse_robot(
-            f"robot '{robot.name}'", f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}"
-        )
+        robot.refuse(f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}")
     return ClosedRobot(robot, start, minors, frozen(_determinants(opened, links)[0]), fixed)
 
 
@@ -345,15 +342,13 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
         values = np.linalg.svd(np.concatenate(rows, axis=1)[0])
         left = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
         if left != robot.r:
-            refuse_robot(
-                f"robot '{robot.name}'",
+            robot.refuse(
                 f"its loops leave the platform {left} freedoms, but freedom names {robot.r} "
-                f"({', '.join(robot.freedom)}); the motions left are {_motions(values[2][6 - left :])}",
+                f"({', '.join(robot.freedom)}); the motions left are {_motions(values[2][6 - left :])}"
             )
         if np.linalg.cond(values[2][6 - left :, robot.selected]) > 1e8:
-            refuse_robot(
-                f"robot '{robot.name}'",
-                f"the platform can move in {_motions(values[2][6 - left :])}; freedom names {', '.join(robot.freedom)}",
+            robot.refuse(
+                f"the platform can move in {_motions(values[2][6 - left :])}; freedom names {', '.join(robot.freedom)}"
             )
         fixed = fixed and float(np.abs(np.concatenate(rows, axis=1)[0] @ named).max()) < 1e-9
         if trial == 3:

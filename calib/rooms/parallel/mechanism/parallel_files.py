@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
+from calib.arrays import frozen
 from calib.config_types import shown
 from calib.errors import refuse_robot, suggestion
 from calib.robot import mdh
@@ -90,7 +91,7 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
         home=placement(own.get("home", {}), f"{place}, home"),
         lower=_box(own, "lower", freedom, place),
         upper=_box(own, "upper", freedom, place),
-        platform=vector(own["inertia"], 10, f"{place}, inertia") if "inertia" in own else None,
+        platform=frozen(vector(own["inertia"], 10, f"{place}, inertia")) if "inertia" in own else None,
         gravity=gravity,
     )
 

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NoReturn
 
 import numpy as np
 
-from calib.arrays import frozen
-from calib.errors import RobotError, refuse_robot
+from calib.arrays import Frozen
+from calib.errors import refuse_robot
 from calib.robot.chain import GRAVITY, Chain, Joint
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
@@ -24,7 +25,7 @@ ENDS = ("rigid", "spherical")
 
 
 @dataclass(frozen=True, eq=False)
-class Leg:
+class Leg(Frozen):
     """One serial chain from the base to the platform.
 
     Attributes:
@@ -45,18 +46,18 @@ class Leg:
     end: str = "rigid"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        place, n = f"leg '{self.name}'", self.chain.n
         if self.end not in ENDS:
-            raise RobotError(f"leg '{self.name}': its end '{self.end}' is neither {' nor '.join(ENDS)}")
-        home = np.atleast_1d(np.asarray(self.home, dtype=float))
-        if home.shape != (self.chain.n,):
-            raise RobotError(f"leg '{self.name}': home has {home.size} values for its {self.chain.n} joints")
-        if self.chain.n > self.held:
-            raise RobotError(
-                f"leg '{self.name}': {self.chain.n} joints behind a {self.end} end leave motions that no loop "
-                f"determines; at most {self.held} can be solved for"
+            refuse_robot(place, f"its end '{self.end}' is neither {' nor '.join(ENDS)}")
+        if self.home.shape != (n,):
+            refuse_robot(place, f"home has {self.home.size} values for its {n} joints")
+        if n > self.held:
+            refuse_robot(
+                place,
+                f"{n} joints behind a {self.end} end leave motions that no loop determines; at most {self.held} can be "
+                "solved for",
             )
-        object.__setattr__(self, "home", frozen(home))
-        object.__setattr__(self, "attachment", frozen(self.attachment))
 
     @property
     def held(self) -> int:
@@ -70,7 +71,7 @@ class Leg:
 
 
 @dataclass(frozen=True, eq=False)
-class ParallelRobot:
+class ParallelRobot(Frozen):
     """Legs and the platform they hold.
 
     Attributes:
@@ -96,31 +97,27 @@ class ParallelRobot:
     links = ()  # names of a URDF's, which there is none of
 
     def __post_init__(self) -> None:
-        for key in ("home", "lower", "upper", "gravity"):
-            object.__setattr__(self, key, frozen(getattr(self, key)))
-        if self.platform is not None:
-            object.__setattr__(self, "platform", frozen(self.platform))
+        super().__post_init__()
+        freedom = ", ".join(self.freedom)
         names = [leg.name for leg in self.legs]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            refuse_robot(f"robot '{self.name}'", f"two legs are called '{twice[0]}'")
-        unknown = [name for name in self.freedom if name not in COORDINATES]
-        if unknown or not self.freedom or len(set(self.freedom)) < len(self.freedom):
-            refuse_robot(
-                f"robot '{self.name}'",
-                f"freedom {', '.join(self.freedom) or 'is empty'}; it names the platform's "
-                f"independent coordinates, each once, of {', '.join(COORDINATES)}",
+            self.refuse(f"two legs are called '{twice[0]}'")
+        if not freedom or not set(self.freedom) <= set(COORDINATES) or len(set(self.freedom)) < self.r:
+            self.refuse(
+                f"freedom {freedom or 'is empty'}; it names the platform's independent coordinates, each once, of "
+                f"{', '.join(COORDINATES)}"
             )
         if self.n < self.r:
-            refuse_robot(
-                f"robot '{self.name}'",
-                f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({', '.join(self.freedom)})",
-            )
+            self.refuse(f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({freedom})")
         if self.lower.shape != (self.r,) or self.upper.shape != (self.r,) or not (self.lower < self.upper).all():
-            refuse_robot(
-                f"robot '{self.name}'",
-                "the platform's limits need one lower and one higher upper value per coordinate "
-                f"({', '.join(self.freedom)}); found {self.lower.tolist()} and {self.upper.tolist()}",
+            self.refuse(
+                f"the platform's limits need one lower and one higher upper value per coordinate ({freedom}); found "
+                f"{self.lower.tolist()} and {self.upper.tolist()}"
             )
+
+    def refuse(self, words: str) -> NoReturn:
+        """Refuse the robot for what `words` say of it."""
+        refuse_robot(f"robot '{self.name}'", words)
 
     @property
     def r(self) -> int:
