@@ -177,9 +177,9 @@ class ParallelExcitation(ExcitationDesign):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        torque, acceleration = self.peaks
+        torque, acceleration = (peaks.tolist() for peaks in self.peaks)
         own = {"robot": self.robot.chain.name, "peak_torque": torque, "peak_acceleration": acceleration}
-        return super().to_dict() | {key: own[key] if key == "robot" else own[key].tolist() for key in own}
+        return super().to_dict() | own
 
     def __repr__(self) -> str:
         return f"<ParallelExcitation for {self.robot.chain.name}: {self.period:g} s>"

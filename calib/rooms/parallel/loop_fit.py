@@ -25,16 +25,7 @@ from calib.api.rendering import Judged, data_frame
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
-from calib.errors import (
-    CalibError,
-    MeasurementError,
-    NoPosture,
-    UsageError,
-    finding,
-    refuse_data,
-    refuse_option,
-    suggestion,
-)
+from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, finding, refuse_option, suggestion
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
 from calib.folders import METRICS, check_target, write_staged
@@ -62,21 +53,6 @@ FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE)
 HEADER = ("name", "unit", "value", "sigma")
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Encoder readings (m, n), with platform coordinates (m, r) or None."""
-
-    readings: np.ndarray
-    coordinates: np.ndarray | None
-
-    def __len__(self) -> int:
-        return len(self.readings)
-
-    def part(self, rows: np.ndarray) -> _Rows:
-        """Return some of the rows."""
-        return _Rows(self.readings[rows], None if self.coordinates is None else self.coordinates[rows])
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ParallelFit(Judged):
     """A geometric calibration and its files.
@@ -84,7 +60,7 @@ class ParallelFit(Judged):
     Attributes:
         nominal: the robot before.
         files: that were read.
-        rows: that were fitted.
+        rows: (m, n) encoder readings that were fitted, or (m, n + r) with the platform's coordinates behind them.
         found: the calibration.
         own: errors on the fitted rows, nominal and calibrated (2, m, k): platform coordinates; or what encoders
             contradict each other by.
@@ -94,7 +70,7 @@ class ParallelFit(Judged):
 
     nominal: ParallelMechanism
     files: tuple[Path, ...]
-    rows: _Rows
+    rows: np.ndarray
     found: LoopFit
     own: np.ndarray
     unseen: Mapping[str, np.ndarray]
@@ -115,8 +91,8 @@ class ParallelFit(Judged):
         """Pass, marginal or fail, with the reason: by the rules of the module, whose limits are the catalogue's."""
         kinds = {"contradictions": (np.ones(self.own.shape[2], dtype=bool), "mrad (or mm)")}
         figures, rules = [], [finding("readings-alone")]
-        if self.rows.coordinates is not None:
-            places = _positions(self.nominal.chain)
+        if self.measured:
+            places = self.nominal.chain.selected < 3
             kinds, rules = {"position": (places, "mm"), "orientation": (~places, "mrad")}, []
         for (where, errors), (kind, (columns, unit)) in product(self.unseen.items(), kinds.items()):
             if not columns.any():
@@ -134,9 +110,14 @@ class ParallelFit(Judged):
         return Verdict.of("; ".join(figures), rules if figures else [finding("no-unseen-poses")])
 
     @property
+    def measured(self) -> bool:
+        """Whether the platform was."""
+        return self.rows.shape[1] > self.nominal.chain.n
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """What the errors are of."""
-        if self.rows.coordinates is not None:
+        if self.measured:
             return self.nominal.chain.freedom
         return tuple(f"contradiction {k + 1}" for k in range(self.own.shape[2]))
 
@@ -176,11 +157,10 @@ class ParallelFit(Judged):
             key: dict(zip(self.columns, row.tolist()))
             for key, row in zip(("nominal", "calibrated"), np.sqrt(np.mean(both**2, axis=1)))
         }
-        platform = self.rows.coordinates is not None
         return {
             "robot": self.nominal.chain.name, "parameters": len(found.parameters), "not_told": list(found.vague),
             "reading_rms": {"nominal": found.before, "calibrated": found.after},
-            "platform_rms": errors if platform else None, "contradiction_rms": None if platform else errors,
+            "platform_rms": errors if self.measured else None, "contradiction_rms": None if self.measured else errors,
             "judged_on": ", ".join(self.judged), "iterations": found.iterations,
             "verdict": {"level": verdict.level, "reason": verdict.reason},
         }  # fmt: skip
@@ -246,15 +226,15 @@ def fit_parallel(
     held = _held(known, settings, options or FitOptions())
     rows = _stacked([read_rows(path, known.robot) for path in measured], measured)
     unseen = _read_unseen(known.robot, rows, validate)
-    if settings.tolerance is not None and (rows.coordinates is None or not _positions(known.robot).any()):
+    if settings.tolerance is not None and not (rows.shape[1] > known.robot.n and (known.robot.selected < 3).any()):
         raise UsageError("a tolerance is of the platform's position, and none was measured")
     if settings.holdout:
         order = np.random.default_rng(settings.seed).permutation(len(rows))
         kept = len(rows) - round(settings.holdout * len(rows))
-        unseen["held out, unseen"], rows = rows.part(order[kept:]), rows.part(order[:kept])
+        unseen["held out, unseen"], rows = rows[order[kept:]], rows[order[:kept]]
     say("fitting")
     try:
-        found = fit_loops(known, rows.readings, rows.coordinates, held=held)
+        found = fit_loops(known, *_parts(known, rows), held=held)
         say("judging")
         proofs = {name: _errors(known, found.known, own) for name, own in unseen.items() if len(own)}
         own = _errors(known, found.known, rows)
@@ -271,19 +251,22 @@ def _paths(measured: Sequence[object]) -> tuple[Path, ...]:
     raise UsageError("a parallel robot's measurements are CSV files (calib formats parallel), not values in memory")
 
 
-def read_rows(path: Path, robot: ParallelRobot) -> _Rows:
-    """Return readings (m, n) and platform coordinates (m, r), None where the file has no such columns.
+def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
+    """Return readings (m, n), and behind them the platform's coordinates (m, n + r) where the file has such columns.
 
     Raises:
-        MeasurementError: naming the column that is missing, and which there are.
+        MeasurementError: naming the column that is missing, and which there are; or one that is not known.
     """
     table = read_table(path)
     readings = [table.numbers(joint.name, "angle" if joint.kind == "revolute" else "length") for joint in robot.joints]
-    present = [name for name in robot.freedom if name in table]
-    _refuse_others(table, robot, path)
-    if not present:
-        return _Rows(np.column_stack(readings), None)
-    return _Rows(np.column_stack(readings), read_coordinates(table, robot))
+    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
+    for name in table.header:
+        if name in passive:
+            table.fail("is of a passive joint, whose encoder the fit does not know yet; leave it out", name)
+        if name in COORDINATES and name not in robot.freedom:
+            table.fail(f"is none of the platform's coordinates ({', '.join(robot.freedom)}); leave it out", name)
+    measured = any(name in table for name in robot.freedom)
+    return np.column_stack([*readings, *(read_coordinates(table, robot).T if measured else ())])
 
 
 def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
@@ -307,63 +290,49 @@ def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tup
     return options.fix
 
 
-def _refuse_others(table: Table, robot: ParallelRobot, path: Path) -> None:
-    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
-    for name in table.header:
-        if name in passive:
-            refuse_data(
-                path, f"column '{name}' is of a passive joint, whose encoder the fit does not know yet; leave it out"
-            )
-        if name in COORDINATES and name not in robot.freedom:
-            refuse_data(
-                path,
-                f"column '{name}' is none of the platform's coordinates ({', '.join(robot.freedom)}); leave it out",
-            )
+def _stacked(parts: Sequence[np.ndarray], paths: Sequence[Path]) -> np.ndarray:
+    bare = min(range(len(parts)), key=lambda k: parts[k].shape[1])
+    if any(own.shape[1] > parts[bare].shape[1] for own in parts):
+        raise UsageError(f"{paths[bare]} has no platform coordinates, other files have: fit them apart")
+    return np.concatenate(parts)
 
 
-def _stacked(parts: Sequence[_Rows], paths: Sequence[Path]) -> _Rows:
-    with_poses = [own.coordinates is not None for own in parts]
-    if any(with_poses) != all(with_poses):
-        bare = paths[with_poses.index(False)]
-        raise UsageError(f"{bare} has no platform coordinates, other files have: fit them apart")
-    readings = np.concatenate([own.readings for own in parts])
-    coordinates = [own.coordinates for own in parts if own.coordinates is not None]
-    return _Rows(readings, np.concatenate(coordinates) if coordinates else None)
-
-
-def _read_unseen(robot: ParallelRobot, rows: _Rows, paths: Sequence[Path]) -> dict[str, _Rows]:
+def _read_unseen(robot: ParallelRobot, rows: np.ndarray, paths: Sequence[Path]) -> dict[str, np.ndarray]:
     """Return the rows of unseen files by name, of the same columns as those that are fitted."""
     unseen = {f"{path.name}, unseen": read_rows(path, robot) for path in paths}
     for name, own in unseen.items():
-        if (own.coordinates is None) != (rows.coordinates is None):
+        if own.shape[1] != rows.shape[1]:
             refuse_option(name, "platform coordinates are in it or in the fitted files, not in both")
     return unseen
 
 
-def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: _Rows) -> np.ndarray:
+def _parts(known: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the readings (m, n) of rows, and the platform's coordinates (m, r) or None."""
+    n = known.robot.n
+    return rows[:, :n], rows[:, n:] if rows.shape[1] > n else None
+
+
+def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> np.ndarray:
     """Return the errors of both robots (2, m, k): platform coordinates, or the encoders' contradictions."""
-    if rows.coordinates is None:
-        return np.array([contradictions(known, rows.readings) for known in (nominal, calibrated)])
-    return np.array([platform_errors(known, rows.readings, rows.coordinates) for known in (nominal, calibrated)])
+    readings, coordinates = _parts(nominal, rows)
+    if coordinates is None:
+        return np.array([contradictions(known, readings) for known in (nominal, calibrated)])
+    return np.array([platform_errors(known, readings, coordinates) for known in (nominal, calibrated)])
 
 
-def _cross_validated(known: ClosedRobot, rows: _Rows, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
+def _cross_validated(known: ClosedRobot, rows: np.ndarray, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
     """Return errors of all rows, each by a fit that has not seen it; nothing where a fold cannot be fitted."""
     folds_wanted = 4  # of the rows, where none are unseen
     folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), folds_wanted)
     found = []
     for k, own in enumerate(folds):
-        rest = rows.part(np.concatenate(folds[:k] + folds[k + 1 :]))
+        rest = rows[np.concatenate(folds[:k] + folds[k + 1 :])]
         try:
-            fitted = fit_loops(known, rest.readings, rest.coordinates, held=held)
-            found.append(_errors(known, fitted.known, rows.part(own)))
+            fitted = fit_loops(known, *_parts(known, rest), held=held)
+            found.append(_errors(known, fitted.known, rows[own]))
         except CalibError:
             return {}
     return {"left out": np.concatenate(found, axis=1)}
-
-
-def _positions(robot: ParallelRobot) -> np.ndarray:
-    return robot.selected < 3
 
 
 def _rms(errors: np.ndarray) -> float:

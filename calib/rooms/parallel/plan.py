@@ -167,7 +167,7 @@ def _read_waypoints(path: Path | np.ndarray, known: ClosedRobot) -> np.ndarray:
         refuse_data(path, f"neither the platform's coordinates ({', '.join(known.robot.freedom)}) nor the actuators "
             f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}")  # fmt: skip
     try:
-        return coordinates_of(known, known.locate(read_rows(path, known.robot).readings))
+        return coordinates_of(known, known.locate(read_rows(path, known.robot)[:, : known.robot.n]))
     except NoPosture as error:
         raise MeasurementError(f"waypoint out of reach: {error}", path) from error
 
