@@ -34,16 +34,16 @@ class SampledMotion:
     v: np.ndarray
     a: np.ndarray
     jerk: np.ndarray
-    _told: dict[Callable, np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    _evaluated: dict[Callable, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def told(self, regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    def evaluated(self, regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
         """Return regressor(q, v, a), evaluated once: objectives and torque limits have one in common."""
-        if regressor not in self._told:
-            self._told[regressor] = regressor(self.q, self.v, self.a)
-        return self._told[regressor]
+        if regressor not in self._evaluated:
+            self._evaluated[regressor] = regressor(self.q, self.v, self.a)
+        return self._evaluated[regressor]
 
     @property
     def orders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

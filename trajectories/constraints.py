@@ -160,7 +160,7 @@ class TorqueLimit:
         return np.tile(np.arange(len(self.joints)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
-        Y = motion.told(self.regressor)
+        Y = motion.evaluated(self.regressor)
         torque, bound = (Y @ self.parameters)[:, self.joints], (1 - self.margin) * self.limits[self.joints]
         if self.covariance is not None:
             Y = Y[:, self.joints]

@@ -58,12 +58,12 @@ class Fourier:
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
         """Return variables of a random motion about a centre (n,); amplitudes (n,) spread over the harmonics as 1/k."""
-        drawn = []
+        coefficients = []
         for count, middle, size in zip(self.harmonics, centre, amplitude):
             fall = 1.0 / np.arange(1, count + 1)
             fall = fall / max(np.sqrt((fall**2).sum()), 1.0)
-            drawn.append(np.concatenate([[middle], size * np.tile(fall, 2) * rng.normal(size=2 * count)]))
-        return self.variables(drawn)
+            coefficients.append(np.concatenate([[middle], size * np.tile(fall, 2) * rng.normal(size=2 * count)]))
+        return self.variables(coefficients)
 
 
 def fourier_family(

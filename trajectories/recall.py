@@ -79,17 +79,17 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
         raise BadInput("recording or reference hold values that are no numbers: cut them out before")
     if len(q) < len(r):
         raise BadInput(f"the recording has {len(q)} samples, one period of the motion {len(r)}: it is not all there")
-    alike = _likeness(q, r)
-    best = int(alike.argmax())
-    if alike[best] < likeness:
+    similarity = _likeness(q, r)
+    best = int(similarity.argmax())
+    if similarity[best] < likeness:
         raise BadInput(
             f"the motion is not in the recording: the nearest {len(r)} samples begin at {best} and explain "
-            f"{max(alike[best], 0.0):.0%} of its variance; check the rate, the order of the joints and their units"
+            f"{max(similarity[best], 0.0):.0%} of its variance; check the rate, the order of the joints and their units"
         )
-    chain = [k for k in range(best % len(r), len(alike), len(r)) if alike[k] >= likeness]
+    chain = [k for k in range(best % len(r), len(similarity), len(r)) if similarity[k] >= likeness]
     run = _run_with(chain, best, len(r))[skip:]
     require(run, f"fewer than {skip + 1} whole periods of the motion are in the recording")
-    return Recalled(run[0], len(r), len(run), tuple(float(alike[k]) for k in run), _lag(alike, best))
+    return Recalled(run[0], len(r), len(run), tuple(float(similarity[k]) for k in run), _lag(similarity, best))
 
 
 def average(values: np.ndarray, found: Recalled) -> Averaged:
@@ -126,10 +126,10 @@ def _run_with(places: list[int], best: int, period: int) -> list[int]:
     return places[first : last + 1]
 
 
-def _lag(alike: np.ndarray, best: int) -> float:
+def _lag(similarity: np.ndarray, best: int) -> float:
     """Return where the parabola through the best match and its neighbours peaks, relative to it."""
-    if not 0 < best < len(alike) - 1:
+    if not 0 < best < len(similarity) - 1:
         return 0.0
-    before, here, after = alike[best - 1 : best + 2]
+    before, here, after = similarity[best - 1 : best + 2]
     bend = before - 2 * here + after
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))

@@ -84,11 +84,11 @@ class PoseSelection(selection.Chosen):
         look = self.outlook
         curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]
         own = (float(look.poses.poses), 1e3 * look.poses.rms)
-        drawn = {
+        charts = {
             "predicted": lambda: predicted_map(look.poses.points, look.poses.spread),
             "outlook": lambda: outlook_figure(curve, own, "poses", "σ of the tool's position [mm]"),
         }
-        return {name: figure(drawn[name]()) for name in self.figures}
+        return {name: figure(charts[name]()) for name in self.figures}
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""

@@ -30,7 +30,7 @@ def listed(given: object | Sequence[object]) -> list:
 
 
 def optional(given: Any) -> Any:
-    """Return a text as the path it is, and any other value, None included, as it is."""
+    """Return a text as a path, and any other value unchanged."""
     return Path(given) if isinstance(given, str) else given
 
 
@@ -88,7 +88,7 @@ class Judged(ABC):
         return as_text(self.renderables())
 
     def page(self) -> Page:
-        """Return the section as a page of its own."""
+        """Return the section as a page with a title."""
         from calib.procedure.report import certificate
 
         return certificate.certificate(repr(self).strip("<>"), "", (), [self.section()])

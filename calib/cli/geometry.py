@@ -111,8 +111,8 @@ def select(
     if run:
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
-    if told := selection.beside_poses(out, plots, chosen):
-        say(f"predictions: {', '.join(str(path) for path in told.values())}")
+    if predictions := selection.beside_poses(out, plots, chosen):
+        say(f"predictions: {', '.join(str(path) for path in predictions.values())}")
     say(f"{m} poses written to {out}")
 
 

@@ -1,7 +1,4 @@
-"""What several commands share: arguments, the console, progress, lists of numbers.
-
-Check where a verb's results go, before any work is done, for serial arms and other robots alike.
-"""
+"""What several commands share: arguments, the console, progress, lists of numbers, checks of the output folder."""
 
 import os
 import re

@@ -122,7 +122,7 @@ class Evaluation:
 
     @property
     def regressor(self) -> np.ndarray:
-        return self.sampled.told(self.problem.regressor)
+        return self.sampled.evaluated(self.problem.regressor)
 
     @property
     def values(self) -> np.ndarray:

@@ -127,11 +127,11 @@ def one_start(
         evaluations: most, if all of `STAGES` are gone through.
         stages: those to go through; a given start is not led away by a coarse one.
     """
-    began, drawn = time.perf_counter(), isinstance(start, int | np.integer)
-    chosen = stages if drawn else tuple(stage for stage in stages if not stage.coarse)
+    began, random = time.perf_counter(), isinstance(start, int | np.integer)
+    chosen = stages if random else tuple(stage for stage in stages if not stage.coarse)
     extra = problem.extra
     run = StartSearch(*_at_stage(problem, chosen[0], extra))
-    if drawn:
+    if random:
         y = random_start(run.problem, run.basis, np.random.default_rng([seed, int(start)]))
     else:
         y = np.asarray(start, dtype=float)
@@ -162,7 +162,7 @@ def one_start(
     if run.problem.family is not problem.family:  # interrupted before the whole family was looked at
         run, y = run.continued(run.reached(y), problem, problem.basis())
         run.repaired(y)
-    return run.result(y, time.perf_counter() - began, int(start) if drawn else -1)
+    return run.result(y, time.perf_counter() - began, int(start) if random else -1)
 
 
 def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
@@ -231,11 +231,11 @@ class StartSearch:
         factor = float(best[p]) if self.problem.free_period else stretch[0]
         if self.best is None:
             return Stuck(best[:p], factor, self.least, self.count, self.reason)
-        told = list[int]()  # fewer samples may have promised more
+        records = list[int]()  # fewer samples may have promised more
         for k, value in enumerate(self.history):
-            if value >= self.merit and (not told or value < self.history[told[-1]]):
-                told.append(k)
-        history, times = tuple(self.history[k] for k in told), tuple(self.times[k] for k in told)
+            if value >= self.merit and (not records or value < self.history[records[-1]]):
+                records.append(k)
+        history, times = tuple(self.history[k] for k in records), tuple(self.times[k] for k in records)
         return SearchResult(
             best[:p], factor, self.merit, self.values, history, self.count, self.kept / self.count, seconds, seed,
             self.interrupted, times,

@@ -164,7 +164,7 @@ class _DesignSetting:
 
 @dataclass(frozen=True)
 class _LimitMargin:
-    """What is left of a limit, as a share of its scale."""
+    """Margin to a limit, as a share of the limit."""
 
     share: float
 
@@ -220,7 +220,7 @@ class Designed:
 
     @property
     def period(self) -> float:
-        """Of the motion found [s]."""
+        """The motion's period [s]."""
         return self.family.period * self.found.factor
 
     @property
@@ -273,10 +273,10 @@ def search_motion(
     check_playback(settings, given)
     problem, checked, notes = _excitation_problem(given, settings)
     condition = _condition_objective(given, settings)
-    wanted = read_goals(settings, given, condition)
+    named_goals = read_goals(settings, given, condition)
     report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
     search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
-    found, problem = _searched(problem, wanted, settings.starts, search, say)
+    found, problem = _searched(problem, named_goals, settings.starts, search, say)
     say("verifying")
     found, problem = _whole(found, problem, settings.rate)
     with finishing():
@@ -284,7 +284,7 @@ def search_motion(
     front = None
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
-            front = _front(problem, given, found, wanted, settings.front, report)
+            front = _front(problem, given, found, named_goals, settings.front, report)
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
@@ -294,7 +294,7 @@ def search_motion(
         outlook, predicted = foretell(given, settings, problem, found, partial(_problem_of_period, given, settings))
     pairs = zip(problem.goals, found.values)
     reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
-    cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
+    cut = ("interrupted before any motion met the goals",) if named_goals and not problem.goals else ()
     return Designed(
         given, settings, problem, found, proof, condition_found,
         reached, front, played,
@@ -348,13 +348,13 @@ def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) 
 
 
 def _searched(
-    problem: ExcitationProblem, wanted: list[NamedGoal], starts: int, search: Search, say: Progress
+    problem: ExcitationProblem, named_goals: list[NamedGoal], starts: int, search: Search, say: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
     """Search without goals, or for the goals: with a first run that proposes some for the condition numbers."""
-    if not wanted:
+    if not named_goals:
         return search(problem, starts=starts), problem
-    goals = tuple(one.goal for one in wanted)
-    if set(SCALINGS) & {one.name for one in wanted}:
+    goals = tuple(one.goal for one in named_goals)
+    if set(SCALINGS) & {one.name for one in named_goals}:
         problem = replace(problem, goals=goals)
         return search(problem, starts=starts), problem
     first = search(problem, starts=starts)
@@ -372,7 +372,7 @@ def _searched(
 
 
 def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
-    """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign.
+    """Return the condition numbers of `INSTANTS` samples over the period, Coulomb friction not smoothed.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
     """
@@ -437,12 +437,12 @@ def _front(
     problem: ExcitationProblem,
     given: ExcitationInputs,
     found: SearchResult,
-    wanted: list[NamedGoal],
+    named_goals: list[NamedGoal],
     count: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
     """Sweep the first torque goal (default: the wrist) between what this motion has and what it can reach alone."""
-    goals = (one.goal.objective for one in wanted)
+    goals = (one.goal.objective for one in named_goals)
     slack = next((one for one in goals if isinstance(one, TorqueSlack)), None)
     slack = slack or torque_slack(wrist(given.chain.n), given, "front")
     motion = problem.basis().motion(found.x)

@@ -161,7 +161,7 @@ def _seconds(track: Setpoints | None) -> float | None:
 
 
 def design_lines(designed: Designed) -> list[str]:
-    """Return what a person wants to read at the end."""
+    """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
     found, cond = designed.found, designed.condition
     columns, prior = len(designed.inputs.columns.names), designed.inputs.prior
     together = [] if prior is None else [
@@ -170,7 +170,7 @@ def design_lines(designed: Designed) -> list[str]:
         f"{cond.raw_alone:.4g} and {cond.normalised_alone:.4g}"
     ]  # fmt: skip
     result = [
-        *(["interrupted: this is the best motion found until then"] if found.interrupted else []),
+        *(["interrupted: this is the best motion so far"] if found.interrupted else []),
         f"condition number of {columns} columns: {cond.raw:.4g} raw, {cond.normalised:.4g} normalised "
         f"({designed.settings.family}, period {designed.period:g} s)",
         *together,
@@ -213,7 +213,7 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
 
 
 def plan_lines(planned: Planned) -> list[str]:
-    """Return what a person wants to read at the end."""
+    """Return the lines that `calib plan` prints: duration, margins, limits, notes."""
     words = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; some limit is within {ACTIVE:.0%} of being "
         f"reached for {_active_share(planned):.1%} of the time, none is crossed at "
@@ -226,15 +226,15 @@ def plan_lines(planned: Planned) -> list[str]:
         free = ", ".join(f"{x:.3g}" for x in planned.sigma)
         words.append(f"limits of torque narrowed for the model's uncertainty, one sigma of each joint: {free} N m")
     if planned.shaped is not None:
-        words.append(f"the path's own shape: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
+        words.append(f"path shape optimised: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
     if planned.deviation is not None:
-        words.append(f"the tool keeps its lines to {1e6 * planned.deviation[0]:.2g} µm")
+        words.append(f"the tool stays on its straight lines to {1e6 * planned.deviation[0]:.2g} µm")
     return [*words, *planned.bounds.lines(), *(f"note: {note}" for note in planned.notes)]
 
 
 @dataclass(frozen=True)
 class _PlanMargin:
-    """What is left of a limit at the joint nearest to it, and each joint's share that is left."""
+    """Margin to a limit: of the joint nearest to it, and of each joint as a share."""
 
     margin: float
     unit: str

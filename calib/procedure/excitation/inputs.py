@@ -1,4 +1,4 @@
-"""What an excitation starts from: a robot's model and limits, joints that rest, and motions that count already."""
+"""Inputs of an excitation: a robot's model and limits, locked joints, and earlier motions that count."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures
 
 @dataclass(frozen=True, eq=False)
 class ExcitedModel:
-    """A model to excite, and the best there is to predict torques with.
+    """The dynamic model to excite, and its parameters as far as they are known, which predict torques.
 
     Attributes:
         smooth: base model with the Coulomb sign smoothed for the search; `exact` with the model's own smoothing.
@@ -168,7 +168,11 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     if not np.isfinite(values).all():
         names = [*bodies.names, *(one.name for one, _ in kept)]
         raise UsageError(f"{folder}: parameter {names[int(np.argmin(np.isfinite(values)))]} of the model is not finite")
-    notes = [f"terms without slopes are left out of the predicted torque: {', '.join(left)}"] if left else []
+    notes = (
+        [f"friction terms that cannot be differentiated are not in the predicted torque: {', '.join(left)}"]
+        if left
+        else []
+    )
     model = IdentificationModel(bodies, tuple(one for one, _ in kept))
     made = _dynamics(model, values, any(one.shape == "sign" for one, _ in kept))
     covariance = _covariance(folder, made.exact.names)
@@ -239,7 +243,7 @@ def identifiable(
     still = ", ".join(chain.joint_names[j] for j in locked)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
-        f"held: {still}; a held joint's torque is stiction in part and is left out; {len(kept)} of {len(names)} "
+        f"held: {still}; torques of held joints are left out (stiction); {len(kept)} of {len(names)} "
         f"columns are identifiable ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
         f"{', ...' if len(gone) > 12 else ''})"
     )

@@ -55,7 +55,7 @@ MAX_ACCELERATION = 3000.0  # [rad/s² or m/s²] direct drives of fast parallel r
 MAX_TORQUE = 1e5  # [N m or N] (our choice)
 MAX_EXCESS = 0.01  # of a limit, by which a written sample may be beyond it: rounding to whole samples
 DEFAULT_RISE = 2.0  # [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
-DEFAULT_ORIGIN = f"default, {DEFAULT_RISE:g}/s times the speed limit: none is stated"
+DEFAULT_ORIGIN = f"default, {DEFAULT_RISE:g}/s times the speed limit, since none is stated"
 PLACE = "in the limits file (--limits, or [dynamics] limits in session.toml)"
 
 
@@ -112,12 +112,12 @@ class MotionBounds:
         for order, (kind, most) in enumerate(
             (("velocity", MAX_SPEED), ("acceleration", MAX_ACCELERATION), ("torque", MAX_TORQUE)), 1
         ):
-            alike: dict[str, list[Joint]] = {}
+            by_size: dict[str, list[Joint]] = {}
             for joint, size in zip(self.joints, getattr(self, kind)):
                 words = f"{size:.4g} {motion_units([joint.kind])[order]}" if size <= most else "none"
-                alike.setdefault(words, []).append(joint)
-            sizes = "; ".join(f"{words} {self._named(joints)}" for words, joints in alike.items())
-            result.append(f"{kind} limits: " + ("none" if [*alike] == ["none"] else f"{sizes} ({self.origin[kind]})"))
+                by_size.setdefault(words, []).append(joint)
+            sizes = "; ".join(f"{words} {self._named(joints)}" for words, joints in by_size.items())
+            result.append(f"{kind} limits: " + ("none" if [*by_size] == ["none"] else f"{sizes} ({self.origin[kind]})"))
         return result
 
     def check(self, track: Setpoints) -> None:
@@ -193,7 +193,7 @@ class LimitsFile(ConstraintsFile):
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """What `read_motion_limits` found.
+    """Limits of a motion: constraints, bounds of each joint, torque limits and what is known of friction.
 
     Attributes:
         constraints: all but torque.
@@ -236,7 +236,7 @@ class MotionLimits:
 def read_motion_limits(
     given: Tables | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
 ) -> MotionLimits:
-    """Read the limits of a motion; where nothing else is stated it keeps what poses keep (`limits_of`).
+    """Return the limits of a motion from a limits file and the robot; by default those of poses (`limits_of`).
 
     Args:
         given: the file, or its tables; None for the robot's own limits and the defaults alone.

@@ -79,14 +79,14 @@ def read_waypoints(
     if targets.position is None and targets.q is not None:
         return read_poses(targets.q, chain.joint_names)
     goal = Goal(Installation(chain), 3 if targets.rotation is None else 6, lower, upper)
-    wanted = pose(targets.rotation, targets.position)
+    places = pose(targets.rotation, targets.position)
     low, high = (np.where(np.isfinite(x), x, s * np.pi) for x, s in ((lower, -1.0), (upper, 1.0)))
     here = np.asarray(start, dtype=float) if start is not None else (low + high) / 2
     others = np.random.default_rng(0).uniform(low, high, (MAX_TRIES, chain.n))
     found = []
     for k in range(len(targets)):
         near = here if targets.q is None else np.array(targets.q[k])
-        here = _reached(goal, wanted[k : k + 1], near, others, targets, k)
+        here = _reached(goal, places[k : k + 1], near, others, targets, k)
         found.append(here)
     return np.array(found)
 

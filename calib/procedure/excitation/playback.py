@@ -1,4 +1,4 @@
-"""An exciting motion as it is run: an approach, as many periods as wanted, and a slow rehearsal of it.
+"""Setpoints of an exciting motion for a controller: approach, periods, and a slow rehearsal.
 
 The approach leads from where a robot stands to where a motion starts: calm, jerk-limited, held against the limits file.
 """
@@ -52,7 +52,7 @@ def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> Non
 
 
 def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
-    """Return the setpoints of a motion that was found: approach, periods and rehearsal, as the settings say."""
+    """Return the setpoints of a designed motion: approach, periods and rehearsal, as the settings say."""
     model, limits, chain = given.model, given.limits, given.chain
     period = family.period * found.factor
     count = round(period * settings.rate)  # a period holds a whole number of the controller's samples
@@ -125,9 +125,7 @@ def approach_to(
     for limit, broken, k in known.broken(SampledMotion(*(x[rows] for x in parts))):
         words = f"on the straight way from start, {broken} at t = {found.times[rows[k]]:.3g} s"
         if isinstance(limit, Clearance):
-            raise UsageError(
-                f"{words}: move the robot to another pose before, or reach the start of the motion by hand"
-            )
+            raise UsageError(f"{words}: move the robot to another pose first, or drive to the start by hand")
         notes.append(f"{words}: watch the approach, or start from another pose")
     return found, tuple(notes)
 

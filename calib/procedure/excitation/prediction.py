@@ -91,7 +91,7 @@ def foretell(
     found: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return what a motion is to identify, of torques and of parameters; None where a joint has no torque limit.
+    """Return the predicted sigmas of torques and of parameters; None where a joint has no torque limit.
 
     Args:
         given, settings, problem, found: the robot, what was asked for, what was solved, and the motion.
@@ -102,16 +102,16 @@ def foretell(
         return None, ()
     sigmas = share * limits
     task = _task(given, settings.seed)
-    tell = partial(_prediction, given, sigmas, task)
-    own, spread = tell(problem.family, found.x, found.factor, settings.repeat)
+    predict = partial(_prediction, given, sigmas, task)
+    own, spread = predict(problem.family, found.x, found.factor, settings.repeat)
     others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
     own_period = problem.family.period * found.factor
     for period in PERIODS if settings.outlook and evaluations and not found.interrupted else ():
         if period >= own_period - 1e-9:
-            others.append(tell(problem.family, found.x, found.factor, period / own_period)[0])
+            others.append(predict(problem.family, found.x, found.factor, period / own_period)[0])
             continue
         shorter = _shortened(problem, found, problem_of, period, evaluations)
-        others += [] if shorter is None else [tell(shorter[0], shorter[1].x, shorter[1].factor, 1.0)[0]]
+        others += [] if shorter is None else [predict(shorter[0], shorter[1].x, shorter[1].factor, 1.0)[0]]
     model, columns = given.model, given.columns.columns
     kept = slice(None) if columns is None else columns
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
@@ -187,7 +187,7 @@ def _shortened(
 
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
-    """Write the parameters' predicted sigmas as CSV; values and rsd [%] are left out where nobody knows the value."""
+    """Write the parameters' predicted sigmas as CSV; value and rsd [%] are empty where the value is not known."""
     return files.write_table(folder / NAME, PredictedSigma._fields, rows)
 
 

@@ -1,4 +1,4 @@
-"""A designed motion found again in a log, cut to whole periods, and averaged: less noise, and how much there was.
+"""Find a designed motion in a log, cut it to whole periods, and average them: mean and variance over the periods.
 
 What is written is a recording of one period that `calib identify` reads. A NumPy archive holds besides, per sample and
 joint, the variance of one sample over the periods (``variance_q``, ``variance_tau``, ...), and how many ``periods``
@@ -98,7 +98,7 @@ def write(averaged: AveragedMotion, out: Path) -> Path:
 
 
 def lines(averaged: AveragedMotion) -> list[str]:
-    """Return what a person wants to read."""
+    """Return the lines that `calib recall` prints: periods, their agreement, noise of each joint."""
     found, averages = averaged.found, averaged.averages
     start = found.start / averaged.rate
     unit = "N m" if averaged.kind == "torque" else "A"

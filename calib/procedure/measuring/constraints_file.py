@@ -127,7 +127,7 @@ class PlacedTable:
 
     @property
     def stated(self) -> dict[str, Any]:
-        """The keys that were stated."""
+        """The placement keys of the table that have a value."""
         return {key: value for key in ("xyz", "rpy", "matrix") if (value := getattr(self, key)) is not None}
 
 
@@ -202,7 +202,7 @@ class CameraTable:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """What would have to be known to tell whether the board is seen."""
+        """Keys that are unknown, without which the camera's view cannot be checked."""
         names = ("mounting", "lens", "board", "carried", "stands")
         return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 

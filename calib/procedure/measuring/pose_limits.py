@@ -127,7 +127,7 @@ def read_limits(
 def _with_camera(
     limits: Limits, stated: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
 ) -> Limits:
-    """Return limits that keep the board in the camera's view, past the arm's own links, where enough is known of it."""
+    """Return limits with the camera's view of the board added, where camera and board are known well enough."""
     unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     if stated.unknown:
         return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))

@@ -83,7 +83,7 @@ class Run:
 
     @property
     def cut_off(self) -> tuple[int, ...]:
-        """Numbers of the poses, as they came, that no clear way was found to from where most of them are."""
+        """Numbers of the poses (in input order) that no clear way reaches from the largest connected group."""
         parts = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
         most = max(parts, key=len)
         return tuple(sorted(int(k) for part in parts if part is not most for k in part))
@@ -172,7 +172,7 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
-    """Return the order of least time where ways may lead by third poses, and its ways; pairs that none joins lack."""
+    """Return the fastest order where moves may pass other poses, and its ways; pairs without any way are left out."""
     direct = np.full(cost.shape, np.inf)
     for one, two in clear:
         direct[one, two] = direct[two, one] = cost[one, two]
@@ -222,7 +222,7 @@ def _pair(one: int, two: int) -> tuple[int, int]:
 
 
 def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
-    """Tell (m, m) which straight moves are clear at `PLACES` places: a guess, to find an order by."""
+    """Return (m, m) whether straight moves are clear at `PLACES` places: an estimate, to find an order by."""
     one, two = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
     places = q[one] + share * (q[two] - q[one])
@@ -233,11 +233,11 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
 
 
 def lines(run: Run, settings: RunSettings) -> list[str]:
-    """Return what a run comes to, in words."""
+    """Return lines on a run: duration, ways around obstacles, and poses without a clear way."""
     minutes, before = run.seconds / 60, run.found / 60
     found = [
         f"run: {len(run.order)} poses in {minutes:.1f} min at {settings.speed:.0%} of the joints' speed, "
-        f"{settings.dwell:g} s at each pose ({before:.1f} min in the order they were found, by straight moves)"
+        f"{settings.dwell:g} s at each pose ({before:.1f} min in their original order, by straight moves)"
     ]
     if run.around:
         found.append(f"{run.around} of {len(run.ways)} ways lead around something: drive their via-points, too")
@@ -271,7 +271,7 @@ def write_run(path: Path, run: Run, chain: Chain) -> Path:
 
 
 def is_run(path: Path) -> bool:
-    """Tell whether a CSV is a run's."""
+    """Return whether a CSV file holds a run."""
     with path.open(encoding="utf-8", errors="replace") as file:
         return file.readline().startswith("t,pose,")
 
@@ -338,7 +338,7 @@ class Exchange:
         return observability(rows, self.index), float(log_det(flat.T @ flat)) / rows.shape[2]
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
-        """Return the candidates' numbers (N,), that first which is worth most beside poses (m, n)."""
+        """Return the candidates' numbers (N,), best first: by the index they give together with poses (m, n)."""
         rows, trials = self._rows(q), self.jacobian(self.candidates)
         flat = rows.reshape(-1, rows.shape[2])
         matrices = flat.T @ flat + trials.transpose(0, 2, 1) @ trials
@@ -410,7 +410,7 @@ def drivable(
 def _rejoined(
     chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: Any, settings: RunSettings, seed: int
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
-    """Return poses (m, n) that clear ways lead to, which candidates are among them, and all ways found."""
+    """Return reachable poses (m, n), the candidates among them by place, and all clear ways."""
     q, found, ways = q.copy(), dict[int, int](), run.found_ways
     joined = [k for k in range(len(q)) if k not in run.cut_off]
     for place in run.cut_off:
