@@ -154,11 +154,10 @@ def select_friction(
     offered = {name: terms for name, terms in offered.items() if terms or name == wanted}
     every = [one for terms in offered.values() for one in terms]
     validation, place = _cross_validation(candidates, offered, every)
-    base = np.arange(validation.data.parameters - len(every))
+    bench = _Bench(candidates, validation, every, wanted != "auto")
     say("friction: standard")
-    size = _sizes(candidates, validation)
-    error = validation.errors(base)
-    steps = [_step("standard", len(base), error, size, tuple(range(candidates.n)), candidates.apart)]
+    error = bench.errors([])
+    steps = [bench.trial("standard", [], error, tuple(range(candidates.n)))]
     taken: list[int] = []
     waiting = list(offered)
     for second in (False, True):
@@ -166,12 +165,11 @@ def select_friction(
         for name in waiting:
             say(f"friction: {name}")
             columns = [k for k in place[name] if k not in taken]
-            found, new, at = _try(validation, base, taken, columns, every, error, wanted != "auto", candidates)
+            found, new, at = bench.tried(taken, columns, error)
             note = "" if at else "no better on unseen time: left out"
-            shown = new if found else validation.errors(np.array([*base, *taken, *columns]))
-            count = len(base) + len(taken) + len(found or columns)
-            names = tuple(every[k - len(base)].name for k in found)
-            steps.append(_step(f"+ {name}", count, shown, size, at, candidates.apart, note, names))
+            shown = new if found else bench.errors([*taken, *columns])
+            names = tuple(bench.term(k).name for k in found)
+            steps.append(bench.trial(f"+ {name}", [*taken, *(found or columns)], shown, at, note, names))
             if found:
                 taken, error = [*taken, *found], new
             else:
@@ -180,52 +178,82 @@ def select_friction(
             break
         waiting = [name for name in refused if any(at > place[name][0] for at in taken)]
     groups = validation.group[taken]
-    return FrictionSelection(tuple(every[k - len(base)] for k in taken), tuple(int(g) for g in groups), tuple(steps))
+    return FrictionSelection(tuple(map(bench.term, taken)), tuple(int(g) for g in groups), tuple(steps))
 
 
-def _try(
-    validation: CrossValidation,
-    base: np.ndarray,
-    taken: list[int],
-    columns: list[int],
-    every: list[DriveTerm],
-    error: np.ndarray,
-    forced: bool,
-    candidates: FrictionCandidates,
-) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
-    """Return the columns that stay, the errors with them, and their joints."""
-    joints = {k: _joints(every[k - len(base)]) for k in columns}
-    everyone = tuple(sorted(set(joints.values())))
-    side = every[columns[0] - len(base)].side
+@dataclass(frozen=True, eq=False)
+class _Bench:
+    """What judges terms: columns are numbered as in the validation, `every` offered term's behind the base's.
 
-    def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
-        """Return the squared errors (blocks,) of the rows that see the terms of joints, in units of their own."""
-        rows = [row for j in own for row in candidates.torque_rows.of_side(side, j, candidates.n)]
-        return np.sum(squares[:, rows] / validation.std[rows] ** 2, axis=1)
+    Attributes:
+        forced: whether terms stay whatever they bring.
+    """
 
-    if forced:
-        return columns, validation.errors(np.array([*base, *taken, *columns])), _flat(everyone)
-    half = validation.errors(np.array([*base, *taken]), 2)
-    far = validation.extrapolated(np.array([*base, *taken]))
-    at, some = everyone, columns
-    for _ in range(2):  # with the joints left that it pays at, once more
-        tried = np.array([*base, *taken, *some])
-        new, other, beyond = validation.errors(tried), validation.errors(tried, 2), validation.extrapolated(tried)
-        at = tuple(
-            own
-            for own in at
-            if _pays(felt(error, own), felt(new, own))
-            and _carries(felt(half, own), felt(other, own))
-            and _extrapolates(felt(far, own), felt(beyond, own))
-        )
-        some, before = [k for k in some if joints[k] in at], some
-        if not some:
-            return [], error, ()
-        if some == before:
-            break
-    else:
-        new = validation.errors(np.array([*base, *taken, *some]))
-    return some, new, _flat(at)
+    candidates: FrictionCandidates
+    validation: CrossValidation
+    every: Sequence[DriveTerm]
+    forced: bool
+
+    def term(self, column: int) -> DriveTerm:
+        return self.every[column - self.validation.data.parameters]  # counted from behind
+
+    def errors(self, taken: Sequence[int], folds: int | None = None) -> np.ndarray:
+        """Return the squared errors (blocks, rows) of a model with these columns behind the base's."""
+        return self.validation.errors(self._with_base(taken), folds)
+
+    def _with_base(self, taken: Sequence[int]) -> np.ndarray:
+        return np.array([*range(self.validation.data.parameters - len(self.every)), *taken])
+
+    def tried(
+        self, taken: list[int], columns: list[int], error: np.ndarray
+    ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
+        """Return the columns that stay, the errors with them, and their joints."""
+        joints = {k: _joints(self.term(k)) for k in columns}
+        everyone, side = tuple(sorted(set(joints.values()))), self.term(columns[0]).side
+        if self.forced:
+            return columns, self.errors([*taken, *columns]), _flat(everyone)
+
+        def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
+            """Return the squared errors (blocks,) of the rows that see the terms of joints, in units of their own."""
+            rows = [row for j in own for row in self.candidates.torque_rows.of_side(side, j, self.candidates.n)]
+            return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
+
+        half, far = self.errors(taken, 2), self.validation.extrapolated(self._with_base(taken))
+        at, some = everyone, columns
+        for _ in range(2):  # with the joints left that it pays at, once more
+            both = [*taken, *some]
+            new, other, beyond = (
+                self.errors(both), self.errors(both, 2), self.validation.extrapolated(self._with_base(both))
+            )  # fmt: skip
+            at = tuple(
+                own
+                for own in at
+                if _pays(felt(error, own), felt(new, own))
+                and _carries(felt(half, own), felt(other, own))
+                and _extrapolates(felt(far, own), felt(beyond, own))
+            )
+            some, before = [k for k in some if joints[k] in at], some
+            if not some:
+                return [], error, ()
+            if some == before:
+                break
+        else:
+            new = self.errors([*taken, *some])
+        return some, new, _flat(at)
+
+    def trial(
+        self, name: str, taken: Sequence[int], error: np.ndarray, at: tuple[int, ...], note: str = "",
+        terms: tuple[str, ...] = (),
+    ) -> FrictionTrial:  # fmt: skip
+        """Return the record of a model with these columns, its squared errors, and the joints where a step stays."""
+        squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, self.validation.rows)
+        size = squares[: self.validation.blocks].sum(axis=0)  # Σ τ² per row over the judged blocks
+        with np.errstate(divide="ignore", invalid="ignore"):
+            joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
+        alike = np.setdiff1d(np.arange(len(size)), self.candidates.apart)
+        total = float(100.0 * np.sqrt(error[:, alike].sum() / size[alike].sum()))
+        percent, count = tuple(float(x) for x in np.nan_to_num(joints)), len(self._with_base(taken))
+        return FrictionTrial(name, count, total, percent, tuple(1 + joint for joint in at), note, terms)
 
 
 def _joints(one: DriveTerm) -> tuple[int, ...]:
@@ -353,27 +381,3 @@ def _cross_validation(
         prior and np.sqrt(TEMPERING) * prior.widened(len(every)),
         regimes(rows, candidates.cases, candidates.decimator),
     ), place
-
-
-def _sizes(candidates: FrictionCandidates, validation: CrossValidation) -> np.ndarray:
-    """Return Σ τ² per row over the judged blocks (rows,)."""
-    squares = validation.data.factors[:, :, -1] ** 2
-    return squares.sum(axis=1).reshape(-1, validation.rows)[: validation.blocks].sum(axis=0)
-
-
-def _step(
-    name: str,
-    parameters: int,
-    error: np.ndarray,
-    size: np.ndarray,
-    at: tuple[int, ...],
-    apart: Sequence[int],
-    note: str = "",
-    terms: tuple[str, ...] = (),
-) -> FrictionTrial:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
-    alike = np.setdiff1d(np.arange(len(size)), apart)
-    total = float(100.0 * np.sqrt(error[:, alike].sum() / size[alike].sum()))
-    percent = tuple(float(x) for x in np.nan_to_num(joints))
-    return FrictionTrial(name, parameters, total, percent, tuple(1 + joint for joint in at), note, terms)
