@@ -3,7 +3,6 @@
 from functools import cache
 
 import numpy as np
-import pinocchio_model as model
 import pytest
 from arms import motley, physical, states
 from differences import check
@@ -243,16 +242,6 @@ def test_prismatic_joints_and_tilted_gravity(name):
         assert np.allclose(case[:, :, result.kept] @ (result.transform @ chi), case @ chi, rtol=0, atol=1e-10)
     moved = [k for k in range(50, 60) if k in result.kept] if "payload" in name else range(10)
     assert "payload" not in name or len(moved) == 10
-
-
-def test_counts_do_not_depend_on_the_frames():
-    """The TIAGo-like arm of axes x, y, z keeps as many columns as Pinocchio's regressor has rank."""
-    chain = motley(7)
-    q, v, a = states(5, 200)
-    matrix = model.regressor(chain, q, v, a).reshape(-1, 50)
-    assert base.find(IdentificationModel(bodies_of(chain))).b == np.linalg.matrix_rank(
-        matrix, tol=1e-9 * np.linalg.norm(matrix)
-    )
 
 
 def test_richer_friction_has_columns_of_its_own():

@@ -1,7 +1,5 @@
 """Gravity torques against Pinocchio, from the URDF itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

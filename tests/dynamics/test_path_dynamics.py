@@ -1,7 +1,5 @@
 """Proposition 1 against Pinocchio: A = MΦ', B = MΦ'' + CΦ', Γ = G, and tau is the full inverse dynamics."""
 
-from __future__ import annotations
-
 import arms
 import numpy as np
 import pinocchio

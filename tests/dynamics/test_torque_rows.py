@@ -1,7 +1,5 @@
 """Torque rows as a linear map: one map for regressors and for measured torques, with its adjoint."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from arms import motley

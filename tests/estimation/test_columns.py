@@ -1,7 +1,5 @@
 """Which columns are independent: rank, coefficients, order of preference, columns without effect."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

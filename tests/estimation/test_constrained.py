@@ -1,7 +1,5 @@
 """Constrained least squares: the optimum of cvxpy, proved by the result itself; least squares where nothing binds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

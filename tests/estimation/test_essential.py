@@ -1,7 +1,5 @@
 """Essential parameters: planted zeros go, strong ones stay, lists are obeyed, the F values are the textbook's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.stats

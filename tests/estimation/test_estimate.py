@@ -1,7 +1,5 @@
 """Estimates: the covariance is the scatter over many seeds; correlations are named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.stats

@@ -1,7 +1,5 @@
 """Instruments: right where least squares is not, and the tests say when; all from triangles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.signal

@@ -1,7 +1,5 @@
 """Whole samples: the covariance across joints is found and used, and samples that do not fit are put aside."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

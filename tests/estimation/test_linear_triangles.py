@@ -1,7 +1,5 @@
 """Triangles carry all of the data: block by block, merged, selected and reweighted they equal the whole matrix."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from linear_problems import noisy

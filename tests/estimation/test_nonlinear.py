@@ -1,7 +1,5 @@
 """Levenberg-Marquardt against SciPy's optimum on textbook problems; every way it can end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Automatic relevance determination: a planted sparse model is found, the rest is switched off."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Robust weights: they are the slope of their loss, 95 % efficient, and the spread ignores outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from differences import check

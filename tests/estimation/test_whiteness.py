@@ -1,7 +1,5 @@
 """Whiteness: known processes have their known correlations, and the verdicts keep their rates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.stats

@@ -1,7 +1,5 @@
 """Full standard parameters: of possible bodies, with the torques that were identified."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

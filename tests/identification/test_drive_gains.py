@@ -1,7 +1,5 @@
 """Gains relative to one joint: which the currents tell, and what stands for those that they do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The methods of ``calib identify`` on planted logs: each is right where its assumption holds, and says what it is."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

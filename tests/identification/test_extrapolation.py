@@ -1,7 +1,5 @@
 """Models hold where they never learnt: friction is bounded and brakes, couplings are found, joints borrow of others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """With torque sensors behind the gears, richer friction and cables are found, and parameters keep what is stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ridges of richer friction: one per group, of parameters whose columns differ in size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Claims on sensitivity and total covariance: derivative, identities, and a small Monte Carlo of whole calibrations."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

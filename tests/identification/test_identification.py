@@ -1,7 +1,5 @@
 """Claims on a planted robot: parameters come back within their covariance; the ladder takes what is there, no more."""
 
-from __future__ import annotations
-
 import numpy as np
 import planted_motion as planted
 import pytest

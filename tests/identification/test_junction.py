@@ -1,7 +1,5 @@
 """Claim: geometry and dynamics meet in memory as they do through files, the geometry's covariance included."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A model that is no serial chain is identified like one: identification asks for the protocol alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The power model of serial arms: energies whose derivative is the power, one row per sample, weights by recording."""
 
-from __future__ import annotations
-
 import numpy as np
 from arms import motley
 

@@ -1,7 +1,5 @@
 """The prior whose sizes the evidence tells: rich motion does not feel it, poor motion is held by it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The second judgement: what replaying a recording says of a feed-forward is what the true robot would do."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 

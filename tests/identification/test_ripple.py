@@ -1,7 +1,5 @@
 """Gear ripple: found by its family, also where another gear's is felt, and not where there is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

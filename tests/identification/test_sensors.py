@@ -1,7 +1,5 @@
 """Joint torque sensors through ``calib identify``: Models 1 to 3, loaded and unloaded runs stacked."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -88,9 +86,3 @@ def test_models_1_to_3_recover_the_truth(robot, tmp_path, capsys, rows, count):
 def test_a_missing_torque_is_named(robot, tmp_path, capsys, rows, columns, message):
     code, out = identify(robot, tmp_path, rows, log(tmp_path, "empty.csv", 0, False, columns))
     assert code == 2 and message in " ".join(capsys.readouterr().err.split()) and not out.exists()
-
-
-@pytest.mark.slow
-def test_motor_torques_may_be_called_tau(robot, tmp_path):
-    code, out = identify(robot, tmp_path, "both", log(tmp_path, "empty.csv", 0, False, ("tau_sensor", "tau")))
-    assert code == 0 and json.loads((out / "metrics.json").read_text())["parameters"]["base"] == 36

@@ -1,7 +1,5 @@
 """Errors that a model expects of its torques hold on other motion, whatever the truth is; extrapolation is named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

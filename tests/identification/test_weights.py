@@ -1,7 +1,5 @@
 """Weights from repeats: the file's variances say how the joints are weighed, not what the model cannot explain."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A problem of identification on the planted arm, for every method."""
 
-from __future__ import annotations
-
 import numpy as np
 import planted_motion as planted
 import pytest

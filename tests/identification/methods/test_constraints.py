@@ -1,7 +1,5 @@
 """Claims of the PC methods: constraints by name hold, cost what they must, and those that say nothing are refused."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Claims of the filters: Kalman's own on a linear system, six that agree, sigma that covers, failures with names."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Claims of IDIM-IV: right where least squares is biased, cheap where it is not, honest about its instruments."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Claims of what takes a loop for granted: a loop stated wrongly is named, by recorded torques; a right one never."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 import numpy as np

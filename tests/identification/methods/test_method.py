@@ -1,7 +1,5 @@
 """A method's failure is a status that says which; the error that says what to do is kept for who wants it raised."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

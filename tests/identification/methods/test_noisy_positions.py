@@ -1,7 +1,5 @@
 """Claims of maximum likelihood and of the networks: who is right where positions are noisy, who is least squares."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

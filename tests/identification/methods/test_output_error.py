@@ -1,7 +1,5 @@
 """Claims of output and input error: their sigma covers, each is best where its signal is clean, failures are named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

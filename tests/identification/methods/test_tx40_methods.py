@@ -1,7 +1,5 @@
 """Claims on six joints: the survey's TX40 at its lowest noise, encoders in the loop; slow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

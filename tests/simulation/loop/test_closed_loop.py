@@ -1,7 +1,5 @@
 """Claims of the closed-loop simulator: the right dynamics, integrated well, without chatter, controlled as stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

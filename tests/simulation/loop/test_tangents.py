@@ -1,7 +1,5 @@
 """The claim of the tangents: they are the derivative of what is simulated, whatever the robot and the loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
