@@ -50,6 +50,11 @@ class Triangles:
         """Return ‖y_g - W_g x‖² of every group (g,), from the triangles alone."""
         return np.sum((self.factors @ np.append(values, -1.0)) ** 2, axis=1)
 
+    def relative_errors(self, values: np.ndarray) -> np.ndarray:
+        """Return 100 ‖y_g - W_g x‖ / ‖y_g‖ [%] of every group (g,); 0 where y_g is."""
+        size = self.residual_squares(np.zeros(self.parameters))
+        return 100.0 * np.sqrt(self.residual_squares(values) / np.where(size > 0.0, size, np.inf))
+
     def select(self, columns: np.ndarray) -> Triangles:
         """Return the triangles of the model with only these columns, in the order given."""
         columns = np.asarray(columns, dtype=int)

@@ -240,11 +240,6 @@ def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
 
-def _joint_by_joint(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Tell whether ripple, which is sought in the motors' torques alone, has a place in a model."""
-    return _sees_drives(model) and model.torque_rows.motors_alone
-
-
 def _richer_friction(
     model: RegressorModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator,
     first: FirstFit, prior: Prior | None, settings: IdentificationSettings, progress: Progress | None,
@@ -270,7 +265,7 @@ def _with_ripple(
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
     """Return the model with gear ripple found in what it leaves, where that is asked for."""
     model = dynamics.model
-    if not _joint_by_joint(model) or settings.friction not in ("auto", "ripple"):
+    if not _sees_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
     say("ripple")
     ripples = tuple(find_all(cases, [case.target - predict(dynamics, case) for case in cases]))
@@ -300,11 +295,8 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     of fast motion no other row identifies.
     """
     rates = [case.motion.rate for case in cases]
-    if max(rates) > 1.02 * min(rates):
-        slowest, fastest = min(rates), max(rates)
-        raise MeasurementError(
-            f"recordings of {slowest:.4g} Hz and {fastest:.4g} Hz do not go together; resample one of them"
-        )
+    words = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz do not go together; resample one of them"
+    require(max(rates) <= 1.02 * min(rates), words, MeasurementError)
     total = sum(len(case.motion) for case in cases)
     widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
     one_in = -(-total // (widest.factor * settings.samples))  # what the memory asks for
@@ -398,8 +390,6 @@ def _require_motion(cases: Sequence[Case]) -> None:
 
 def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:
     count = sum(int(part.present.sum()) for part in rows)
-    if count < 2 * base.b:
-        raise MeasurementError(
-            f"{count} rows are left for {base.b} base parameters after filtering and thinning: record longer, or raise "
-            "the identification band ([filter] band)"
-        )
+    words = f"{count} rows are left for {base.b} base parameters after filtering and thinning"
+    advice = "record longer, or raise the identification band ([filter] band)"
+    require(count >= 2 * base.b, f"{words}: {advice}", MeasurementError)

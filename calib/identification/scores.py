@@ -137,40 +137,23 @@ def score(
     moves = moving(motion) if slow is None else moving(motion, slow)
     count = case.target.shape[1]
     rows = [_row(case, np.asarray(predicted)[:, k], k, known, moves[:, k % motion.n]) for k in range(count)]
-    every = motion.decimator.factor
-    residual = np.stack([row.low for row in rows], axis=1)
-    raw, filtered, moved, stood = (_together([row.sums[k] for row in rows], apart) for k in range(4))
-    return Score(
-        raw,
-        filtered,
-        moved,
-        stood,
-        np.array([row.above for row in rows]),
-        np.array([row.r_squared for row in rows]),
-        _whiteness(residual, motion.segment[::every]),
-        motion.rate / every,
-        float(moves.mean()),
-    )
+    sums, above, explained, low = zip(*rows)
+    every, residual = motion.decimator.factor, np.stack(low, axis=1)
+    raw, filtered, moved, stood = (_together([one[k] for one in sums], apart) for k in range(4))
+    white, share = _whiteness(residual, motion.segment[::every]), float(moves.mean())
+    rate, shares = motion.rate / every, (np.array(above), np.array(explained))
+    return Score(raw, filtered, moved, stood, *shares, white, rate, share)
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """One torque row's share of a score: an hour's rows would not fit into memory side by side.
+def _row(
+    case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray
+) -> tuple[np.ndarray, float, float, np.ndarray]:
+    """Return one torque row's share of a score: an hour's rows would not fit into memory side by side.
 
-    Attributes:
-        sums: (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing
-            ones.
-        above, r_squared: as in `Score`.
-        low: (M,) the residual in the band, thinned.
+    Returns:
+        (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
+        `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
     """
-
-    sums: np.ndarray
-    above: float
-    r_squared: float
-    low: np.ndarray
-
-
-def _row(case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray) -> _Row:
     motion, target = case.motion, case.target[:, k]
     low = motion.in_band(np.stack([target, predicted], axis=1))
     residual, own = target - predicted, low[:, 0] - low[:, 1]
@@ -178,7 +161,7 @@ def _row(case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np
     sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]
     size = float(np.linalg.norm(target))
     above = 100.0 * float(np.linalg.norm(target - low[:, 0])) / size if size > 0.0 else 0.0
-    return _Row(np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor])
+    return np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor]
 
 
 def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[float, float, float]:

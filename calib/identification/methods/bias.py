@@ -146,8 +146,7 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
         if not plain.found:
             return None
         name, other, limit = "wls", plain.estimate, max_beside_wls
-        size = np.maximum(problem.pooled.residual_squares(np.zeros(len(own.values))), 1e-300)
-        left, beside = (100.0 * np.sqrt(problem.pooled.residual_squares(x.values) / size) for x in (own, other))
+        left, beside = (problem.pooled.relative_errors(x.values) for x in (own, other))
     away = np.abs(own.values - other.values) / np.maximum(np.hypot(own.sigma, other.sigma), 1e-300)
     worst = int(np.argmax(away))
     if away[worst] < SIGMAS or not np.any(left > limit * beside):

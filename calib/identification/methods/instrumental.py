@@ -125,16 +125,12 @@ class Instrumental:
 
     def simulated_error(self, values: np.ndarray) -> np.ndarray:
         """Return (n,) 100 ‖y - Z x‖ / ‖y‖ [%] of any values (p,), free of the noise of measured positions."""
-        return self._error(np.concatenate([values, np.zeros(len(self.names))]))
+        return self.problem.data.relative_errors(np.concatenate([values, np.zeros(len(self.names))]))
 
     @property
     def own(self) -> np.ndarray:
         """(n,) 100 ‖y - W x‖ / ‖y‖ [%]: the same of the measured motion."""
-        return self._error(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
-
-    def _error(self, values: np.ndarray) -> np.ndarray:
-        rest, size = (self.problem.data.residual_squares(x) for x in (values, np.zeros(2 * len(self.names))))
-        return 100.0 * np.sqrt(rest / np.where(size > 0.0, size, np.inf))
+        return self.problem.data.relative_errors(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
 
     @property
     def off(self) -> np.ndarray:
