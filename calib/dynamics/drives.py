@@ -203,8 +203,7 @@ def slopes(
 ) -> None:
     """Add the slopes of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
     for weight, one in zip(weights, terms, strict=True):
-        if not one.form.slopes:
-            raise CalibError(f"term '{one.name}' ({one.shape}) depends on the past or on torques: it has no slopes")
+        require(one.form.slopes, f"term '{one.name}' ({one.shape}) depends on the past or on torques: it has no slopes")
         for row, motion in one.acts:
             parts = one.slopes(_join(one, motion, [*motions, None], None))
             for target, part in zip(out, parts):

@@ -50,7 +50,7 @@ from scipy.special import multigammaln  # type: ignore[attr-defined]
 from calib.arrays import Frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import NotConverged, UsageError, suggestion
+from calib.errors import NotConverged, UsageError, one_of
 from calib.identification.possible.information import Information, of
 from calib.identification.possible.problem import (
     DRIVE,
@@ -130,8 +130,7 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     Raises:
         UsageError: for a model without bodies (motor side alone), or a prior that is none.
     """
-    if prior not in PRIORS:
-        raise UsageError(f"prior '{prior}' is none of {', '.join(PRIORS)}{suggestion(prior, PRIORS)}")
+    one_of(prior, PRIORS, "prior", UsageError)
     model = information.dynamics.model
     if not model.torque_rows.has_bodies:
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
