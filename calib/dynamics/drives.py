@@ -60,7 +60,7 @@ class DriveTerm:
 
     @property
     def joint(self) -> int | None:
-        """The one joint whose own motion it answers; None for a coupling."""
+        """The joint whose torque depends on its own motion through this term; None for a coupling."""
         if len(self.acts) != 1 or self.acts[0][1] != ((self.acts[0][0], 1.0),):
             return None
         return self.acts[0][0]
@@ -109,7 +109,7 @@ class DriveTerm:
 
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
-    """Return the term of one joint that sees its own motion."""
+    """Return the term of one joint that depends on that joint's motion."""
     return DriveTerm(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
 
 

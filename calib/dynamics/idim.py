@@ -278,7 +278,7 @@ class IdentificationModel:
         return tuple(one.name for one in self.columns if one.form.loaded)
 
     def with_terms(self, *terms: DriveTerm) -> IdentificationModel:
-        """Return the model with more drive terms behind its own."""
+        """Return the model with more drive terms appended."""
         return replace(self, terms=(*self.terms, *terms))
 
 

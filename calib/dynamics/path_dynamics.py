@@ -124,7 +124,7 @@ def _require_torques(model: IdentificationModel) -> None:
 
 
 def _is_friction(model: IdentificationModel) -> np.ndarray:
-    """Tell which of the p columns depend on speed."""
+    """Return (p,) which columns depend on speed."""
     bodies = np.zeros(model.inertial, dtype=bool)
     return np.concatenate([bodies, np.array([one.form.friction for one in model.columns], dtype=bool)])
 

@@ -123,7 +123,7 @@ class TorqueRows:
         return self.labels([str(j + 1) for j in range(n)])
 
     def titles(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the rows' names in full, from the joints' own."""
+        """Return the full names of the rows, from the names of the joints."""
         if self.projection is not None:
             return self.projection.labels
         return tuple(joint + block.suffix for block in self.blocks for joint in joints)

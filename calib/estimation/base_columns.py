@@ -1,4 +1,4 @@
-"""Which columns of an observation matrix carry information of their own: the same question in geometry and dynamics."""
+"""Linearly independent columns of an observation matrix, for geometry and dynamics alike."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -88,7 +88,7 @@ class Condensed:
 
 
 def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Condensed:
-    """Return coordinates of the columns with statistics WᵀW `square` (p, p), in which those of a group are alike.
+    """Return coordinates of the columns with statistics WᵀW `square` (p, p), with equal prior size within a group.
 
     Args:
         square: of all rows that will ever be used.
@@ -158,8 +158,8 @@ def relevance(
             index, square = index[inside], square.take(inside, 0).take(inside, 1)
         own = family[index]
         solution, variance = _posterior(square, data.cross[index], lam[own], beta)
-        told = np.where(own < count, 1.0 - lam[own] * variance, 0.0)
-        gamma = np.bincount(own, told, count + 1)
+        determined = np.where(own < count, 1.0 - lam[own] * variance, 0.0)
+        gamma = np.bincount(own, determined, count + 1)
         size = np.bincount(own, solution**2, count + 1)
         lam[:count] = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)[:count]
         alive[:count] &= (lam < max_prior_weight * beta * np.maximum(information, 1e-300))[:count]

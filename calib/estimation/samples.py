@@ -128,7 +128,7 @@ def by_joint(data: Samples) -> LinearFit:
 
 
 def row_irls(data: Samples, loss: str = "cauchy") -> LinearFit:
-    """Estimate x with a weight of its own for every row, w(|ρ| / σ_j), σ_j = 1.4826 · median |ρ| of joint j.
+    """Estimate x with one weight per row, w(|ρ| / σ_j), σ_j = 1.4826 · median |ρ| of joint j.
 
     For outliers that hit single joints. Its covariance is that of weighted rows, without the M-estimator's factor.
 

@@ -33,7 +33,7 @@ class Whiteness:
 
 
 def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
-    """Return what is left in a series of residuals (N,), evenly sampled, of one joint in one recording.
+    """Return the whiteness tests of evenly sampled residuals (N,) of one joint in one recording.
 
     Args:
         residual: (N,) with N > lags and N >= 20.

@@ -165,9 +165,9 @@ def identify_gains(
             covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gain, gain)
             values = np.zeros(len(names))
             values[free], values[fixed] = x / norms, given
-            told = ", ".join(f"{name} = {value:g}" for name, value in known.items())
-            told = told if reference is None else f"gain of joint {reference + 1} = 1"
-            return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), told, tuple(own))
+            scale = ", ".join(f"{name} = {value:g}" for name, value in known.items())
+            scale = scale if reference is None else f"gain of joint {reference + 1} = 1"
+            return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), scale, tuple(own))
     if reference is None:
         raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
     raise NotConverged(
@@ -195,7 +195,7 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     blocks = [k for k in range(data.groups // joints) if data.rows[k * joints : (k + 1) * joints].any()]
     own: tuple[int, ...] = ()
     max_sigma = 0.3  # sigma of a relative gain, of it, up to which the motion tells it
-    max_factor = 10.0  # factor between gains of one robot's motors beyond which one is not told
+    max_factor = 10.0  # factor between gains of one robot's motors beyond which one counts as not identified
     while True:
         try:
             found = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=own)

@@ -165,7 +165,7 @@ def identify_model(
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
     prior = None
-    if _drawn(method, model, settings, source):
+    if _takes_prior(method, model, settings, source):
         prior = tempered_prior(
             lambda tempering, start: find_prior(
                 model, base, rows, whole, source, noise, start=start, effort=effort, tempering=tempering
@@ -236,7 +236,7 @@ def _torque_limits(chain: Chain) -> np.ndarray | None:
 
 
 def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Tell whether richer friction, which is of single joints' motors, has a place in a model."""
+    """Return whether richer friction can be added to a model: it acts on the motors of single joints."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
 
@@ -263,7 +263,7 @@ def _richer_friction(
 def _with_ripple(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings, say: Progress
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
-    """Return the model with gear ripple found in what it leaves, where that is asked for."""
+    """Return the model with gear ripple identified from its residuals, where the settings ask for it."""
     model = dynamics.model
     if not _sees_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
@@ -276,7 +276,7 @@ def _with_ripple(
 def _with_payloads(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
 ) -> Dynamics[RegressorModel]:
-    """Return the model with the parameters of payloads that no case carries, where they are known."""
+    """Return the model with known parameters for payloads that no training recording carries."""
     model, values = dynamics.model, np.array(dynamics.values)
     for label, stated in settings.payloads.items():
         known = settings.payload_values.get(label, stated.parameters)
@@ -349,7 +349,7 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
     return FirstFit(std, residual_inflation(rows, values), values)
 
 
-def _drawn(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
+def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
     """Say whether the parameters have a prior: it is asked for, and the method and the model take one.
 
     Raises:

@@ -157,7 +157,7 @@ class Constraints(Frozen):
 
 @contextmanager
 def _unsatisfied(words: str) -> Iterator[None]:
-    """Say why no optimum was found, for an error raised inside."""
+    """Add `words`, the reason, to a `NotConverged` raised inside."""
     try:
         yield
     except NotConverged as error:
@@ -198,7 +198,7 @@ class Binding:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A constrained estimate beside the free one.
+    """A constrained estimate with the unconstrained one.
 
     Attributes:
         constraints: that were asked, bodies that can exist as a plane.

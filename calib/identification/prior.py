@@ -52,26 +52,6 @@ from calib.robot.chain import Chain
 
 RADIUS = 0.1  # [m] of the balls that rods are made of
 PAYLOAD = (2.0, 0.1)  # [kg, m]
-
-
-def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:
-    """Return rods (B, 10) from each body's frame to the next one's, mass by length and thickness; `total` [kg]."""
-    arm = model.bodies
-    ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
-    for i, parent in enumerate(arm.parents):
-        if parent >= 0 and arm.coordinates[i] >= 0:
-            ends[parent] = arm.placements[i][:3, 3]
-    moving = arm.coordinates >= 0
-    share = np.where(moving, np.linalg.norm(ends, axis=1) + 2 * RADIUS, 0.0)
-    masses = total * share / share.sum()
-    return np.array(
-        [
-            pseudo_inertia.rod(mass, end, RADIUS) if moves else pseudo_inertia.ball(*PAYLOAD)
-            for mass, end, moves in zip(masses, ends, moving)
-        ]
-    )
-
-
 TEMPERING = 2.0  # weight of the prior for the values, at least: chosen on motion other than learnt from
 MIN_NOISE = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
@@ -330,7 +310,7 @@ def _whitened(
 
 
 def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
-    """Return the logarithms of sizes (k,) where evidence and their own prior are largest together."""
+    """Return the logarithms of sizes (k,) that maximise the product of evidence and their prior."""
     b = len(columns)
 
     def lost(t: np.ndarray) -> tuple[float, np.ndarray]:
@@ -338,14 +318,32 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         own, solution, inverse, log_det = _whitened(factor, columns, deviations)
         rest, away = factor[:b, b] - own @ solution, (t - sizes.centre) / sizes.width
         value = 0.5 * float(rest @ rest + solution @ solution + away @ away) + log_det
-        told = solution**2 + np.sum(inverse**2, axis=1) - 1.0  # slope of the evidence by each log deviation
-        return value, away / sizes.width - np.bincount(sizes.member, told, len(t))
+        slope = solution**2 + np.sum(inverse**2, axis=1) - 1.0  # slope of the evidence by each log deviation
+        return value, away / sizes.width - np.bincount(sizes.member, slope, len(t))
 
     found = scipy.optimize.minimize(
         lost, np.clip(start, sizes.least, sizes.most), jac=True, method="L-BFGS-B",
         bounds=np.column_stack([sizes.least, sizes.most]), options={"maxiter": 60, "ftol": 1e-8},
     )  # fmt: skip
     return np.asarray(found.x)
+
+
+def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:
+    """Return rods (B, 10) from each body's frame to the next one's, mass by length and thickness; `total` [kg]."""
+    arm = model.bodies
+    ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
+    for i, parent in enumerate(arm.parents):
+        if parent >= 0 and arm.coordinates[i] >= 0:
+            ends[parent] = arm.placements[i][:3, 3]
+    moving = arm.coordinates >= 0
+    share = np.where(moving, np.linalg.norm(ends, axis=1) + 2 * RADIUS, 0.0)
+    masses = total * share / share.sum()
+    return np.array(
+        [
+            pseudo_inertia.rod(mass, end, RADIUS) if moves else pseudo_inertia.ball(*PAYLOAD)
+            for mass, end, moves in zip(masses, ends, moving)
+        ]
+    )
 
 
 def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -144,7 +144,7 @@ class ObservationRows:
         )  # fmt: skip
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
-        """Return rows with more columns (M, rows, k) behind their own."""
+        """Return rows with more columns (M, rows, k) appended."""
         if not terms:
             return self
         return replace(

@@ -106,7 +106,7 @@ class CrossValidation:
         runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
         key = len(runs).to_bytes(4, "little") + columns.tobytes()
         if key not in self._known:
-            fitted = self._fitted if (self.group[columns] < 0).all() else self._drawn
+            fitted = self._fitted if (self.group[columns] < 0).all() else self._regularised
             values = fitted(columns, runs)
             each = [own for run, own in zip(runs, values) for _ in run]
             self._known[key] = self._errors(columns, each)
@@ -124,7 +124,7 @@ class CrossValidation:
             rest.flat[:: len(index) + 1] += rounding  # differences are positive definite but for that
             rest += known
             rows = int(np.sum((self.regimes.total - counts) / self.inflation))
-            values = np.append(_drawn(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
+            values = np.append(_regularised(rest, rows, self.group[columns], self._kinds[columns])[0], -1.0)
             result[k] = np.einsum("i,rij,j->r", values, held.take(index, 1).take(index, 2), values)
         return np.maximum(result, 0.0)
 
@@ -139,15 +139,15 @@ class CrossValidation:
         return result
 
     def _fitted(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return least squares on the blocks beside each run, from their triangles."""
+        """Return the least-squares fit to the blocks outside each run, from their triangles."""
         chosen, group = self.data.select(columns), self.group[columns]
         prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
         folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
         pooled = (pool(chosen, self.rows, others) for others in folds)
         return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
 
-    def _drawn(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the estimates with ridges on the blocks beside each run: these need no more than [W y]ᵀ[W y]."""
+    def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the ridge estimates from the blocks outside each run; they need [W y]ᵀ[W y] alone."""
         index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
         squares = self._squares.take(index, 1).take(index, 2)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
@@ -157,7 +157,7 @@ class CrossValidation:
             others = ~np.isin(blocks, run)
             whole = squares[others].sum(axis=0) + known
             rows = int(np.sum(samples[others].sum(axis=0) / self.inflation))
-            found.append(_drawn(whole, rows, self.group[columns], self._kinds[columns])[0])
+            found.append(_regularised(whole, rows, self.group[columns], self._kinds[columns])[0])
         return found
 
     @cached_property
@@ -194,7 +194,7 @@ def estimate(
         scale = np.where(size > 0.0, size, 1.0)
         found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
         return found / scale, np.full(len(group), np.inf)
-    return _drawn(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group, _kinds(group, data.units))
+    return _regularised(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group, _kinds(group, data.units))
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
@@ -203,7 +203,7 @@ def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
     return np.where(group < 0, -1, group * len(found) + unit)
 
 
-def _drawn(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) of so many rows.
 
     A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters

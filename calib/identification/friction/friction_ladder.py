@@ -166,7 +166,7 @@ def select_friction(
             say(f"friction: {name}")
             columns = [k for k in place[name] if k not in taken]
             found, new, at = bench.tried(taken, columns, error)
-            note = "" if at else "no better on unseen time: left out"
+            note = "" if at else "no better on held-out time: left out"
             shown = new if found else bench.errors([*taken, *columns])
             names = tuple(bench.term(k).name for k in found)
             steps.append(bench.trial(f"+ {name}", [*taken, *(found or columns)], shown, at, note, names))
@@ -214,7 +214,7 @@ class _Bench:
             return columns, self.errors([*taken, *columns]), _flat(everyone)
 
         def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
-            """Return the squared errors (blocks,) of the rows that see the terms of joints, in units of their own."""
+            """Return the squared errors (blocks,) of the torque rows that terms of these joints act on, whitened row by row."""
             rows = [row for j in own for row in self.candidates.torque_rows.of_side(side, j, self.candidates.n)]
             return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
 
@@ -271,7 +271,7 @@ def _carries(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Say whether a joint's squared errors in the regimes left out (k,) did not grow, in their geometric mean."""
+    """Return whether a joint's squared errors in held-out regimes (k,) did not grow, in the geometric mean."""
     used = (before > 0.0) & (after > 0.0)
     return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
 

@@ -49,7 +49,7 @@ class GearWave:
 
 @dataclass(frozen=True)
 class RippleWaves:
-    """Ripple found at a joint, from 1, and the share of the fast residual's power that it explains, held out."""
+    """Ripple of a joint, counted from 1, and the share of the high-frequency residual's power it explains when held out."""
 
     joint: int
     waves: tuple[GearWave, ...]
@@ -287,7 +287,7 @@ def _climb(
 
 
 def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
-    """Return the most coherent order of the joint's own gear, and the most coherent two that are two apart."""
+    """Return the most coherent order of the joint's gear, and the most coherent pair of orders that differ by two."""
     power = coherence(track, joint, rest)
     order = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER + 1]))
     lower = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]))
@@ -295,7 +295,7 @@ def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, .
 
 
 def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
-    """Return what of a residual (N,) lies above twice the motion's own band, each segment by itself."""
+    """Return the part of a residual (N,) above twice the bandwidth of the motion, segment by segment."""
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
     slow = [low_pass(residual[a:b], motion.rate, cutoff) for a, b in segments(motion.segment)]

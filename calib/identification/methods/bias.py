@@ -107,7 +107,7 @@ SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choic
 
 @dataclass(frozen=True)
 class LoopDisagreement:
-    """An estimate that takes the loop for granted, beside one that does not.
+    """Comparison of an estimate that relies on the stated loop with one that does not.
 
     Attributes:
         method, beside: of the two.
@@ -158,7 +158,7 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
 
 
 def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
-    """Return by torque row the slope of W own against W other."""
+    """Return, for each torque row, the regression slope of the torques W own on W other."""
     factors = problem.pooled.factors[:, :, :-1]
     mine, theirs = factors @ own, factors @ other
     return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))

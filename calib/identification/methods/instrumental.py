@@ -80,7 +80,7 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Instrumental:
-    """What IDIM-IV found.
+    """Result of IDIM-IV.
 
     Attributes:
         fit: the estimate.
@@ -315,7 +315,7 @@ def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) 
 def _result(
     task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
 ) -> Instrumental:  # fmt: skip
-    """Return the last round, sigmas with its own inflation, with what the tests say of it."""
+    """Return the result of the last round: σ with the inflation of its residuals, and the tests."""
     problem = found.problem if task.estimator.measured else _stack(found.observed, found.simulated)
     fit, bound = _held_fit(task, problem, std, found.tau)
     verdict = instrumental_variables.exogeneity(problem, std, found.tau)
@@ -436,7 +436,7 @@ def _distance(runs: Runs) -> np.ndarray:
 
 
 def _stray(runs: Runs) -> np.ndarray:
-    """Return (n,) the slope of q_ref - q against q_ref - q_s, which noise of q leaves as it is; see `Instrumental`."""
+    """Return (n,) the regression slope of q_ref - q on q_ref - q_s, which noise in q does not bias; see `Instrumental`."""
     pairs = []
     for (case, loop), run in runs:
         motion, used = case.motion, simulated_samples(case, run.t, loop)

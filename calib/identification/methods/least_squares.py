@@ -52,7 +52,7 @@ class _LeastSquares(Method):
             std, tau = weighed(problem)
             fit = self.solve(problem, std, tau)
             ridges = self.takes_prior and bool((problem.groups >= 0).any())
-            fit, _, known = _drawn(problem, None, std, tau) if ridges else (fit, None, None)
+            fit, _, known = _regularised(problem, None, std, tau) if ridges else (fit, None, None)
         else:
             fit, known, std, tau = _settled(problem, prior)
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
@@ -84,7 +84,7 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
     return std, residual_inflation(problem.rows, wls(pooled, std).estimate.values)
 
 
-def _drawn(
+def _regularised(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
     """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
@@ -110,7 +110,7 @@ def _drawn(
 
 
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fit with a prior, its rows (k, p), and the (rows,) std and inflation that its own residuals say.
+    """Return the fit with a prior, the prior's rows (k, p), and std and inflation (rows,) of its residuals.
 
     The prior counts `Prior.tempering` times more for the values than for their covariance; drives' inertia is positive
     and friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
@@ -118,12 +118,12 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     """
     pooled, noise = problem.pooled, problem.noise
     std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
-    fit, covariance, known = _drawn(problem, prior, std, tau, tempering)
+    fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
     rounds = 2  # of weighing rows by the residuals that richer friction leaves
     for _ in range(rounds):
         own = fit.estimate
         std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tau, noise)
-        fit, covariance, known = _drawn(problem, prior, std, tau, tempering)
+        fit, covariance, known = _regularised(problem, prior, std, tau, tempering)
     values = _braking(problem, fit.estimate.values, std * np.sqrt(tau), known)
     covariance[: problem.base.b, : problem.base.b] *= tempering
     stated = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(tau))

@@ -26,7 +26,7 @@ class _Simulated(Method):
     instruments: str = ""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the base columns; weights and inflation beside it are those of WLS.
+        """Return the estimate of the base columns, with weights and inflation from WLS.
 
         Raises:
             UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
@@ -40,7 +40,7 @@ class _Simulated(Method):
         return replace(found, seconds=plain.seconds + found.seconds)
 
     def beside(self, problem: IdentificationProblem, plain: MethodEstimate) -> MethodEstimate:
-        """Return the same beside least squares that is there already."""
+        """Return the estimate, given the least-squares estimate `plain`."""
         model, loop = problem.model, problem.loop
         if loop is None or not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
             raise UsageError("instruments from simulation are for motor torques alone")

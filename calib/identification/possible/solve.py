@@ -329,7 +329,7 @@ class Contradiction:
 
 
 def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
-    """Return how far an estimate is from what can exist; None where its rows hold no bodies, or nothing was found.
+    """Return the distance of an estimate from the nearest physically consistent robot; None where no solver converged.
 
     Args:
         found: the estimate, of torques.
