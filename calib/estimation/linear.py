@@ -93,7 +93,7 @@ def subsystem_std(data: Triangles) -> np.ndarray:
         own = split_columns(factor[:, :p], tolerance=1e-8).kept
         if data.rows[g] <= len(own):
             raise CalibError(
-                f"group {g} has {data.rows[g]} rows for {len(own)} parameters of its own: no residual is left to estimate "
+                f"group {g} has {data.rows[g]} rows for {len(own)} parameters of its own: no residual is left for "
                 "its noise; state the standard deviations"
             )
         rest = retriangulate(factor[:, np.append(own, p)])[-1, -1]

@@ -214,7 +214,7 @@ class _Bench:
             return columns, self.errors([*taken, *columns]), _flat(everyone)
 
         def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
-            """Return the squared errors (blocks,) of the torque rows that terms of these joints act on, whitened row by row."""
+            """Return the whitened squared errors (blocks,) of the torque rows that terms of these joints act on."""
             rows = [row for j in own for row in self.candidates.torque_rows.of_side(side, j, self.candidates.n)]
             return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
 

@@ -49,7 +49,7 @@ class GearWave:
 
 @dataclass(frozen=True)
 class RippleWaves:
-    """Ripple of a joint, counted from 1, and the share of the high-frequency residual's power it explains when held out."""
+    """Ripple of a joint, from 1, and the share of the residual's high-frequency power that it explains, held out."""
 
     joint: int
     waves: tuple[GearWave, ...]

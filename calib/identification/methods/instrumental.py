@@ -436,7 +436,7 @@ def _distance(runs: Runs) -> np.ndarray:
 
 
 def _stray(runs: Runs) -> np.ndarray:
-    """Return (n,) the regression slope of q_ref - q on q_ref - q_s, which noise in q does not bias; see `Instrumental`."""
+    """Return (n,) the slope of q_ref - q on q_ref - q_s, which noise in q does not bias; see `Instrumental`."""
     pairs = []
     for (case, loop), run in runs:
         motion, used = case.motion, simulated_samples(case, run.t, loop)
