@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import frozen, shaped
+from calib.arrays import shaped
 from calib.errors import refuse_robot
 from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, check_reachable, closing, inseparable
 from calib.robot.chain import Chain, random_joints
@@ -26,8 +26,6 @@ from calib.robot.formats.readback import configurations, driven_joints
 from calib.robot.formats.urdf_tree import Node, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
 from calib.transforms import pose
-
-DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +299,7 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
     if path.suffix != ".urdf":
         return {}
     folders, found = list(path.resolve().parents), dict[str, Path | str]()
-    for _, _, node in _meshes(path, "collision"):
+    for _, _, node in urdf_meshes(path, "collision"):
         name = node.attributes.get("filename", "")
         inner, mesh = name.removeprefix("package://"), find_mesh(name, folders)
         if mesh is not None and not inner.startswith(("/", "file:")) and ".." not in Path(inner).parts:
@@ -309,39 +307,7 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class Visual:
-    """A mesh file that moves with a link: its placement (4, 4) in the link's frame, its scale (3,)."""
-
-    link: str
-    file: Path
-    placement: np.ndarray
-    scale: np.ndarray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "placement", frozen(self.placement))
-        object.__setattr__(self, "scale", frozen(self.scale))
-
-
-def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of a URDF's ``<visual>`` elements, and the names of those that were not found.
-
-    Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse
-    the whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
-    """
-    places, found, missing = list(Path(path).resolve().parents), [], []
-    for link, visual, mesh in _meshes(path, "visual"):
-        name = mesh.attributes.get("filename", "")
-        file = find_mesh(name, places)
-        if file is None or file.suffix.lower() not in DRAWABLE:
-            missing.append(name)
-            continue
-        scale = numbers(mesh, "scale", str(path), "1 1 1")
-        found.append(Visual(link.attributes.get("name", ""), file, origin(visual, str(path)), scale))
-    return found, missing
-
-
-def _meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
+def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
     """Return each mesh of a URDF's ``<visual>`` or ``<collision>`` elements, with its link and its element."""
     shapes = [(link, node) for link in parse(text(path)[0], str(path)).all("link") for node in link.all(tag)]
     return [(*own, mesh) for own in shapes for shape in own[1].all("geometry") for mesh in shape.all("mesh")]

@@ -25,9 +25,9 @@ from calib.procedure.measuring.run import is_run, rehearsed_samples
 from calib.records import shielded
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
-from calib.robot.collision import Visual, visuals
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.load import load, resolve
+from calib.rooms.viewer.visuals import Visual, visuals
 from calib.transforms import invert
 
 FRAMES = 50.0  # positions of the arm per second of motion; our choice

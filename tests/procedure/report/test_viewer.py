@@ -14,7 +14,6 @@ import pytest
 from calib import cli
 from calib.errors import UsageError
 from calib.geometry import installation
-from calib.robot.collision import visuals
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.load import load
@@ -22,6 +21,7 @@ from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.viewer import scene as viewing
 from calib.rooms.viewer import viewer
+from calib.rooms.viewer.visuals import visuals
 
 
 @pytest.fixture(scope="module")
