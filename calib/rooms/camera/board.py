@@ -87,7 +87,7 @@ class Board:
         return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
 
     def checked(self) -> Board:
-        """Return a board made by hand, checked as one from a file.
+        """Return this board after the checks that a board read from a file gets.
 
         Raises:
             ValueError: where a value cannot be.

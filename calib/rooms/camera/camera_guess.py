@@ -1,4 +1,4 @@
-"""What images do not say of themselves: the lens, whether the arm carries camera or board, and their first placement.
+"""What has to be found before a fit of images: the lens, whether the arm holds camera or board, and first placements.
 
 Every image gives the board's pose by its corners alone (`calib.rooms.camera.board_pose`); the arm's poses beside them
 place camera and board in closed form (`calib.rooms.camera.robust_placement`). Both ways of mounting are tried.
@@ -33,7 +33,7 @@ LOST = 0.2  # median misfit over the distance to the board beyond which nothing 
 
 @dataclass(frozen=True, eq=False)
 class CameraPlacement:
-    """What a block of images says of camera and board by itself.
+    """Where camera and board are, estimated from one block of images.
 
     Attributes:
         rows: (k,) the rows that were looked at.
@@ -91,7 +91,7 @@ def _lens_of(block: Pixels) -> Lens:
 
 
 def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.ndarray:
-    """Return the board's poses (k, 4, 4) in the camera at some rows, by each image alone.
+    """Return the board's poses (k, 4, 4) in the camera's frame at some rows, each from its own image.
 
     `max_at_once`: images whose corners are looked at together.
     """
@@ -100,7 +100,7 @@ def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.nd
 
 
 def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: float = 1.1774) -> Pixels:
-    """Return the block without corners that lie far off all others of their image, which its notes name.
+    """Return the block without outliers among the corners; its notes name them.
 
     A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
 
@@ -125,12 +125,12 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: floa
         return block
     max_named = 3
     named = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), max_named)
-    words = f"{len(gone)} of {before.sum()} corners do not fit into their image and are left out: {named}"
+    words = f"{len(gone)} of {before.sum()} corners are outliers in their image and are left out: {named}"
     return replace(block, notes=(*block.notes, words))
 
 
 def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return the rows of images that show the board elsewhere than all others do, and what is to be said of them.
+    """Return the rows of images that contradict the others, and the sentence that names them.
 
     Raises:
         MeasurementError: where they are many.
@@ -147,7 +147,7 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
         return strange, ""
     turned = far(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= most
     cause = (
-        "they would fit turned by 180°: were they turned by a program?"
+        "turned by 180° they would fit: did a program rotate them?"
         if turned.mean() > 0.5
         else "are their joint values those of other images, or was camera or board moved?"
     )
@@ -160,12 +160,12 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
-    """Return poses of what the arm carries, in the frame of what stands: of board poses (m, 4, 4) in the camera."""
+    """Return poses (m, 4, 4) of the moving one of camera and board in the fixed one, from board poses in the camera."""
     return invert(poses) if mounting == IN_HAND else poses
 
 
 def pnp_poses(block: Pixels) -> Poses:
-    """Return images as poses of what the arm carries, each by its own corners alone: what a pose fit would get."""
+    """Return images as measured poses, each from its corners alone (PnP), as a fit of poses would take them."""
     seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
     return Poses(
         block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), station=block.station,

@@ -1,4 +1,4 @@
-"""Whether a camera sees its board, where from, and what an image would reveal: pose selection with a camera.
+"""Pose selection with a camera: which poses see the board, and what an image there would identify.
 
 ``[camera]`` of the constraints file states the camera (`calib formats constraints`).
 """
@@ -42,7 +42,7 @@ TRIES = 60
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """What it takes to see the board, as a constraint: q (m, n) -> (m, 19), kept where <= 0.
+    """The constraint that the camera sees the whole board: q (m, n) -> (m, 19), met where <= 0.
 
     Attributes:
         cell: the arm with camera and board where they roughly are.
@@ -99,7 +99,7 @@ class CameraView:
 
     @property
     def assumed(self) -> str:
-        """What a prediction of accuracy takes for granted, in words."""
+        """The assumptions of a predicted accuracy, as a sentence."""
         return ASSUMED
 
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
@@ -172,7 +172,7 @@ class ImageObservation(Observation):
     product = None  # type: ignore[assignment]
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where what the arm carries is in its base (m, 3) [m], and its Jacobian (m, 3, p), not whitened."""
+        """Return position (m, 3) [m] of camera or board on the arm, and Jacobian (m, 3, p), not whitened."""
         seen = see(self.cell, q, -1)
         columns = target_jacobian(self.cell, seen, self.free, -1, np.zeros(len(q), dtype=int))
         return seen.point.T, columns[:, :3].transpose(2, 1, 0)

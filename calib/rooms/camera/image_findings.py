@@ -1,4 +1,4 @@
-"""What a fit says of its images: how well corners are predicted, what the arm adds, where the scale is from."""
+"""Findings on the images of a fit: reprojection error, errors of the arm in it, coverage, scale of the board."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,7 +48,7 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques
 
 
 def image_words(block: Pixels) -> str:
-    """Return what is said of images as they arrive: corners, mounting, lens, coverage."""
+    """Return a sentence on images that have just arrived: corners, mounting, lens, coverage."""
     lens = block.lens
     focal = "" if lens is None else f", focal length {lens.values[0]:.0f} px {'given' if block.known else 'found'}"
     seen = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"

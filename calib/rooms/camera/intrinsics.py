@@ -1,4 +1,4 @@
-"""A lens from images of a board alone, and whether they identify it.
+"""The lens estimated from images of a board, and whether it is identifiable from them.
 
 Zhang's (2000) problem, min over lens and one pose per image of the reprojection error, by variable projection (Golub &
 Pereyra 1973; Kaufman 1975): for a lens every image has its own best pose, and what a QR of its rows leaves beyond those
@@ -74,7 +74,7 @@ def estimate_lens(
 
 
 def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) -> tuple[Lens, float, np.ndarray]:
-    """Return the best lens, its reprojection error per coordinate [px], and ∂residual/∂values beside free poses."""
+    """Return the best lens, its reprojection error [px], and ∂residual/∂values with the poses projected out."""
     middle, zero = 0.5 * (np.array(size) - 1.0), np.zeros({"pinhole": 5, "fisheye": 4}[model])
     starts = [Lens(model, np.array([f * max(size), f * max(size), *middle, *zero]), size) for f in STARTS]
     max_tried = 8  # images that they are tried on (our choice)
@@ -110,7 +110,7 @@ def _squares(rows: np.ndarray) -> float:
 
 
 def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
-    """Return [∂residual/∂values, residual] of all images, what each one's own six numbers of a pose take left out."""
+    """Return [∂residual/∂values, residual] of all images with each image's pose projected out."""
     table, rows = corners(board), []
     for where, own in zip(board_poses(lens, board, pixel).poses, pixel):
         seen = ~np.isnan(own[:, 0])

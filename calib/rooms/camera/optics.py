@@ -1,4 +1,4 @@
-"""What an image adds to an installation: lenses, and the shape of boards as printed; their parameters and derivatives.
+"""Parameters that images add to an installation: lenses, and the shape of boards as printed; with derivatives.
 
 A corner (x, y, 0) of the table stands on the board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y counted
 from the board's middle: s is the scale of the print, b how the board bends [1/m]. In ``robot.toml`` of a fit::

@@ -1,4 +1,4 @@
-"""What an image says of the geometry: the corners of one rigid board, as one pose and a table.
+"""Residuals of images of a rigid board: its corners, with the pose that all corners of an image share.
 
     r = y - π(P c + p),   ∂π/∂x = ∂π/∂point · (ω × R c + v) + ∂π/∂lens + ∂π/∂point · R ∂c/∂shape
 
@@ -6,7 +6,7 @@ with (R, p) the board in the camera's frame. All corners of an image share the s
 2K x (6 + k + 1) matrix leaves 6 + k + 1 rows of the least-squares problem, the same problem (Golub & Van Loan 2013,
 sec. 5.3), so that thousands of images take the memory of thousands of poses.
 
-How wrong images are: corners one by one, and all corners of an image together.
+Noise of images: of each corner alone, and of all corners of an image together.
 
     r_i = J_i M_i ξ_i + ε_i,   ε ~ N(0, f² σ²),   ξ ~ N(0, diag(s_v², s_v², s_v², s_ω², s_ω², s_ω²))
 
@@ -65,11 +65,11 @@ class ImageNoise:
         return np.repeat([self.displacement, self.turn], 3)
 
     def unweighted(self, images: int) -> ImageNoise:
-        """Return the noise of as many images of full weight, at the state at hand."""
+        """Return this noise for `images` images of weight 1, without the stored `shared`."""
         return replace(self, weight=np.ones(images), shared=None)
 
     def near(self, other: ImageNoise) -> bool:
-        """Say whether two estimates are alike, so that the fit need not be repeated."""
+        """Return whether two estimates are so close that the fit need not be repeated."""
         pairs = ((self.factor, other.factor), (self.displacement, other.displacement), (self.turn, other.turn))
         alike = all(abs(a - b) <= MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE for a, b in pairs)
         return alike and np.abs(self.weight - other.weight).max(initial=0.0) < 0.05
@@ -77,7 +77,7 @@ class ImageNoise:
 
 @dataclass(frozen=True, eq=False)
 class OwnPoses:
-    """What the images say of themselves: k of them, each fitted with a pose of its own.
+    """Estimates of k images, each fitted with a pose of its own.
 
     Attributes:
         residual: (k, 6) of what the arm carries: best pose minus predicted [v; ω].
@@ -212,7 +212,7 @@ class PixelPart(Part):
         return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
-        """Return what the images say with a pose of their own each, at sigmas `scale` (2, N)."""
+        """Return estimates in which each image has a pose of its own, at sigmas `scale` (2, N)."""
         images, first = np.unique(self.index, return_index=True)
         counts = np.diff(np.append(first, len(self.index)))
         table = np.concatenate([self.local[:, :, :6], self.value.T[:, :, None]], axis=2) / scale.T[:, :, None]
@@ -232,7 +232,7 @@ class PixelPart(Part):
         return replace(noise, weight=weight, shared=self._shared_errors(noise))
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
-        """Return the corners' residuals (2, N) [px] that their image's own best pose leaves."""
+        """Return the corners' residuals (2, N) [px] after fitting each image's own pose."""
         images, place = np.unique(self.index, return_inverse=True)
         found = self.own_poses(sigma)
         moved = np.einsum("kij,kj->ki", self.carried[images], found.residual)

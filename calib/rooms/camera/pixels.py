@@ -1,4 +1,4 @@
-"""Corners of a board in images: what a camera measures; one image is one row."""
+"""Measurements by a camera: corners of a board in images; one image is one row."""
 
 from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar

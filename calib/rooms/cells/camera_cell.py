@@ -202,7 +202,7 @@ def _points(found: CameraCell, poses: np.ndarray) -> np.ndarray:
 def photograph(
     found: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
 ) -> Pixels:
-    """Return the corners seen at q (m, n), each with white noise [px]; the lens is left to be found.
+    """Return the corners seen at q (m, n), each with white noise [px], as images whose lens is not known.
 
     The recorded joints carry the encoders' noise.
     """
@@ -282,7 +282,7 @@ def seen_by_camera(cell: Cell) -> CameraCell:
 
 @contextmanager
 def limits_of(found: CameraCell) -> Iterator[Path]:
-    """Yield a constraints file with the camera's rough place, beside its lens and its board."""
+    """Yield a constraints file with the camera's rough place; lens and board files are in its folder."""
     truth, middle = found.cell.truth, pose(None, 0.5 * np.array([*found.board.extent, 0.0]))
     places = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
     stated = {name: [np.round(part, DIGITS).tolist() for part in to_xyz_rpy(place)] for name, place in places.items()}

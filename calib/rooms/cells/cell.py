@@ -1,4 +1,4 @@
-"""A robot cell with known truth: the arm as it really is, and the instrument that looks at it.
+"""A simulated robot cell with known true parameters: the arm, and the instrument that measures it.
 
     y_i = S_true · arm_true(q_i + δ(q_i)) · X_true · noise,     q_recorded = q_i + encoder noise,
 

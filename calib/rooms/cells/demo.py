@@ -42,7 +42,7 @@ LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their no
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demonstration came to: the session, its verdict ("" where it stopped), what to look at, and how long.
+    """The result of the demonstration: the session, its verdict ("" where it stopped), files to look at, and duration.
 
     Attributes:
         asks: what to do now, where it stopped for an engineer.

@@ -1,4 +1,4 @@
-"""What an engineer brings from the cell: a measured block, or a log, as the CSV files that `calib` reads."""
+"""Simulated measurements and logs, written as the CSV files that `calib` reads."""
 
 import io
 from collections.abc import Iterator

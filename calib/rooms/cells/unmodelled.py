@@ -1,4 +1,4 @@
-"""What real arms do and no parameter of this toolkit holds: errors of position and torque outside every model.
+"""Unmodelled effects of real arms: errors of position and torque that no parameter of this toolkit describes.
 
 Errors of position, of joint j at the i-th pose of a series,
 
@@ -33,7 +33,7 @@ CABLE = 0.5  # [rad]
 
 
 def _named(parts: Sequence[tuple[float, str]]) -> str:
-    """Return the words of those of (size, words) that are there, as the end of a sentence; empty where none is."""
+    """Return the words of effects (size, words) with a size above 0, as the end of a sentence; empty without any."""
     named = ", ".join(words for size, words in parts if size)
     return f"; in no model: {named}" if named else ""
 

@@ -164,13 +164,13 @@ def _held(torque: np.ndarray) -> np.ndarray:
 
 
 def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the motors' torques (N, n) by the plant's own model [N m or N]."""
+    """Return the motors' torques (N, n) of the simulated robot's rigid model with friction [N m or N]."""
     model = IdentificationModel(arm.plant.bodies, arm.plant.terms)
     return np.einsum("kij,j->ki", model.regressor(q, v, a), arm.plant.parameters)
 
 
 def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return what the motors bring up besides (N, n) [N m or N]; t (N,) since the arm was cold [s]."""
+    """Return the torques (N, n) of unmodelled effects [N m or N]; t (N,) since the arm was cold [s]."""
     parameters = dict(zip((one.name for one in arm.plant.terms), arm.plant.parameters[arm.plant.inertial :]))
     viscous, coulomb = (
         np.array([parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"] for j in range(arm.chain.n)])

@@ -184,8 +184,8 @@ def read_study(
     names = [condition.name for condition in conditions]
     if twice := next((name for name in names if names.count(name) > 1), ""):
         raise UsageError(
-            f"there are two conditions '{twice}': name a value once in its list, and give noises (and studies of "
-            "several files) names of their own"
+            f"two conditions are named '{twice}': list each value once, and give noises (and studies of "
+            "several files) different names"
         )
     _check_cutoffs(conditions)
     counts = tuple(_counts(one, methods, runs) for one, _ in found)

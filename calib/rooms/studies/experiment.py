@@ -199,7 +199,7 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
 
 
 def _loop(condition: Condition, controller: Controller) -> LoopSettings:
-    """Return the loop as it is believed to be."""
+    """Return the loop settings that methods are given, wrong where the condition says so."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
     known = known_robots.truth(condition.robot)
     return LoopSettings(

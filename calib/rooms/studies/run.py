@@ -1,4 +1,4 @@
-"""Running what a study lacks: tasks to workers, rows to the store as they come."""
+"""Running the missing trials of a study: tasks go to workers, rows to the store as they arrive."""
 
 import time
 from collections import Counter
@@ -37,7 +37,7 @@ class Progress:
 
     @property
     def remaining(self) -> float:
-        """Seconds that are left, by each method's own pace so far and by how many run at once."""
+        """Seconds that remain, from each method's mean time so far and the number of trials in parallel."""
         paces = {name: sum(own) / len(own) for name, own in self.spent.items()}
         if not paces or self.seconds <= 0:
             return float("nan")
@@ -62,7 +62,7 @@ def span(seconds: float) -> str:
 
 
 def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
-    """Yield the tasks whose rows a store lacks; data set by data set, so that all conditions fill up alike."""
+    """Yield the tasks whose rows a store lacks, data set by data set, so that all conditions progress equally."""
     most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
     for number in range(most):
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
@@ -74,7 +74,7 @@ def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
 
 
 def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress], None]) -> Progress:
-    """Run what is missing; rows are in the store as soon as they are there.
+    """Run the missing trials of a study; each row is stored as soon as it arrives.
 
     Args:
         say: called with how far it is, now and then.

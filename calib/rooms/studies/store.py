@@ -1,4 +1,4 @@
-"""The store of a study: rows of trials in a folder, keyed, appended as they come, never counted twice.
+"""The store of a study: rows of trials in a folder, appended as they arrive, each key once.
 
 rows.csv       rows since the last command ended, one line each, flushed to the disk as trials end: a killed process
                loses at most the line it was writing, and that line is taken off when the store is opened again
@@ -50,7 +50,7 @@ class RowStore:
         self._journal = _open_journal(folder / JOURNAL, good)
 
     def holds(self, key: tuple[str, str, int]) -> bool:
-        """Tell whether a trial is there, by its method as it is now."""
+        """Return whether the store holds a trial of the method's present version."""
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:
@@ -85,7 +85,7 @@ class RowStore:
         )
 
     def settle(self) -> Path:
-        """Write all rows as Parquet, where pyarrow is there, and start the journal anew; return where the rows are."""
+        """Write all rows as Parquet if pyarrow is installed, and empty the journal; return the rows' file."""
         try:
             content = _parquet(self.rows.values())
         except ImportError:

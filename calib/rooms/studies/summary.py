@@ -1,4 +1,4 @@
-"""What rows say: figures of merit of each method on each condition, and which methods can be distinguished.
+"""Summaries of trials: figures of merit of each method on each condition, and which methods differ significantly.
 
 Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
 on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
@@ -105,11 +105,11 @@ class ConditionSummary:
 
 
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
-    """Return what rows say of a study's conditions, all methods that have any.
+    """Return the summary of each condition of a study over all methods with rows.
 
     Rows of other conditions do not count, nor do those of a method that has changed since.
 
-    What a study asks for is what is to be run; what is there stays in sight when a method is added or taken out.
+    Methods that the study no longer asks for stay in the summary while their rows are stored.
     """
     kept: dict[str, dict[str, list[TrialRow]]] = {}
     for row in (one for one in rows if one.current):

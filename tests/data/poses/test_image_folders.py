@@ -96,7 +96,7 @@ def test_too_few_usable_images_are_refused_with_the_reasons(folder):
         (lambda f: (f / "board.toml").unlink(), "has no board.toml"),
         (lambda f: (f / "joints.csv").unlink(), "has no joints.csv"),
         (lambda f: (f / "joints.csv").write_text((f / "joints.csv").read_text().replace("0002", "0001")), "2 times"),
-        (lambda f: [p.unlink() for p in f.glob("*.png")], "none of the images that joints.csv names is there"),
+        (lambda f: [p.unlink() for p in f.glob("*.png")], "none of the images named in joints.csv exists"),
         (
             lambda f: write_lens(Lens(LENS.model, LENS.values, (640, 480)), f / "camera.yaml"),
             "is about images of 640 x 480 pixels, those beside it have 480 x 360",

@@ -13,7 +13,7 @@ POINT = 0.0254 / 72.0  # PDF's unit [m]
 
 
 def charuco(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return OpenCV's own of a ChArUco board; lengths in metres."""
+    """Return OpenCV's object of a ChArUco board; lengths in metres."""
     size = board.columns, board.rows
     with quiet():
         return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))

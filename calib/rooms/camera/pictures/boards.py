@@ -70,7 +70,7 @@ def make(
 
 
 def _as_printed(out: Path) -> bool:
-    """Tell whether a folder's ``board.toml`` is that of its ``board.svg``, as `make` left both."""
+    """Return whether a folder's ``board.toml`` still describes its ``board.svg``, as `make` wrote both."""
     from calib.rooms.camera.pictures import board_print
 
     try:
@@ -86,7 +86,7 @@ def _as_printed(out: Path) -> bool:
 
 
 def look(folder: Path, show: Show) -> list[str]:
-    """Look at the images of a folder; return what was found, in sentences."""
+    """Find the board in the images of a folder; return the result in sentences."""
     board = read_own_board(folder)
     names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
     found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
@@ -102,7 +102,7 @@ def _images(folder: Path) -> list[str]:
 
 
 def _summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
-    """Return what was found in images, in sentences: how many are of use, why others are not, what they cover.
+    """Return sentences on detected corners: how many images are usable, why others are not, what they cover.
 
     Raises:
         MeasurementError: where none is of use, with the reasons.
@@ -127,7 +127,7 @@ def _summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
 def from_bag(
     bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Show
 ) -> list[str]:
-    """Make a folder of images' corners and joint values from a bag; return what was found, in sentences."""
+    """Write the corners and joint values of a bag's images as a folder; return the result in sentences."""
     from calib.rooms.camera.pictures.image_bags import read_image_bag, write_image_folder
 
     made = boards.read_board(board)

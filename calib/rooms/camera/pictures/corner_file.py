@@ -1,4 +1,4 @@
-"""``corners.csv``: what was found in the images of a folder, one row per corner; and why others are of no use.
+"""``corners.csv``: the corners detected in the images of a folder, one per row, and why other images are unusable.
 
 Columns ``image``, ``corner``, ``u [px]``, ``v [px]``, ``sigma [px]``; an image without a usable board has one row with
 its ``problem`` and nothing else. Written beside the images, so that they are looked at once; a file that another
@@ -20,7 +20,7 @@ USUAL = 0.1  # sigma where a file states none [px]; our choice
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What was found in one image.
+    """The corners detected in one image.
 
     Attributes:
         pixel: (K, 2) of each corner of the board; NaN where it was not seen.

@@ -87,7 +87,7 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _upright(image: np.ndarray, found: np.ndarray, board: Board) -> np.ndarray:
-    """Return a chessboard's corners from the corner beside the black square in its upper left."""
+    """Return a chessboard's corners in the order that begins at the black square in its upper left."""
     inner = found.reshape(board.rows - 1, board.columns - 1, 2)
 
     def level(a: np.ndarray, b: np.ndarray) -> float:
@@ -163,7 +163,7 @@ def _widths(across: np.ndarray, down: np.ndarray, contrast: float) -> tuple[floa
 
 
 def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, thorough: bool) -> str:
-    """Return why no board was found."""
+    """Return the likely reason why no board was detected."""
     if count:
         return f"only {count} corners of the board are seen ({MIN_CORNERS} are needed): move it into view"
     if np.percentile(image[::5, ::5], 99) < 30:
@@ -188,7 +188,7 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
 
 
 def _other_dictionary(image: np.ndarray, board: Board) -> str:
-    """Return the dictionary of which the most markers are found; empty where hardly any are."""
+    """Return the dictionary with the most detected markers; empty where hardly any are detected."""
     own = board.dictionary.split("_")[0]
     others = [each for each in DICTIONARIES if each.endswith("_100") or each.startswith("apriltag_36h11")]
     counts = {each: _markers(image, each) for each in others if each.split("_")[0] != own}
@@ -216,7 +216,7 @@ def detected(
     count: int = 0,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Found:
-    """Look for a board in images, files or arrays, by name.
+    """Detect a board in images (files or arrays) and return the corners by image name.
 
     Images of another size than most are of no use: a camera's lens is that of one size.
     """

@@ -84,7 +84,7 @@ def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
 
 
 def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
-    """Yield the wanted images as grey levels, one by one, in their order."""
+    """Yield the images of these numbers as grey levels, in their order."""
     for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
         if number in wanted:
             yield _grey(reader.deserialize(raw, connection.msgtype))

@@ -1,4 +1,4 @@
-"""A folder of images of a board beside the joint values: what a camera brings.
+"""A folder of images of a board, with the joint values at each image.
 
 ==================  ===================================================================================================
 ``*.png`` …         the images (png, jpg, tif, bmp, pgm, webp), as the sensor gave them
@@ -125,7 +125,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
             return kept
     if not images:
         missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
-        raise MeasurementError(f"none of the images that {JOINTS} names is there ({missing})", path)
+        raise MeasurementError(f"none of the images named in {JOINTS} exists ({missing})", path)
     from calib.rooms.camera.pictures.detection import detected  # loads OpenCV: only where images are looked at
 
     found = detected(((each.name, each) for each in images), board, len(images), progress)
@@ -135,7 +135,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
 
 
 def _usable(names: Sequence[str], found: Found, path: Path, min_images: int = 3) -> tuple[np.ndarray, list[str]]:
-    """Return the rows (of the table) whose images are of use, and what is to be said of the others.
+    """Return the table's rows whose images are usable, and sentences on the others.
 
     `min_images`: usable images below which a folder is refused.
     """
@@ -159,7 +159,7 @@ def _usable(names: Sequence[str], found: Found, path: Path, min_images: int = 3)
 
 
 def problem_words(problems: Mapping[str, str]) -> list[str]:
-    """Return why images are of no use, one sentence per reason, with their names; of its numbers the range is told."""
+    """Return a sentence per reason why images are unusable, with their names and the range of the numbers in it."""
     reasons: dict[str, list[str]] = {}
     for name, problem in problems.items():
         if problem:
@@ -174,7 +174,7 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
 
 
 def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
-    """Return the folder's lens and whether it was given; None where it is to be found from the images."""
+    """Return the folder's lens and whether it was given; None where it has to be estimated from the images."""
     place = path / LENS
     if not place.is_file():
         if options.camera.intrinsics == "given":

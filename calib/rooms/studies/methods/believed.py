@@ -1,4 +1,4 @@
-"""The robot that a problem's parameters make, to be simulated, and where methods that simulate it start."""
+"""The simulated robot with a problem's parameters, and the values that methods which simulate it start from."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -122,7 +122,7 @@ def start_of(
 
 
 def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
-    """Return parameters (p,) of bodies that are hubs: of this inertia about their own axis, or mass along it."""
+    """Return parameters (p,) of bodies with this inertia about their joint's axis alone, or this mass along it."""
     result = np.zeros(model.p)
     for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
         if coordinate >= 0:

@@ -37,7 +37,7 @@ NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider on
 
 @dataclass(frozen=True)
 class _KalmanFilter(Method):
-    """A method that carries parameters along as states; see the module.
+    """A Kalman filter whose states include the parameters; see the module.
 
     Attributes:
         kind: rule and form.

@@ -80,7 +80,7 @@ def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
 
 
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
-    """Return the points (2 L + 1, L) of a sigma-point rule, the mean first, `narrower` than the rule's own."""
+    """Return the points (2 L + 1, L) of a sigma-point rule, the mean first; `narrower` scales their distance."""
     deviations, gamma = before.deviations, narrower * _gamma(kind, len(before.mean))
     return np.concatenate(
         [before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T]

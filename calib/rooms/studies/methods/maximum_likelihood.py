@@ -179,7 +179,7 @@ def _inverse(other: np.ndarray, noise: np.ndarray, used: np.ndarray) -> np.ndarr
 
 
 def _torque_noise(task: _NoisyStates, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Return Σ_τ (n,) that maximises the likelihood beside the positions' noise, parameters held."""
+    """Return the torque noise Σ_τ (n,) of maximum likelihood for fixed parameters and position noise."""
     parts = [_residuals(task, part, values) for part in task.parts]
     residual, other = (np.concatenate(x) for x in zip(*((r, more) for r, _, more in parts)))
     left = max(1.0 - len(values) / task.present.sum(), 0.1)  # of the residuals, after the fit
