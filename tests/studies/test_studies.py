@@ -84,7 +84,7 @@ def test_what_a_condition_is_called_is_no_part_of_what_it_is():
         ('"rv2sq"', '"rv2"', "did you mean 'rv2sq'"),
         ("duration", "cutoff = 70\nduration", "expected less than 70 Hz, half the rate of the rv2sq's log"),
         ('"1e-4 deg"', '"-1e-4 deg"', "sigma_q: expected 0 or more, found '-1e-4 deg'"),
-        ("[[noise]]", '[[noise]]\nname = "1"\nsigma_q = 0\nsigma_tau = 0\n[[noise]]', "two conditions are named 'small-1'"),
+        ("[[noise]]", '[[noise]]\nname = "1"\nsigma_q = 0\nsigma_tau = 0\n[[noise]]', "are named 'small-1'"),
     ],
 )
 def test_a_file_that_is_no_study_is_told_why(tmp_path: Path, old: str, new: str, said: str):
