@@ -240,7 +240,7 @@ def polish_frames(
     settings: Settings | None = None,
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> GeometricFit:
-    """Fit stations and tools only, the arm staying as it is: what 'nominal' errors are measured with."""
+    """Return the fit of station and tool placements alone, the arm unchanged: it gives the 'nominal' errors."""
     return fit(cell, measured, layout(cell).frame_index, settings=settings, torques=torques)
 
 

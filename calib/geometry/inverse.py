@@ -1,4 +1,4 @@
-"""Joint values that put an arm's tool where it is wanted, deflections included; all targets at once.
+"""Inverse kinematics: joint values that put an arm's tool on its targets, deflections included; all targets at once.
 
 Damped Gauss–Newton (Levenberg 1944) on  e(q) = [p* - p(q);  L · log(R* R(q)ᵀ)],  one damping per target:
 
@@ -29,7 +29,7 @@ DOF = (6, 5, 3)
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What is wanted of an arm.
+    """The arm, its limits, and how many components of a target pose count.
 
     Attributes:
         cell: the arm with one station and one tool; targets are the tool's poses in the station's frame.

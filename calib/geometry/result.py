@@ -122,7 +122,7 @@ def calibrated_chain(
     if not whole.deflection.terms:
         rigid = found
     if rigid is None:
-        raise UsageError("a fit with joint corrections needs the best fit without them beside it")
+        raise UsageError("a fit with joint corrections needs the best fit without them as well")
     chain = rigid.cell.chain
     own = np.flatnonzero(rigid.free < len(chain.elements))
     covariance = None

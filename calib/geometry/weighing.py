@@ -155,7 +155,7 @@ class Weigher:
 
 
 def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
-    """Return the stated sigmas of a part, or one estimated from its residuals, as (rows, m)."""
+    """Return standard deviations (rows, m) of a part: those of the file, or one estimated from its residuals."""
     if part.sigma is not None:
         return part.sigma
     if start:

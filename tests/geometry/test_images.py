@@ -300,7 +300,7 @@ def test_a_flat_board_has_one_pose_even_from_afar():
 
 @pytest.mark.parametrize("method", ["Shah", "Li", "Park-Martin"])
 def test_every_closed_form_places_exact_poses(method, monkeypatch):
-    from calib.geometry.hand_eye import place_pose
+    from calib.geometry.first_guess import place_pose
     from calib.rooms.camera import robust_placement as robust
 
     rng = np.random.default_rng(1)

@@ -130,7 +130,7 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
 
 
 def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, seed: int = 0) -> Folds:
-    """Return folds drawn at random: k-fold, or leave-one-out where `folds` is None.
+    """Return random folds by seed: k-fold, or leave-one-out where `folds` is None.
 
     They ask for interpolation only: on a grid every held-out pose has neighbours among the fitted ones, so that errors
     come out smaller than elsewhere in the workspace. Reflectors of one pose and the two rows of a distance stay

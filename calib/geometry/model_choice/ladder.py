@@ -51,7 +51,7 @@ def _sag(chain: Chain, place: int) -> list[Term]:
 
 
 def _coupling(chain: Chain, known: bool) -> list[Term]:
-    """Return what a joint's own reading and its neighbours' add to it: gear ratio and coupled transmissions."""
+    """Return corrections of a joint by its reading and its neighbours': gear ratio, coupled transmissions."""
     names = chain.names
     near = [(j, i) for j in range(chain.n) for i in (j - 1, j, j + 1) if 0 <= i < chain.n]
     return [Term(names[chain.moving[j]], "joint", i) for j, i in near]

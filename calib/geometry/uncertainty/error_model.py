@@ -66,7 +66,7 @@ class Discrepancy:
 
     @property
     def radius(self) -> float:
-        """Sigmas, as stated, that hold 95 % of the errors."""
+        """Half-width of the 95 % interval, in standard deviations."""
         return max(self.radii)
 
 

@@ -1,4 +1,4 @@
-"""What held-out errors of a fit say of errors to come: what they grow with, and what holds 95 % of them.
+"""Errors on held-out rows as a prediction of future errors: what they grow with, and what holds 95 % of them.
 
 A quantile is taken at the level (n + 1) / n · 95 % of n poses (conformal prediction; Vovk, Gammerman & Shafer 2005). As
 those rows have also chosen the variances, an interval is as much wider as it has to be to hold 95 % of a fold whose

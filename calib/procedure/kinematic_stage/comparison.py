@@ -1,4 +1,4 @@
-"""The nominal arm beside the calibrated one, on the same rows."""
+"""Errors of the nominal and of the calibrated arm on the same rows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MARGIN = 3  # measured numbers per fitted parameter of a placement, below which 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """What a fit expects of its own errors on some rows.
+    """Predicted σ and 95 % interval of the position error on some rows, and the errors themselves.
 
     Attributes:
         sigma: (m,) standard deviation of the tool position error, all axes together [m].
@@ -46,7 +46,7 @@ class Intervals:
 
     @property
     def covered(self) -> float:
-        """Share of the errors found that are within their radius."""
+        """Share of the errors that are within their 95 % interval."""
         return float(np.mean(self.size <= self.radius))
 
     @property
@@ -105,7 +105,7 @@ class Comparison:
 
     @property
     def of_urdf(self) -> Comparison:
-        """The nominal arm beside what a URDF holds: no corrections, nor the errors that were expected with them."""
+        """The same comparison for the URDF alone: without joint corrections and the intervals that include them."""
         return self if self.alone is None else replace(self, errors=(self.errors[0], self.alone), intervals=None)
 
     def record(self, parameters: int = 0) -> ComparedRows:
@@ -158,7 +158,7 @@ def compare_unseen(
     alone: Installation | None = None,
     expected: ErrorModel | None = None,
 ) -> Comparison:
-    """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
+    """Return both arms' errors on unseen rows; base and tool placement are refitted where these rows need it."""
     block, torques, settled, thin = unseen.block, [gravity_of(nominal.chain, unseen.block)], True, None
     if unseen.own_frames:
         placed = [placed_on(cell, block, torques, settings) for cell in (nominal, calibrated)]
@@ -188,7 +188,7 @@ def compare_unseen(
 
 
 def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes: np.ndarray) -> Intervals:
-    """Return what an error model expects on rows, by its sigma there (m,) [m], beside the errors' sizes (m,) [m]."""
+    """Return predicted σ (m,) [m] and interval of an error model on rows, with the errors' sizes (m,) [m]."""
     beyond = np.atleast_2d(expected.beyond(block.q))
     names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
     return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)

@@ -199,7 +199,7 @@ def _found_of(
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
-    """Say that several files share one station where stations of their own explain them far better."""
+    """Return a finding where files share one station and one station per file explains them far better."""
     own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []

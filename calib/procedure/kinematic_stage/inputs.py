@@ -125,7 +125,7 @@ def gather(
 def with_unseen(
     given: Inputs, validate: Sequence[Path | PoseMeasurements], options: FitOptions, settings: FitSettings
 ) -> Inputs:
-    """Return inputs with more rows that were not fitted on; copies of fitted rows are found and prove nothing.
+    """Return inputs with more unseen rows; copies of fitted rows are marked as seen.
 
     Args:
         given: robot, fitted rows, and unseen rows so far.
@@ -296,7 +296,7 @@ def _named(
 
 
 def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return what an arm carries by name, with a number from the second of its sort on."""
+    """Return the name of what the arm holds, numbered from the second of its kind on."""
     number = [each for each in carried if each[0] == own[0]].index(own) + 1
     return f"{own[0]} {number}" if number > 1 else own[0]
 

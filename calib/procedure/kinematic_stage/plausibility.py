@@ -1,4 +1,4 @@
-"""What cannot be of this arm: values for the catalogue's first chapter, which holds the limits and the sentences.
+"""Findings on measurements that cannot be of this arm (catalogue, chapter 1): wrong columns, scale, large changes.
 
 Rows that do not fit, and whether rigid geometry explains the measurements.
 """

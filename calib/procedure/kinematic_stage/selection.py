@@ -230,7 +230,7 @@ def _outlook(
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
-    """Return the files of a selection beside its CSV, of any or of a given one: the prediction, and figures by name."""
+    """Return the files written next to a selection's CSV: the prediction, and figures by name."""
     figures = () if not plots else FIGURES if chosen is None else chosen.figures
     predicted = {} if chosen is not None and chosen.prediction is None else {"prediction": beside(out)}
     return predicted | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}

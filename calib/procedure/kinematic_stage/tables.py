@@ -88,7 +88,7 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
     strange = [name for name in names if name not in place]
     if strange:
         raise UsageError(
-            f"{folder}/covariance.csv does not belong to the robot.toml beside it: '{strange[0]}' is no parameter "
+            f"{folder}/covariance.csv does not belong to the robot.toml next to it: '{strange[0]}' is no parameter "
             "there; fit again"
         )
     back, start = np.eye(len(parameters.names)), parameters.arm

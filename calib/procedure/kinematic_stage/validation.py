@@ -2,7 +2,7 @@
 
 `assess` is called by a fit that was just made and by one read back from its folder; they get the same answer.
 
-May one trust the calibrated arm? The rules' limits and sentences stand in the catalogue, chapter 4.
+The rules of the verdict have their limits and sentences in the catalogue of findings, chapter 4.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -13,8 +13,7 @@ import numpy as np
 from calib.data.poses.choices import IN_HAND, TO_HAND
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.errors import MeasurementError, refuse_data
-from calib.geometry.first_guess import guess
-from calib.geometry.hand_eye import average_pose, misfit
+from calib.geometry.first_guess import average_pose, guess, misfit
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.rooms.camera import pixel_residuals  # noqa: F401  # registers what images say of the geometry

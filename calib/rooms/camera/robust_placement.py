@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.hand_eye import average_pose, by_orientations, misfit
+from calib.geometry.first_guess import average_pose, by_orientations, misfit
 from calib.transforms import invert, orthonormal, pose
 
 
