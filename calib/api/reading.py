@@ -77,8 +77,8 @@ def read_recording(
     from calib.procedure.dynamic_stage.inputs import joints_of  # the dynamics' modules: none of the geometry's
 
     found = mechanism(robot)
-    joints = joints_of(_loaded(cast(Any, robot)).chain) if found is None else found.joints
-    return read_file(path, joints, options or RecordingOptions())
+    chain = _loaded(cast(Any, robot)).chain if found is None else found.chain
+    return read_file(path, joints_of(chain), options or RecordingOptions())
 
 
 def _loaded(robot: str | Path | CalibratedChain) -> CalibratedChain:

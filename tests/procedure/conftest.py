@@ -74,7 +74,7 @@ def calib(capsys: pytest.CaptureFixture[str], figures: bool):
         code = cli.run([str(argument) for argument in arguments] if figures else words(*arguments))
         said = capsys.readouterr()
         lines = [line for line in said.out.splitlines() if not line.lstrip().startswith(("verdict", "warning"))]
-        results_are_tables = {"formats", "explain", "run", "study", "compare", "-v"} & set(arguments)
+        results_are_tables = {"formats", "explain", "run", "study", "compare", "-v", "--help"} & set(arguments)
         assert results_are_tables or len(lines) <= MAX_LINES + 1, "without -v a command prints 25 lines at most"
         return code, said.out, said.err
 
