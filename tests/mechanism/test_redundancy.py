@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from computed_torque import ComputedTorque, simulate
+from platform_sines import sines
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
@@ -35,12 +36,8 @@ def dualv():
 
 def reference(seconds: float = 4.0):
     """Return x, v, a (N, 3): sines of five frequencies on each coordinate."""
-    t, rng = np.arange(int(seconds * RATE))[:, None] / RATE, np.random.default_rng(0)
-    parts = np.zeros((3, len(t), 3))
-    for frequency in (1.5, 2.5, 4.0, 5.5, 7.0):
-        size, phase, w = np.array([0.02, 0.02, 0.12]) * 1.5 / frequency, rng.uniform(0, 6, 3), 2 * np.pi * frequency
-        parts += size * np.stack([np.sin(w * t + phase), w * np.cos(w * t + phase), -(w**2) * np.sin(w * t + phase)])
-    return parts
+    t, frequencies = np.arange(int(seconds * RATE)) / RATE, (1.5, 2.5, 4.0, 5.5, 7.0)
+    return sines(t, frequencies, lambda f: np.array([0.02, 0.02, 0.12]) * 1.5 / f, np.random.default_rng(0))
 
 
 def run(model, values, carried, preload=10.0):
@@ -126,12 +123,8 @@ def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
     values = np.concatenate([model.known_parameters(), [drives[one.name[:2]] for one in model.terms]])
     wrong = []
     for rate in (1000.0, 4000.0):
-        t, rng = np.arange(int(0.5 * rate))[:, None] / rate, np.random.default_rng(0)
-        x, v, a = np.zeros((3, len(t), known.robot.r))
-        for w in 2 * np.pi * np.array([0.7, 1.6]):
-            size, phase = 0.17 * (known.robot.upper - known.robot.lower), rng.uniform(0, 6, known.robot.r)
-            x, v = x + size * np.sin(w * t + phase), v + size * w * np.cos(w * t + phase)
-            a = a - size * w**2 * np.sin(w * t + phase)
+        t, size = np.arange(int(0.5 * rate)) / rate, 0.17 * (known.robot.upper - known.robot.lower)
+        x, v, a = sines(t, (0.7, 1.6), size, np.random.default_rng(0))
         log = simulate(model, values, ComputedTorque(values, rate=rate), x, v, a)
         assert np.abs(log.q - log.reference).max() < 1e-4
         motion, part = along(known, x, v, a), slice(len(t) // 10, None)

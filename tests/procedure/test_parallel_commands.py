@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from platform_sines import sines
 from without_figures import run
 
 import calib as api
@@ -31,13 +32,9 @@ def folder(tmp_path_factory):
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("M5")] = 5.37
-    t, rng = np.arange(1000)[:, None] / 1000.0, np.random.default_rng(0)
+    t, rng = np.arange(1000) / 1000.0, np.random.default_rng(0)
     for name, carried in (("empty", ()), ("load", ("5",)), ("other", ("5",))):
-        x, v, a = np.zeros((3, len(t), 3))
-        for frequency in (1.5, 2.5, 4.0, 5.5):
-            w, size, phase = 2 * np.pi * frequency, np.array([0.02, 0.02, 0.12]), rng.uniform(0, 6, 3)
-            x, v = x + size * np.sin(w * t + phase), v + size * w * np.cos(w * t + phase)
-            a = a - size * w**2 * np.sin(w * t + phase)
+        x, v, a = sines(t, (1.5, 2.5, 4.0, 5.5), np.array([0.02, 0.02, 0.12]), rng)
         q = along(known, x, v, a).posture.q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
         plan = PlatformRegressor(model, np.arange(model.p), values, 10.0, carried)
         tau = plan.torques(plan.motion(x, v, a))
@@ -45,6 +42,10 @@ def folder(tmp_path_factory):
         table = np.column_stack([t, q, tau])
         np.savetxt(path / f"{name}.csv", table, delimiter=",", header=HEAD, comments="")
         if name == "empty":
+            (path / "absent").mkdir()
+            (path / "absent" / "load.csv").write_text((path / "empty.csv").read_text())
+            reversed_ = table * np.where(np.arange(9) == 5, -1.0, 1.0)
+            np.savetxt(path / "reversed.csv", reversed_, delimiter=",", header=HEAD, comments="")
             table[:, [1, 2]] = table[:, [2, 1]]
             np.savetxt(path / "swapped.csv", table, delimiter=",", header=HEAD, comments="")
             table = np.column_stack([t, q[:, :3], tau[:, :3]])
@@ -59,6 +60,8 @@ def folder(tmp_path_factory):
     motors = "motor1 [deg],motor2 [deg],motor3 [deg],motor4 [deg]"
     table = np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])])
     np.savetxt(path / "poses.csv", table, delimiter=",", header=motors + ",x [mm],y [mm],rz [deg]", comments="")
+    wrong = table[:40] + 20.0 * ((np.arange(40) < 30)[:, None] & (np.arange(7) == 4))
+    np.savetxt(path / "wrong.csv", wrong, delimiter=",", header=motors + ",x [mm],y [mm],rz [deg]", comments="")
     np.savetxt(path / "readings.csv", table[:, :4], delimiter=",", header=motors, comments="")
     (path / "way.csv").write_text("x [mm],y [mm],rz [deg]\n0,0,0\n50,40,15\n-60,20,-20\n0,0,0\n")
     (path / "outside.csv").write_text("x [mm],y [mm],rz [deg]\n0,0,0\n300,0,0\n")
@@ -154,36 +157,18 @@ def test_the_api_chooses_no_poses_for_a_parallel_robot():
         api.select_poses(api.load("dualv"))
 
 
-def test_reversed_torques_fail(folder, tmp_path, capsys):
-    log = np.loadtxt(folder / "empty.csv", delimiter=",", skiprows=1)
-    log[:, 5] *= -1.0
-    np.savetxt(tmp_path / "reversed.csv", log, delimiter=",", header=HEAD, comments="")
-    words = ("--validate", folder / "other.csv", "--no-plots", "--out", tmp_path / "id")
-    assert calib("identify", "dualv", tmp_path / "reversed.csv", *words) == 1
-    assert "above 30 % fails" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_payload_that_is_not_there_is_told(folder, tmp_path, capsys):
-    words = ("--options", folder / "options.toml", "--out", tmp_path / "none", "--no-plots")
-    (tmp_path / "load.csv").write_text((folder / "empty.csv").read_text())
-    assert calib("identify", "dualv", folder / "empty.csv", tmp_path / "load.csv", *words) == 0
-    assert "move as if it were not there" in capsys.readouterr().out
-
-
-def test_a_fit_worse_than_the_nominal_fails(folder, tmp_path, capsys):
-    table = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1)
-    table[:30, 4] += 20.0
-    motors = "motor1 [deg],motor2 [deg],motor3 [deg],motor4 [deg],x [mm],y [mm],rz [deg]"
-    np.savetxt(tmp_path / "wrong.csv", table[:40], delimiter=",", header=motors, comments="")
-    words = ("fit", "dualv", tmp_path / "wrong.csv", "--validate", folder / "poses.csv", "--out", tmp_path / "fit")
-    assert calib(*words) == 1
-    assert "worse than the nominal" in capsys.readouterr().out
+NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-plots")
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "code", "said"),
     [
+        (("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"), 1, "above 30 % fails"),
+        (("fit", "dualv", "wrong.csv", "--validate", "poses.csv"), 1, "worse than the nominal"),
+        pytest.param(("identify", "dualv", *NOT_THERE), 0, "move as if it were not there", marks=pytest.mark.slow),
+        pytest.param(("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "a run without it separates them",
+                     marks=pytest.mark.slow),
+        *((words, 2, said) for words, said in (
         (("identify", "dualv", "three.csv"), "3 joints"),
         (("identify", "dualv", "swapped.csv"), "swapped.csv: sample 1: the loops"),
         (("identify", "dualv", "load.csv", "--method", "didim"), "simulates a serial arm"),
@@ -199,21 +184,15 @@ def test_a_fit_worse_than_the_nominal_fails(folder, tmp_path, capsys):
         (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
         (("select", "dualv"), "choosing poses is for serial arms"),
         (("new", "--robot", "dualv", "--instrument", "cmm"), "a guided session is for serial arms"),
+        )),
     ],
-)
-def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, said):
-    command, *rest = [folder / word if str(word).endswith(".csv") else word for word in words]
+)  # fmt: skip
+def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
+    command, *rest = [folder / word if str(word).endswith((".csv", ".toml")) else word for word in words]
     out = tmp_path / "out"
     given = [out, *rest] if command == "new" else [*rest, "--out", out]
-    assert calib(command, *given) == 2
-    assert said in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_payload_on_board_of_every_run_is_told(folder, tmp_path, capsys):
-    words = ("--options", folder / "options.toml", "--out", tmp_path / "id", "--no-plots")
-    assert calib("identify", "dualv", folder / "load.csv", *words) == 0
-    assert "a run without it separates them" in capsys.readouterr().out
+    assert calib(command, *given) == code
+    assert said in "".join(capsys.readouterr())
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():
