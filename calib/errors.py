@@ -59,7 +59,7 @@ class CalibWarning(UserWarning):
 
 
 class UsageError(CalibError):
-    """A command, an option or an options file that cannot be carried out as said."""
+    """A command, an option or an options file that is wrong or contradicts another."""
 
 
 class RobotError(CalibError):
@@ -97,7 +97,7 @@ class MeasurementError(CalibError):
 
 
 class Unidentifiable(CalibError):
-    """Parameters that the data cannot tell apart.
+    """Parameters that the data do not identify.
 
     Attributes:
         names: the parameters concerned.

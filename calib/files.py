@@ -83,12 +83,12 @@ def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), ov
     for number, (target, suffixes) in enumerate(targets):
         check_target(target, inputs, suffixes)
         if any(same_file(target, other) for other, _ in targets[:number]):
-            raise UsageError(f"{target} is to be written twice; give each file a name of its own")
+            raise UsageError(f"{target} would be written twice; give each file its own name")
         known = _written(target.parent / RESULTS).get(target.name)
         if not overwrite and target.exists() and target.stat().st_size and fingerprint(target) != known:
             raise UsageError(
-                f"{target} is there already, and not as an earlier run left it; nothing was changed. Write elsewhere, "
-                "or say --overwrite (in Python overwrite=True)"
+                f"{target} exists, and was not written by an earlier run or has changed since; nothing was changed. "
+                "Write elsewhere, or use --overwrite (in Python overwrite=True)"
             )
 
 
@@ -195,7 +195,7 @@ def check_writable(folder: Path, target: Path | None = None) -> None:
 
 
 def _reached(path: Path) -> bool:
-    """Tell whether something is at `path`; refuse what can never be there.
+    """Return whether a file or folder exists at `path`; refuse a path that cannot exist.
 
     Raises:
         UsageError: for a link to nowhere or to itself, a name too long, a file taken for a folder.
@@ -229,7 +229,7 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Say whether two paths lead to one place, on file systems that do not tell cases apart, too."""
+    """Return whether two paths lead to the same file, also where upper and lower case are the same."""
     return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
 
 
@@ -252,7 +252,7 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
 
 
 def fingerprint(path: Path) -> str:
-    """Return the SHA-256 of a file, in hex; read once as long as it stays as it is."""
+    """Return the SHA-256 of a file in hex; the file is read again only after it changed."""
     found = path.stat()
     return _digest(path.absolute(), found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 

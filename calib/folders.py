@@ -88,7 +88,7 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
 
 
 def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
-    """Replace the files of an earlier run one by one, the metrics last, since they say that the rest is there."""
+    """Replace the files of an earlier run one by one, the metrics last: they show that the folder is complete."""
     fresh = sorted(path.name for path in staging.iterdir())
     with refused_as(UsageError, OSError, f"cannot write to {out}: {{}}"):
         for name in sorted(fresh, key=lambda name: name == METRICS):

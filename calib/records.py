@@ -95,7 +95,7 @@ def read_json(
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text that we left, none where there is none; damaged letters are replaced."""
+    """Return the lines of a text file, none where it is missing; damaged letters are replaced."""
     return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
 

@@ -44,7 +44,7 @@ class _Cluster:
         return self.threads
 
     def _said(self, ask: Callable[[], Any]) -> Any:
-        """Return what a scheduler that is there answers."""
+        """Return what `ask` gets from the scheduler; raise CalibError where the scheduler is gone."""
         error = None
         try:
             if self.client.status == "running":

@@ -21,7 +21,7 @@ _calls = 0
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Give BLAS one thread while the block runs, and its own number back once no thread runs such a block."""
+    """Limit BLAS to one thread while the block runs; restore its number after the last such block."""
     global _calls
     with _changing:
         if not _calls:
@@ -38,7 +38,7 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield what a generator does, with one thread while it works and the caller's own number between."""
+    """Yield a generator's values; BLAS has one thread while it works, the caller's number in between."""
     ended = object()
     with closing(steps):
         while True:
@@ -50,7 +50,7 @@ def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
 
 
 def limit_process() -> None:
-    """Give BLAS one thread in this process for good, as it is loaded and as it will be, unless the user chose."""
+    """Limit BLAS to one thread in this process permanently, unless the user set a number."""
     if not _chosen():
         _limit_for_good()
 

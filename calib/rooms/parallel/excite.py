@@ -210,7 +210,7 @@ def excite_parallel(
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
     if limits is not None:
-        raise UsageError("limits are for serial arms yet; a parallel robot's are in its own file: effort, lower, upper")
+        raise UsageError("a limits file is for serial arms; a parallel robot's own file states effort, lower, upper")
     made, values = read_model(robot, model, settings.drives)
     return design_parallel(robot, made, values, settings, map=map, progress=progress)
 

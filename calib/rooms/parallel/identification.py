@@ -171,7 +171,7 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
 
 
 def _of_arms(method: Method) -> bool:
-    """Tell whether a method needs what only a serial arm's model has."""
+    """Return whether a method works with the model of a serial arm alone."""
     return method.needs_simulation or method.name == "ml"
 
 

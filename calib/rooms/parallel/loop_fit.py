@@ -1,4 +1,4 @@
-"""Fit the geometry of a parallel robot to a CSV of encoder readings, with platform poses beside them or without.
+"""Fit the geometry of a parallel robot to a CSV of encoder readings, with or without measured platform poses.
 
 Columns: one per actuated joint, by its name [rad or m, or the unit in brackets behind it]; and, where the platform was
 measured, one per coordinate of its freedom (``x [mm]``, ``rz [deg]``), counted from home in the base's axes. Of the
@@ -185,7 +185,7 @@ class ParallelFit(Judged):
         return f"<ParallelFit of {self.nominal.chain.name}: {self.verdict.level}>"
 
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
-        """Return a fit judged anew on more unseen files beside those of before; nothing is fitted again."""
+        """Return the same fit with its verdict on additional unseen files; nothing is fitted again."""
         validate = _paths(unseen)
         proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
         for name, rows in _read_unseen(self.nominal.chain, self.rows, validate).items():
@@ -293,7 +293,7 @@ def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tup
 def _stacked(parts: Sequence[np.ndarray], paths: Sequence[Path]) -> np.ndarray:
     bare = min(range(len(parts)), key=lambda k: parts[k].shape[1])
     if any(own.shape[1] > parts[bare].shape[1] for own in parts):
-        raise UsageError(f"{paths[bare]} has no platform coordinates, other files have: fit them apart")
+        raise UsageError(f"{paths[bare]} has no platform coordinates, but other files have them; fit them separately")
     return np.concatenate(parts)
 
 

@@ -131,7 +131,9 @@ def plan_parallel(
     say, known = progress or (lambda words: None), robot.known
     refuse_unread(settings, DEFAULT_PLAN, READ)
     if limits is not None or drives is not None:
-        raise UsageError("limits and drives are in a parallel robot's own file (velocity, effort) and in its model")
+        raise UsageError(
+            "limits and drives files are for serial arms; a parallel robot's own file states velocity and effort"
+        )
     law = _law(robot, model, settings.payloads)
     bounds = actuator_bounds(known)
     kept = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)

@@ -123,7 +123,7 @@ def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:
 
 
 def _pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
-    """Return poses (N, 4, 4) at platform coordinates (N, r), what the loops make of the others left out."""
+    """Return platform poses (N, 4, 4) at coordinates (N, r); coordinates that the loops determine are zero."""
     full = np.zeros((len(coordinates), 6))
     full[:, known.robot.selected] = coordinates
     pose = np.tile(known.robot.home, (len(full), 1, 1))
@@ -197,7 +197,7 @@ def _where(known: ClosedRobot, posture: Posture) -> str:
 
 
 def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim, near: Posture | None) -> Posture:
-    """Return solutions for targets (N, k), home having `own`; by Newton along the straight line from home."""
+    """Return postures at targets (N, k), by Newton's method along the straight line from home's values `own`."""
     if not len(wanted):
         return known.home[:0]
     if near is not None:
@@ -263,7 +263,7 @@ def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rc
 def _from_readings(
     known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
 ) -> np.ndarray:
-    """Return the twist's independent parts (N, r) that bring the readings nearest to those wanted."""
+    """Return the twist's independent parts (N, r) that bring the readings nearest to `wanted`."""
     rows, right = [], wanted - posture.q[:, known.robot.actuated]
     for leg, one in zip(known.robot.legs, links):
         rows.append(

@@ -47,7 +47,7 @@ class LoopParameter:
 
 @dataclass(frozen=True, eq=False)
 class LoopFit:
-    """What a geometric calibration found.
+    """A geometric calibration of a parallel robot: the calibrated robot and its estimate.
 
     Attributes:
         known: the calibrated robot, its loops closed.

@@ -54,7 +54,7 @@ def library() -> dict[str, Path]:
 
 
 def is_parallel(path: str | Path) -> bool:
-    """Tell whether a TOML file says of itself that it holds a parallel robot, or has the tables of one."""
+    """Return whether a TOML file says ``kind = "parallel"`` or has ``[[leg]]`` tables."""
     table = load(path)
     return table.get("kind") == KIND or "leg" in table
 

@@ -145,7 +145,7 @@ class ParallelModel:
 
     @cached_property
     def legs(self) -> tuple[tuple[Bodies, slice, slice], ...]:
-        """Each leg as a tree of its own, its joints among those of all legs, and the columns of its bodies."""
+        """For each leg: its bodies, its joints' indices in the tree, and its bodies' columns."""
         robot = self.known.robot
         ends = 10 * np.cumsum([0, *(leg.bodies for leg in robot.legs)])
         return tuple(
@@ -221,7 +221,7 @@ class ParallelModel:
         ]
 
     def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the ten parameters of the platform with what it carries."""
+        """Return the ten standard parameters of the platform together with the payloads on board."""
         own = values[self.legs[-1][2].stop : self.inertial].reshape(-1, 10)
         present = [True, *(carried is None or label in carried for label in self.payloads)]
         return own[present].sum(axis=0)
