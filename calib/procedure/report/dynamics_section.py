@@ -198,7 +198,7 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
 
 def percent(value: float) -> str:
     """Return a share in percent with three digits; a dash where there is none."""
-    return f"{value:.3g} %" if np.isfinite(value) else "–"
+    return _number(value, " %")
 
 
 def _rsd(percent: float) -> str:
@@ -360,8 +360,8 @@ def _joints(shares: np.ndarray) -> str:
     return " ".join(map(_number, shares))
 
 
-def _number(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "–"
+def _number(value: float, unit: str = "") -> str:
+    return f"{value:.3g}{unit}" if np.isfinite(value) else "–"
 
 
 def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Block]:

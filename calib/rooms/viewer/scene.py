@@ -126,18 +126,18 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         UsageError: where there is nothing to see.
     """
     folder = Path(folder)
-    if folder.is_file() and folder.suffix == ".csv":
-        return _of_poses(folder, robot)
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is no folder; give that of a fit, a session, an identification or a motion")
+    one = folder.is_file() and folder.suffix == ".csv"
+    require(one or folder.is_dir(), f"{folder} is no folder; give that of a fit, a session, or a motion", UsageError)
+    if one and robot is None:
+        refuse_option(folder, "say whose poses these are: --robot")
     chain, source = _arm(folder, robot)
     meshes, notes = _meshes(chain, source)
     fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
     motions = [path for name in (coefficients.SAMPLES, coefficients.PLANNED) for path in _below(folder, name)]
     torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
-    plans = sorted(folder.glob("2-poses/*.csv"))
+    plans = [folder] if one else sorted(folder.glob("2-poses/*.csv"))
     scene = Scene(
-        folder.resolve().name,
+        folder.resolve().stem if one else folder.resolve().name,
         chain,
         tuple(meshes),
         tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
@@ -155,17 +155,6 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         words = "no robot is drawn: the folder does not say which; give --robot"
         return replace(scene, notes=(*scene.notes, words))
     return scene
-
-
-def _of_poses(path: Path, robot: str | None) -> Scene:
-    """Return a scene of chosen poses, or of a run through them."""
-    if robot is None:
-        refuse_option(path, "say whose poses these are: --robot")
-    chain, source = load(robot), resolve(robot)
-    meshes, notes = _meshes(chain, source)
-    if is_run(path):
-        return Scene(path.stem, chain, tuple(meshes), played=(_rehearsed(path, chain),), notes=tuple(notes))
-    return Scene(path.stem, chain, tuple(meshes), chosen=((path.stem, _chosen(path, chain)),), notes=tuple(notes))
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:

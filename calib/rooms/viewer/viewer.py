@@ -29,11 +29,17 @@ EACH = 0.2  # that a pose stands still [s]
 FILE = "session.rrd"
 
 
-def _rerun() -> Any:
-    words = "Rerun is not installed here (there is none for Macs with Intel processors): pip install rerun-sdk"
-    with refused_as(UsageError, ImportError, words):
-        import rerun
-    return rerun
+class _Rerun:
+    """The package rerun, loaded when something of it is used."""
+
+    def __getattr__(self, name: str) -> Any:
+        words = "Rerun is not installed here (there is none for Macs with Intel processors): pip install rerun-sdk"
+        with refused_as(UsageError, ImportError, words):
+            import rerun
+        return getattr(rerun, name)
+
+
+rr = _Rerun()
 
 
 def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Scene:
@@ -44,7 +50,6 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
     """
     path = Path(path)
     scene = viewing.read(folder, robot)
-    rr = _rerun()
     with tempfile.TemporaryDirectory() as place:
         temporary = Path(place) / "scene.rrd"
         recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
@@ -78,7 +83,6 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
         saved = command_line("view", folder, "--save", FILE)
         raise UsageError(f"no display is here to open a window on; {saved} writes a file that rerun shows elsewhere")
     scene = viewing.read(folder, robot)
-    rr = _rerun()
     recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
     with refused_as(
         CalibError, Exception, "Rerun's window did not open ({}); calib view --save FILE.rrd writes a file"
@@ -91,7 +95,6 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
 
 def _send(recording: Any, scene: Scene) -> None:
     """Log everything."""
-    rr = _rerun()
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("about", rr.TextDocument(about(scene), media_type="text/markdown"), static=True)
     start = 0.0
@@ -129,14 +132,12 @@ def about(scene: Scene) -> str:
 
 def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) -> list[Any]:
     """Return the clock and a count of its own for `count` poses, or `some` of them, from `start` on [s]."""
-    rr = _rerun()
     steps = np.arange(1, count + 1) if some is None else some + 1
     return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
 
 
 def _measured(recording: Any, scene: Scene, measured: Measured, start: float) -> float:
     """Log points and error arrows as a whole, and pose by pose; return when the next part may begin [s]."""
-    rr = _rerun()
     if not len(measured.q) or scene.chain is None:
         return start
     scale = measured.arrow_scale(scene.chain)
@@ -173,7 +174,6 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
 
 def _chosen(recording: Any, scene: Scene, chain: Chain, name: str, q: np.ndarray, start: float) -> float:
     """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
-    rr = _rerun()
     tips = viewing.skeleton(chain, q)[:, -1]
     counts = np.arange(1, len(q) + 1)
     grown = np.concatenate([tips[:k] for k in counts])
@@ -187,7 +187,6 @@ def _chosen(recording: Any, scene: Scene, chain: Chain, name: str, q: np.ndarray
 
 def _played(recording: Any, scene: Scene, played: Played, start: float) -> float:
     """Log a motion with its limits from `start` on [s], and return where the next may begin."""
-    rr = _rerun()
     t = start + played.t - played.t[0]
     some = viewing.thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[some])]
@@ -213,7 +212,6 @@ def _played(recording: Any, scene: Scene, played: Played, start: float) -> float
 
 def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> float:
     """Log measured and predicted torques and what remains, and the arm on the same clock."""
-    rr = _rerun()
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
     for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
@@ -229,21 +227,19 @@ def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> fl
 
 def _part(name: str) -> str:
     """Return a name as one part of an entity path."""
-    return _rerun().escape_entity_path_part(name)
+    return rr.escape_entity_path_part(name)
 
 
 def _series(
     recording: Any, path: str, index: list[Any], values: Sequence[float] | np.ndarray, name: str, colour: Any = None
 ) -> None:
     """Log one line of a plot with its legend."""
-    rr = _rerun()
     recording.log(path, rr.SeriesLines(names=name, **({} if colour is None else {"colors": colour})), static=True)
     recording.send_columns(path, indexes=index, columns=rr.Scalars.columns(scalars=np.asarray(values, dtype=float)))
 
 
 def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
     """Log the arm's links as lines, and its links' frames where it has meshes."""
-    rr = _rerun()
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
     points = viewing.skeleton(scene.chain, q)
@@ -267,7 +263,6 @@ def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
 
 def _meshes(recording: Any, scene: Scene) -> None:
     """Log the meshes, each once, under the frame of its link."""
-    rr = _rerun()
     for number, mesh in enumerate(scene.meshes):
         place = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
         placed = rr.Transform3D(
@@ -301,7 +296,7 @@ def _blueprint(scene: Scene) -> Any:
         ]
         tabs.append(rrb.Vertical(*views, name="motion"))
     if scene.torques:
-        each = _torque_names(scene)
+        each = dict.fromkeys(name for one in scene.torques for name in one.rows)
         plots = [rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent) for name in each]
         rest = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
         tabs.append(rrb.Vertical(rrb.Grid(*plots, grid_columns=2), rest, row_shares=[3, 1], name="torques"))
@@ -315,8 +310,3 @@ def _blueprint(scene: Scene) -> Any:
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
     )
-
-
-def _torque_names(scene: Scene) -> list[str]:
-    """Return the names of all torque rows, each once."""
-    return list(dict.fromkeys(name for one in scene.torques for name in one.rows))
