@@ -90,7 +90,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Figures beside each other."""
+    """Figures side by side."""
 
     title: str
     pictures: Sequence[Picture]

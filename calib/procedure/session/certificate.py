@@ -120,12 +120,12 @@ def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str,
             ("tolerance", certificate.tolerance(settings.fit.tolerance_mm, found.metrics)),
         ]  # fmt: skip
     if session.dynamic:
-        wanted = settings.dynamics
-        allowed = wanted.tolerance_percent
+        section = settings.dynamics
+        allowed = section.tolerance_percent
         rows += [
-            ("recordings", _named(session.brought("training", "unseen"))), ("torques", TORQUES[wanted.torques]),
+            ("recordings", _named(session.brought("training", "unseen"))), ("torques", TORQUES[section.torques]),
             ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none stated: pass below 10 %"),
-            ("payloads", ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())),
+            ("payloads", ", ".join(f"{label} {mass:g} kg" for label, mass in section.payloads.items())),
         ]  # fmt: skip
     rows += [
         ("seed", str(settings.seed)), ("command", command_line("next", session.folder.name)),
@@ -179,22 +179,22 @@ def listed(session: Session) -> list[FileRow]:
     """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
-    wanted = [
+    filed = [
         *exported[:1],
         session.robot_file,
         *_filed(session.brought("measured")),
         *_filed(session.brought("validation")),
     ]
     if session.dynamic:
-        wanted += [path for path in session.brought("training", "unseen") if path.is_file()]
+        filed += [path for path in session.brought("training", "unseen") if path.is_file()]
         if session.settings.dynamics.plan:  # else other motions were played
-            wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
-        wanted += [*session.identification.tables, session.identification.model]
-    wanted += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
+            filed += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
+        filed += [*session.identification.tables, session.identification.model]
+    filed += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
     made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
     judged = session.validation.metrics().validation if session.geometric else {}
     rows, seen = [], [name for name, found in judged.items() if not found.unseen]
-    for path in wanted:
+    for path in filed:
         name = path.relative_to(session.folder)
         role = ROLES[name.parts[0]]
         if name.parts[-1].lower().startswith("validation") or name.parts[1].lower().startswith("validation"):

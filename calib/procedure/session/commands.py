@@ -115,17 +115,17 @@ def _form_of_images(session: Session, joints: tuple[str, ...], target: str, both
 
 def _play(session: Session, step: str) -> str:
     """Return what is to be played and logged."""
-    wanted = session.settings.dynamics
+    section = session.settings.dynamics
     names = _motions(session, step)
-    if not wanted.plan:
+    if not section.plan:
         return "Record the robot moving in all its joints, in one motion for training and in another, unseen one."
-    file = RUN if wanted.repeats > 1 else SAMPLES
+    file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never used for training)" if "validation" in names else ""
-    loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted.payloads.items())
+    loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
     again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
     return (
-        f"Play {motions}{unseen}, {wanted.repeats} times the motion each, at {wanted.rate:g} Hz, from rest at "
+        f"Play {motions}{unseen}, {section.repeats} times the motion each, at {section.rate:g} Hz, from rest at "
         "its "
         "first row, before that at a low override, to see that the way is free; log joint positions and torques "
         "all "
@@ -232,13 +232,13 @@ def _limits(
             read_motion_limits(stated, chain, source)
         read_limits(stated, targets_of(chain), source)
         return {LIMITS: stated, **beside(stated)}, LIMITS
-    told = parse(ConstraintsFile, stated, "the cell")
-    limits_of(told, targets_of(chain), source, "the cell")
-    if told.camera is None:
+    cell = parse(ConstraintsFile, stated, "the cell")
+    limits_of(cell, targets_of(chain), source, "the cell")
+    if cell.camera is None:
         return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
-    if not told.camera.unknown:
-        needed("camera_view")(told.camera, chain, "the cell", Path())
-    given = {key: getattr(told.camera, key) for key in CAMERA_FILES if key not in told.camera.unknown}
+    if not cell.camera.unknown:
+        needed("camera_view")(cell.camera, chain, "the cell", Path())
+    given = {key: getattr(cell.camera, key) for key in CAMERA_FILES if key not in cell.camera.unknown}
     tables = {**stated, "camera": {**stated["camera"], **{key: CAMERA_FILES[key] for key in given}}}
     copied = {CAMERA_FILES[key]: Path(name) for key, name in given.items()}
     return {LIMITS: f"{HEAD}{dumps(tables)}", **copied}, LIMITS

@@ -47,22 +47,22 @@ VALIDATION_SEED = 3  # added to the seed for the validation motion
 
 def options_of(session: Session) -> IdentifyOptions:
     """Return how to identify: the options file's content, or what ``session.toml`` says; payloads by file name."""
-    wanted = session.settings.dynamics
-    options = read_options(session.named(wanted.options))
+    section = session.settings.dynamics
+    options = read_options(session.named(section.options))
     settings = options.settings
-    if not wanted.options:
-        rows = torque_rows(wanted.torques)
-        settings = replace(settings, torque_rows=rows, friction=wanted.friction, method=wanted.method)
-    known = {label: Payload(float(mass)) for label, mass in wanted.payloads.items()}
+    if not section.options:
+        rows = torque_rows(section.torques)
+        settings = replace(settings, torque_rows=rows, friction=section.friction, method=section.method)
+    known = {label: Payload(float(mass)) for label, mass in section.payloads.items()}
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
-    own = dict(options.files)
+    named = dict(options.files)
     for path in session.brought("training", "unseen"):
         labels = tuple(label for label in known if label.lower() in path.stem.lower())
         if labels:
-            own[path.name] = replace(
-                own.get(path.name, FileSettings(options.every.recording, options.every.filter)), payload=labels
+            named[path.name] = replace(
+                named.get(path.name, FileSettings(options.every.recording, options.every.filter)), payload=labels
             )
-    return replace(options, settings=settings, files=own)
+    return replace(options, settings=settings, files=named)
 
 
 def excite(session: Session, say: Say) -> list[str]:
@@ -71,20 +71,20 @@ def excite(session: Session, say: Say) -> list[str]:
     from calib.procedure.excitation import folder as motion_folder
     from calib.procedure.excitation.settings import ExcitationSettings
 
-    wanted, notes, draw = session.settings.dynamics, [], None
-    if not wanted.plan:
+    section, notes, draw = session.settings.dynamics, [], None
+    if not section.plan:
         return ["no motion is designed: the recorded files hold others (plan = false)"]
     if session.plots:
         from calib.procedure.report.motion_figures import write_design as draw
-    limits = session.named(wanted.limits)
-    names = ["training", "validation"] if wanted.validation else ["training"]
+    limits = session.named(section.limits)
+    names = ["training", "validation"] if section.validation else ["training"]
     for name in names:
         first = name == "training"
         settings = ExcitationSettings(
-            period=wanted.period * (1.0 if first else VALIDATION_PERIOD), harmonics=wanted.harmonics, rate=wanted.rate,
-            starts=wanted.starts if first else 1,
-            evaluations=wanted.evaluations if first else max(20, wanted.evaluations // 3),
-            seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=wanted.repeats, outlook=first,
+            period=section.period * (1.0 if first else VALIDATION_PERIOD), harmonics=section.harmonics,
+            rate=section.rate, starts=section.starts if first else 1,
+            evaluations=section.evaluations if first else max(20, section.evaluations // 3),
+            seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=section.repeats, outlook=first,
         )  # fmt: skip
         designed = design.excite(
             session.fit.path, settings, limits=limits,
@@ -148,7 +148,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
 
 
 def check_motion(
-    recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], wanted: int
+    recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], repeats: int
 ) -> tuple[LocatedMotion, list[Finding]]:
     """Find the designed motion in a recording, and return what is worth a note.
 
@@ -156,7 +156,7 @@ def check_motion(
         recording: of n joints.
         motion: the one that was to be played.
         others: the session's other motions by name, to say if one of them was played instead.
-        wanted: how many repetitions were asked for.
+        repeats: how many repetitions were asked for.
 
     Raises:
         MeasurementError: where it is not there, with what explains the recording.
@@ -165,8 +165,8 @@ def check_motion(
     if found is None:
         _refuse(recording, _other_motion(recording, motion, another_motion(recording, motion, others)))
     notes = []
-    if found.periods < wanted:
-        notes.append(finding("repetitions-missing", periods=found.periods, wanted=wanted))
+    if found.periods < repeats:
+        notes.append(finding("repetitions-missing", periods=found.periods, wanted=repeats))
     if found.likeness < MIN_TRACKED_SHARE:
         joint = recording.joint_names[found.loosest]
         notes.append(finding("tracking-loose", share=found.likeness, joint=joint))
@@ -268,11 +268,11 @@ def identify(session: Session, say: Say) -> list[str]:
     identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
     found = outcome.found
     raw, normalised = found.condition
-    own = next(iter(outcome.fit.values()))
+    fitted = next(iter(outcome.fit.values()))
     notes = [
         f"{len(found.names)} parameters by {found.fitted.method}, friction {found.friction.chosen or 'standard'}, "
         "condition "
-        f"number {raw:.3g}, with unit columns {normalised:.3g}; {own.raw.total:.2f} % of the torque unexplained"
+        f"number {raw:.3g}, with unit columns {normalised:.3g}; {fitted.raw.total:.2f} % of the torque unexplained"
     ]
     designed = session.path("6-excitation/training")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():

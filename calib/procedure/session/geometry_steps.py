@@ -63,15 +63,15 @@ HOW = "state [camera] in the limits file: calib formats constraints"
 def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[str]:
     """Choose and write the poses that ``session.toml`` asks for, the run through them, and predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
-    wanted, instrument = settings.poses, settings.instrument
+    section, instrument = settings.poses, settings.instrument
     base, tip = session.links(chain)
     sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
     choice = SelectionSettings(
-        kind=_seen_as(instrument.measures), tools=(instrument.tool,), index=wanted.index, method=wanted.method,
+        kind=_seen_as(instrument.measures), tools=(instrument.tool,), index=section.index, method=section.method,
         sigmas=sigmas if instrument.sigma_position else None, seed=settings.seed,
     )  # fmt: skip
     chosen = selection.choose(
-        robot_file, wanted.fit, choice, constraints=session.named(wanted.constraints), base=base, tip=tip,
+        robot_file, section.fit, choice, constraints=session.named(section.constraints), base=base, tip=tip,
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
     said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
@@ -85,8 +85,8 @@ def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[
         f"{len(q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
-    unseen = _unseen(session, robot_file, chain, wanted.validation)
-    sets = {POSES: q, UNSEEN: unseen} if wanted.validation else {POSES: q}
+    unseen = _unseen(session, robot_file, chain, section.validation)
+    sets = {POSES: q, UNSEEN: unseen} if section.validation else {POSES: q}
     for name, joints in sets.items():
         write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, unit="deg", kinds=joint_kinds(chain))
     write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
@@ -102,7 +102,7 @@ def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
     files.write_json(session.path(SELECTION), record)
     notes = [f"{len(q)} poses for the fit: {words}"]
-    notes += [f"{len(unseen)} poses for validation, at random"] if wanted.validation else []
+    notes += [f"{len(unseen)} poses for validation, at random"] if section.validation else []
     numbers = (f"{words}: {number}" for words, number in selection.predicted_rows(chosen))
     return [*notes, *chosen.kept(), *numbers, *record["notes"]]
 
@@ -216,14 +216,14 @@ def check_file(
     """
     notes = []
     for block in inputs.read_file(path, chain, _options_of(session), like):
-        wanted = session.settings.instrument.measures
-        if wanted == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
+        measures = session.settings.instrument.measures
+        if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             notes.append(f"{path.name}: positions only, where the instrument gives poses")
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
         notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
         if block.kind == IMAGES:
             notes.append(f"{path.name}: {needed('image_words')(block)}")
-        elif wanted == IMAGES:
+        elif measures == IMAGES:
             notes.append(f"{path.name}: no images, which the instrument takes; fitted all the same")
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:
@@ -280,12 +280,12 @@ def _drifts(session: Session, chain: Chain) -> list[str]:
 
 def _fit_settings(session: Session) -> FitSettings:
     """Return how the geometry is fitted and judged, as session.toml says; what is ``auto`` there, as the options do."""
-    wanted = session.settings.fit
-    model, loss = (None if value == "auto" else value for value in (wanted.model, wanted.loss))
+    section = session.settings.fit
+    model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
     return FitSettings(
-        model=model, loss=loss, stations=wanted.stations, tolerance=1e-3 * wanted.tolerance_mm or None,
-        refit_frames=wanted.validation_frames == "own", seed=session.settings.seed, holdout=wanted.holdout,
-        deliverable=wanted.deliverable,
+        model=model, loss=loss, stations=section.stations, tolerance=1e-3 * section.tolerance_mm or None,
+        refit_frames=section.validation_frames == "own", seed=session.settings.seed, holdout=section.holdout,
+        deliverable=section.deliverable,
     )  # fmt: skip
 
 

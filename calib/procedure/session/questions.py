@@ -137,9 +137,10 @@ def checked(given: Answers) -> dict[str, Any]:
     robot, instrument = given.robot, given.instrument
     require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
     instrument_named(instrument or "")
-    told = next((name for name in CAMERA if getattr(given, name) is not None), None)
+    stated = next((name for name in CAMERA if getattr(given, name) is not None), None)
     require(
-        by_camera(given) or not told, f"--{told} is about a camera that takes images; the instrument is {instrument}"
+        by_camera(given) or not stated_option,
+        f"--{stated_option} is about a camera that takes images; the instrument is {instrument}",
     )
     dynamics = given.dynamics is not False
     words = "--payload and --torques are about the dynamics, which --geometry-only leaves out"
@@ -152,8 +153,8 @@ def checked(given: Answers) -> dict[str, Any]:
         require(not given.cell, words, UsageError)
     else:
         result["limits"] = cell_tables(**given.cell) or None
-    stated = {"tool": given.tool, "torques": given.torques, "payloads": dict(map(_payload, given.payloads))}
-    return result | {name: value for name, value in stated.items() if value}
+    others = {"tool": given.tool, "torques": given.torques, "payloads": dict(map(_payload, given.payloads))}
+    return result | {name: value for name, value in others.items() if value}
 
 
 def _payload(text: str) -> tuple[str, float]:

@@ -196,14 +196,14 @@ def find(session: Session, name: str) -> SessionStep:
     Raises:
         SessionError: with the names there are.
     """
-    own = _steps_of(session)
-    for number, step in enumerate(own, 1):
+    there = _steps_of(session)
+    for number, step in enumerate(there, 1):
         if name in (step.name, str(number)):
             return step
     if stage := next((step.stage for step in STEPS if step.name == name), ""):
         key = "wanted = true under [dynamics]" if stage == "dynamics" else "what measures under [instrument]"
         raise SessionError(f"this session leaves the {stage} out; for '{name}' write {key} in session.toml")
-    raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in own)}")
+    raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in there)}")
 
 
 def states(session: Session) -> list[State]:
@@ -332,8 +332,8 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 def forget(session: Session, step: SessionStep) -> None:
     """Let a step and all behind it be made again."""
-    own = _steps_of(session)
-    session.write_state(read_state(session).without(*(later.name for later in own[own.index(step) :])))
+    there = _steps_of(session)
+    session.write_state(read_state(session).without(*(later.name for later in there[there.index(step) :])))
 
 
 def _move_export(session: Session) -> None:

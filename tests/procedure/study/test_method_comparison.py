@@ -13,7 +13,7 @@ from calib.cli import run
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.dynamic_stage.validation import overlaps
-from calib.rooms.studies.reports.method_comparison import QUICK, caveats, compare_methods
+from calib.rooms.studies.reports.method_comparison import FAST_SECONDS, caveats, compare_methods
 
 
 def recorded(folder: Path) -> tuple[Path, Path]:
@@ -40,7 +40,9 @@ def test_what_is_not_told_apart_is_as_good_and_a_fast_one_is_taken(robot: Path, 
     found = compare_methods(gather(robot, [train], [other]), ["wls", "ols"])
     good = [one for one in found if one.good]
     (taken,) = (one for one in good if one.chosen)
-    assert taken is next(one for one in good if one.seconds <= max(QUICK, 2.0 * min(each.seconds for each in good)))
+    assert taken is next(
+        one for one in good if one.seconds <= max(FAST_SECONDS, 2.0 * min(each.seconds for each in good))
+    )
 
 
 def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):

@@ -1,14 +1,14 @@
 """``calib compare``: every method on the same recordings, ranked by what they predict of other motion.
 
 All estimate the same columns (base parameters and standard friction, unless another is asked for), each as
-`calib identify --method` does it: wls draws what the motion does not identify to a prior. Errors are relative, in the
-identification band, over all unseen recordings together; their standard errors, and those of differences between
-methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white. Methods within `APART`
-standard errors of the best, or within `SLACK` of its error, are as good; of these one is taken that is fast: at most
-`QUICK` seconds, or `ALIKE` times the time of the fastest, the first in rank. Of that one stands beneath the table
-what `calib identify` says of it: the same verdict, from the same findings. None is taken where that verdict is fail,
-where the best predicts no better than no model does (100 %), or where all recordings repeat the training motion; one
-that does is left out.
+`calib identify --method` does it: wls regularises what the motion does not identify towards a prior. Errors are
+relative, in the identification band, over all unseen recordings together; their standard errors, and those of
+differences between methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white.
+Methods within `MAX_SIGMAS` standard errors of the best, or within `MAX_SHARE` of its error, are as good; of these one
+is taken that is fast: at most `FAST_SECONDS` seconds, or `MAX_TIMES` times the time of the fastest, the first in rank.
+Below the table stands what `calib identify` says of it: the same verdict, from the same findings. None is taken where
+that verdict is fail, where the best predicts no better than no model does (100 %), or where all recordings repeat the
+training motion; one that does is left out.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,9 +33,9 @@ from calib.procedure.dynamic_stage.verdict import motion_findings
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.report.page import Block, Column, Section, Text, table
 
-APART, SLACK, ALIKE, QUICK = 2.0, 0.05, 2.0, 1.0  # our choices; the last in seconds
+MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = (2.0, 0.05, 2.0, 1.0)  # our choices; the last in seconds
 LOOP = "needs the closed loop: state it in the options file, [loop] (calib formats identify-options)"
-USELESS = 100.0  # error [%] of predicting no torque at all
+NO_MODEL = 100.0  # error [%] of predicting no torque at all
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def compare_methods(
     done: list[tuple[ComparedMethod, _Sums]] = []
     models: dict[str, Identification] = {}
     failed: list[ComparedMethod] = []
-    alike = ~np.isin(np.arange(inputs.cases[0].target.shape[1]), inputs.currents.own)
+    same_unit = ~np.isin(np.arange(inputs.cases[0].target.shape[1]), inputs.currents.own)
     for name, method in chosen.items():
         if method.needs_controller and inputs.options.settings.loop is None:
             failed.append(ComparedMethod(name, LOOP))
@@ -125,7 +125,7 @@ def compare_methods(
         say(name)
         try:
             found = identify(inputs.robot, inputs.cases, _settings(inputs, method, friction), partial(_said, say, name))
-            done.append(_errors(found, inputs, alike))
+            done.append(_errors(found, inputs, same_unit))
             models[name] = found
             each(done[-1][0])
         except CalibError as error:
@@ -134,7 +134,7 @@ def compare_methods(
         except Exception as error:  # of one method: the others' results are not lost by it
             failed.append(ComparedMethod(name, f"internal error: {type(error).__name__}: {error}"))
             each(failed[-1])
-    ranked = _ranked(done, alike)
+    ranked = _ranked(done, same_unit)
     return [
         *(_held(one, inputs, models[one.name], bool(proofs), say) if one.chosen else one for one in ranked),
         *failed,
@@ -144,21 +144,21 @@ def compare_methods(
 def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> list[str]:
     """Return what a user should know of a ranking, and why none is to be taken where none is."""
     repeated = repeated_motion(inputs.cases, inputs.unseen)
-    told = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
-    told += [line for one in found for line in one.warnings]
+    notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
+    notes += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
-        told.append("none to take: give motion that is no repeat with --validate")
+        notes.append("none to take: give motion that is no repeat with --validate")
     elif repeated:
-        told.append(f"left out of the ranking: {', '.join(repeated)}")
+        notes.append(f"left out of the ranking: {', '.join(repeated)}")
     judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
-    if found and found[0].unseen >= USELESS:
-        told.append(
-            f"none to take: the best is off by {found[0].unseen:.3g} % on unseen motion, no model by {USELESS:g} %: "
+    if found and found[0].unseen >= NO_MODEL:
+        notes.append(
+            f"none to take: the best is off by {found[0].unseen:.3g} % on unseen motion, no model by {NO_MODEL:g} %: "
             "add training motion"
         )
     elif judged_one is not None:
-        told.append(f"none to take: calib identify fails the model of {judged_one.name}, for the reason below")
-    return list(dict.fromkeys(told))
+        notes.append(f"none to take: calib identify fails the model of {judged_one.name}, for the reason below")
+    return list(dict.fromkeys(notes))
 
 
 def _said(say: Callable[[str], None], name: str, words: str) -> None:
@@ -189,23 +189,23 @@ def _held(
         verdict, warnings = outcome.verdict, outcome.warnings
     except CalibError as error:
         verdict = Verdict("fail", " ".join(str(error).split()))
-    taken = proven and one.unseen < USELESS and verdict.level != "fail"
+    taken = proven and one.unseen < NO_MODEL and verdict.level != "fail"
     return replace(one, chosen=taken, verdict=verdict, warnings=warnings)
 
 
 def _errors(
-    found: Identification, inputs: IdentificationInputs, alike: np.ndarray
+    found: Identification, inputs: IdentificationInputs, same_unit: np.ndarray
 ) -> tuple[ComparedMethod, _Sums]:  # fmt: skip
     """Return a method's errors; nothing of other methods yet."""
     unseen, training = (_sums(found, cases) for cases in (inputs.unseen, inputs.cases))
     joints = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
-    worst = int(np.argmax(np.where(alike, joints, -1.0)))
+    worst = int(np.argmax(np.where(same_unit, joints, -1.0)))
     fitted = found.fitted
     return ComparedMethod(
-        fitted.method, unseen=_percent(unseen.error[:, alike], unseen.size[:, alike]),
-        sigma=float(_jackknife(_leaving_out(unseen, alike))),
-        raw=_percent(unseen.raw_error[:, alike], unseen.raw_size[:, alike]),
-        training=_percent(training.error[:, alike], training.size[:, alike]),
+        fitted.method, unseen=_percent(unseen.error[:, same_unit], unseen.size[:, same_unit]),
+        sigma=float(_jackknife(_leaving_out(unseen, same_unit))),
+        raw=_percent(unseen.raw_error[:, same_unit], unseen.raw_size[:, same_unit]),
+        training=_percent(training.error[:, same_unit], training.size[:, same_unit]),
         worst=(worst + 1, float(joints[worst])), parameters=len(fitted.estimate.values), seconds=fitted.seconds,
         iterations=fitted.iterations, simulations=fitted.simulations,
     ), unseen  # fmt: skip
@@ -232,9 +232,9 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
     return float(100.0 * np.sqrt(error.sum() / max(float(size.sum()), 1e-300)))
 
 
-def _leaving_out(sums: _Sums, alike: np.ndarray) -> np.ndarray:
+def _leaving_out(sums: _Sums, same_unit: np.ndarray) -> np.ndarray:
     """Return the error (k,) [%] with each block left out."""
-    error, size = sums.error[:, alike].sum(axis=1), sums.size[:, alike].sum(axis=1)
+    error, size = sums.error[:, same_unit].sum(axis=1), sums.size[:, same_unit].sum(axis=1)
     return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
 
 
@@ -242,7 +242,7 @@ def _jackknife(each: np.ndarray) -> float:
     return float(np.sqrt((len(each) - 1) / len(each) * np.sum((each - each.mean()) ** 2)))
 
 
-def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> list[ComparedMethod]:
+def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
     """Return the methods by rank; chosen is the first fast one among the good, whatever its verdict will be."""
     if not done:
         return []
@@ -251,11 +251,11 @@ def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> 
     result = []
     for rank, (one, sums) in enumerate(order, 1):
         behind = one.unseen - best.unseen
-        sigma = _jackknife(_leaving_out(sums, alike) - _leaving_out(own, alike))
-        good = behind <= max(APART * sigma, SLACK * best.unseen)
+        sigma = _jackknife(_leaving_out(sums, same_unit) - _leaving_out(own, same_unit))
+        good = behind <= max(MAX_SIGMAS * sigma, MAX_SHARE * best.unseen)
         result.append(replace(one, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
     least = min(one.seconds for one in result if one.good)
-    taken = next(one for one in result if one.good and one.seconds <= max(QUICK, ALIKE * least))
+    taken = next(one for one in result if one.good and one.seconds <= max(FAST_SECONDS, MAX_TIMES * least))
     return [replace(one, chosen=one is taken) for one in result]
 
 
@@ -320,7 +320,7 @@ def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     good = [one for one in found if not one.failure]
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over "
-        f"blocks of time; as good: within {APART:g} standard errors of the difference, or {SLACK:.0%}, of the best"
+        f"blocks of time; as good: within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
     )
     if good:
         yield table("Methods", COLUMNS, good, note, lambda one: one.chosen)

@@ -346,10 +346,10 @@ def run_study(
         words = "rows of methods that have changed since they ran do not count until they are run again"
         notes.append(f"{words}: {named_rows}")
     if not progress.lost and not own:
-        told = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
-        told = f"{len(kept)} rows; {notes[-1]}" if changed else told
+        there = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
+        there = f"{len(kept)} rows; {notes[-1]}" if changed else there
         raise UsageError(
-            f"nothing to report: {out} holds {told}; "
+            f"nothing to report: {out} holds {there}; "
             + ("run the study first, or name its folder (--out)" if report_only else "ask for runs (--runs, runs)")
         )
     if versions := sorted({row.toolkit for row in own}):
