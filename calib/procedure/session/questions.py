@@ -139,8 +139,8 @@ def checked(given: Answers) -> dict[str, Any]:
     instrument_named(instrument or "")
     stated = next((name for name in CAMERA if getattr(given, name) is not None), None)
     require(
-        by_camera(given) or not stated_option,
-        f"--{stated_option} is about a camera that takes images; the instrument is {instrument}",
+        by_camera(given) or not stated,
+        f"--{stated} is about a camera that takes images; the instrument is {instrument}",
     )
     dynamics = given.dynamics is not False
     words = "--payload and --torques are about the dynamics, which --geometry-only leaves out"

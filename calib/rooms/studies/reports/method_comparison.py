@@ -319,8 +319,8 @@ def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     """Yield the ranked table, and why methods are not in it."""
     good = [one for one in found if not one.failure]
     note = (
-        "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over "
-        f"blocks of time; as good: within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
+        "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "
+        f"as good: within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
     )
     if good:
         yield table("Methods", COLUMNS, good, note, lambda one: one.chosen)
