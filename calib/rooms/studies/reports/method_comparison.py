@@ -33,7 +33,7 @@ from calib.procedure.dynamic_stage.verdict import motion_findings
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.report.page import Block, Column, Section, Text, table
 
-MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = (2.0, 0.05, 2.0, 1.0)  # our choices; the last in seconds
+MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0  # our choices
 LOOP = "needs the closed loop: state it in the options file, [loop] (calib formats identify-options)"
 NO_MODEL = 100.0  # error [%] of predicting no torque at all
 
