@@ -39,8 +39,7 @@ from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
 from calib.identification.loop.controller import identify_controller
-from calib.identification.loop.loop_recordings import Loop
-from calib.identification.loop.simulated_motion import simulated_case
+from calib.identification.loop.loop_recordings import Loop, simulated_case
 from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, hold, make_constraints
 from calib.identification.rows import Case, make_case, observe

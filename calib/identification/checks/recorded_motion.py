@@ -1,10 +1,12 @@
 """Whether a recording holds the designed motion, what it holds otherwise, and whether its torques fit nominal masses.
 
-Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions.
+Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions. What quick
+looks at torques share stands here, too: a few samples of a recording, and how much columns explain of its torques.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -12,8 +14,9 @@ import numpy as np
 from calib.column_changes import Change, assigned, best_changes, coupling, couplings
 from calib.data.recordings.recording import Recording
 from calib.data.signals.filtering import moving_cubics
-from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.rigid_body import inverse_dynamics
+from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
+from calib.dynamics.rigid_body import inverse_dynamics, regressor
+from calib.identification.rows import Case, segments
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
 from trajectories.recall import Recalled, find_periods, sliding_products
@@ -158,7 +161,10 @@ def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.nd
     return assigned(-likeness)
 
 
-def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
+def share_of_nominal(
+    t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
+    static: bool = False,
+) -> np.ndarray:  # fmt: skip
     """Compare recorded torques with those of the nominal masses, friction left free.
 
     Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
@@ -166,26 +172,13 @@ def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
     `min_sign_correlation`.
 
     Args:
-        recording: with torques of n joints.
-        chain: the arm with its nominal masses.
-
-    Returns:
-        (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
-    """
-    return share_of_nominal(recording.t, recording.q, recording.effort, chain)
-
-
-def share_of_nominal(
-    t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
-    static: bool = False,
-) -> np.ndarray:  # fmt: skip
-    """Return what `nominal_share` does, of samples.
-
-    Args:
         t: (N,) [s]; q, effort: (N, n).
         chain: the arm with its nominal masses.
         gravity: [m/s²], where it is not the robot's own.
         static: compare torques of gravity alone, the others left free like friction.
+
+    Returns:
+        (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
     """
     grid = _coarse(t)
     torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
@@ -220,3 +213,86 @@ def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndar
     `half_width`: half width of the window for derivatives, in steps of the coarse grid.
     """
     return moving_cubics(values, min(half_width, (len(values) - 1) // 2), order) / STEP**order
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSamples:
+    """N samples of a motion of n joints.
+
+    Attributes:
+        index: (N,) which of the motion's.
+        q, v, a: (N, n).
+        effort: torques of the whole motion, smoothed; velocity: of the whole motion.
+        bodies: of the robot.
+    """
+
+    index: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    effort: np.ndarray
+    velocity: np.ndarray
+    bodies: Bodies
+
+    @property
+    def torque(self) -> np.ndarray:
+        """(N, n)."""
+        return self.effort[self.index]
+
+    @cached_property
+    def inertial(self) -> np.ndarray:
+        """(N, n, 10 B) columns of the bodies."""
+        return regressor(self.bodies, self.q, self.v, self.a).reshape(*self.q.shape, -1)
+
+    @cached_property
+    def at_rest(self) -> np.ndarray:
+        """(N, n, 10 B) columns of the bodies where they stand: of gravity alone."""
+        still = np.zeros_like(self.v)
+        return regressor(self.bodies, self.q, still, still).reshape(*self.q.shape, -1)
+
+    @cached_property
+    def drives(self) -> np.ndarray:
+        """(N, n, 4 n) columns of Ia, Fv, Fc, off of each joint."""
+        m, n = self.q.shape
+        found, joints = np.zeros((m, n, n, 4)), np.arange(n)
+        found[:, joints, joints] = drive_columns(self.v, self.a)
+        return found.reshape(m, n, -1)
+
+
+def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
+    """Return some `count` samples of a recording of the motors' torques; None where too few are left."""
+    motion, n = case.motion, case.motion.n
+    # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
+    edge_time = 0.3
+    edge = int(edge_time * motion.rate)
+    inner = np.concatenate([np.arange(a + edge, b - edge) for a, b in segments(motion.segment)])
+    if len(inner) < 20 * n or case.target.shape[1] != n:
+        return None
+    index = inner[:: max(1, len(inner) // count)]
+    # window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help
+    window = 0.02
+    effort = _smoothed(np.asarray(case.target), max(1, round(window * motion.rate)))
+    q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
+    return MotionSamples(index, q, v, a, effort, motion.v, bodies)
+
+
+def drive_columns(v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return a, v, sign(v) smoothed, and ones, for velocities and accelerations (...): (..., 4)."""
+    return np.stack([a, v, np.tanh(v / CREEP), np.ones_like(v)], axis=-1)
+
+
+def basis(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (N, k) of what columns (N, p) span."""
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 1e-9 * size.max()] / size[size > 1e-9 * size.max()]
+    values, vectors = np.linalg.eigh(columns.T @ columns)
+    kept = values > 1e-9 * values[-1]
+    return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
+
+
+def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
+    """Return the moving average (N, n) over an odd number of samples, three at least."""
+    half = max(1, width // 2)
+    padded = np.pad(values, ((half + 1, half), (0, 0)), mode="edge")
+    total = np.cumsum(padded, axis=0)
+    return (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)

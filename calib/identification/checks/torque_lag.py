@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.identification.checks.motion_samples import MotionSamples, basis
-from calib.identification.checks.recorded_motion import CREEP
+from calib.identification.checks.recorded_motion import CREEP, MotionSamples, basis
 
 LAGS = 0.25  # largest lag that is tried [s], in steps of
 STEP = 0.005

@@ -2,7 +2,7 @@
 
 A stretch is a part of a recording without gaps. The simulation runs along the whole of it and is compared some way
 inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot to forget that it started on the
-reference.
+reference. Its motion then takes the place of the recorded one: the same instants, the same low-pass.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ from scipy.interpolate import CubicSpline
 
 from calib.arrays import frozen
 from calib.data.signals.bandwidth import USABLE
-from calib.data.signals.filtering import Decimator, border, low_pass
+from calib.data.signals.filtering import Decimator, border, curvature, low_pass, slope
 from calib.data.signals.motion import ROWS, Motion
 from calib.dynamics.bodies import Bodies
-from calib.errors import NotConverged, UsageError, refuse_data
+from calib.errors import CalibError, NotConverged, UsageError, refuse_data
 from calib.identification.loop.controller import IdentifiedController, identify_controller
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.rows import Case, segments
-from calib.simulation.loop.closed_loop import Plant, feed_forward
+from calib.simulation.loop.closed_loop import Plant, SimulatedRun, feed_forward
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
@@ -246,3 +246,42 @@ def _fed_forward(
         raise UsageError("[loop] feedforward = 'cad': the robot's description holds no masses")
     inertial = frozen(np.concatenate([cad, np.zeros(10 * bodies.count - len(cad))]))
     return controller.with_feedforward(feed_forward(Plant(bodies, (), inertial), reference))
+
+
+def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
+    """Return the case with the simulated motion at the instants of the recorded one, filtered like that one.
+
+    The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
+    what tells W from Z is noise.
+    """
+    index, motion = simulated_samples(case, run.t, loop), case.motion
+    q, less = (low_passed(run.q, motion, at) for at in (motion.cutoff, motion.velocity_cutoff))
+    v, a = slope(less, motion.rate), curvature(q, motion.rate)
+    return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
+
+
+def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
+    """Return the places of a case's instants among the simulated ones `t` [s]."""
+    step = loop.reference.period * loop.every
+    since = case.motion.t - loop.reference.t[0]
+    index = np.rint(since / step).astype(int)
+    if index[0] < 0 or index[-1] >= len(t) or np.abs(index * step - since).max() > 0.01 * step:
+        raise CalibError(
+            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
+            f"{1 / case.motion.rate:.6g} s, the simulation from {t[0]:.6g} s to {t[-1]:.6g} s in steps of "
+            f"{step:.6g} s: give the whole reference, and `every`"
+        )
+    return index
+
+
+def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) -> np.ndarray:
+    """Return simulated positions (N, n), or their slopes (N, n, ...), through the low-pass of the recorded ones.
+
+    Args:
+        cutoff: (n,) of another of its filters [Hz].
+    """
+    result, cutoffs = np.empty_like(q), motion.cutoff if cutoff is None else cutoff
+    for f in np.unique(cutoffs):
+        own = cutoffs == f
+        result[:, own] = low_pass(q[:, own], motion.rate, float(f))
+    return result

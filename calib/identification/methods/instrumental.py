@@ -31,8 +31,7 @@ from calib.estimation.instrumental_variables import ExogeneityTest, Instruments,
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
-from calib.identification.loop.loop_recordings import Loop
-from calib.identification.loop.simulated_motion import low_passed, simulated_case, simulated_samples
+from calib.identification.loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
 from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, hold, make_constraints
 from calib.identification.rows import Case, ObservationRows, observe, pool, triangulate
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate

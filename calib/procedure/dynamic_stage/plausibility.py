@@ -11,9 +11,8 @@ import numpy as np
 from calib.column_changes import Explanation
 from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.errors import Finding, finding
-from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
+from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
-from calib.identification.checks.whole_robot import ClockRatio
 from calib.identification.methods.bias import LoopDisagreement
 from calib.identification.possible.solve import Contradiction
 from calib.procedure.findings import level_of, limit

@@ -12,8 +12,7 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
-from calib.geometry.checks.instrument_scale import Scale, length_factor, scale_of
-from calib.geometry.checks.wrong_columns import wrong_columns
+from calib.geometry.checks.wrong_columns import Scale, length_factor, scale_of, wrong_columns
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.result import GeometricFit

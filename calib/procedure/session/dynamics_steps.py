@@ -22,7 +22,7 @@ from calib.identification.checks.recorded_motion import (
     LocatedMotion,
     another_motion,
     locate,
-    nominal_share,
+    share_of_nominal,
 )  # fmt: skip
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.identification.settings import Payload
@@ -199,7 +199,7 @@ def check_torques(recording: Recording, chain: Chain) -> None:
     """
     if chain.inertias is None or recording.kind != "torque":
         return
-    share = nominal_share(recording, chain)
+    share = share_of_nominal(recording.t, recording.q, recording.effort, chain)
     sure = np.flatnonzero(np.isfinite(share))
     if not len(sure):
         return

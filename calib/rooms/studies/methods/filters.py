@@ -23,7 +23,7 @@ import numpy as np
 
 from calib.errors import CalibError, CannotSimulate, Diverged, require
 from calib.estimation.linear import LinearFit
-from calib.identification.loop.simulated_motion import low_passed
+from calib.identification.loop.loop_recordings import low_passed
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import Case, segments

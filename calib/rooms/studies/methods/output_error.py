@@ -23,8 +23,7 @@ from calib.estimation import nonlinear
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.estimation.whiteness import scatter
-from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
-from calib.identification.loop.simulated_motion import low_passed, simulated_samples
+from calib.identification.loop.loop_recordings import ClosedLoops, close_loops, low_passed, simulated_samples
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import thinned
