@@ -403,12 +403,12 @@ def from_chain(
     places = places[np.linalg.norm(places, axis=1) > 1e-6]
     lines = _lines_of(chain, np.zeros((1, chain.n)), places)
     length = np.linalg.norm(lines.end - lines.start, axis=2)[0]
-    moving = [chain.elements[k] for k in chain.driven]
-    first = {element.joint: k for k, element in reversed(list(enumerate(moving)))}
-    named = {
-        k: chain.links[j] if chain.links else f"{chain.joint_names[j]}_link" for j, k in first.items() if j is not None
-    }
-    names = [chain.base, *(named.get(k, f"{element.name}_link") for k, element in enumerate(moving))]
+    moving, first = [chain.elements[k] for k in chain.driven], set(chain.moving.tolist())
+    links = chain.links or tuple(f"{name}_link" for name in chain.joint_names)
+    own_names = (
+        links[one.joint or 0] if k in first else f"{one.name}_link" for k, one in zip(chain.driven.tolist(), moving)
+    )
+    names = [chain.base, *own_names]
     names += ["target"] if len(places) == 1 else [f"target {k + 1}" for k in range(len(places))]
     bodies = np.array([*range(len(moving) + 1), *[len(moving)] * len(places)])
     radii = np.array([*[size] * (len(moving) + 1), *[TARGET_RADIUS] * len(places)])

@@ -47,7 +47,6 @@ def test_calibrated_tables_round_trip_as_tables(name, tmp_path):
     path = description.write(tmp_path / "robot.toml", chain)
     assert same(description.read(path), chain) and same(load(tmp_path), chain)
     assert "[[joint]]" in path.read_text() and "[[element]]" not in path.read_text()
-    assert same(description.read(path), chain)
 
 
 def test_any_chain_round_trips(tmp_path):
@@ -107,24 +106,23 @@ def test_complaints_about_elements(element, message, tmp_path):
         description.read(path)
 
 
-def test_complaints_about_the_whole(tmp_path):
-    path = tmp_path / "robot.toml"
-    for text, message in (
-        ('[[joint]]\nname="a"\n[[element]]\nname="e"\naxis="rz"\njoint=0', r"'name' is missing"),
-        (
-            'name="x"\nbase=5\n[[joint]]\nname="a"\n[[element]]\nname="e"\naxis="rz"\njoint=0',
-            r"'base' has to be text, found 5",
-        ),
-        ('name="x"\n[[element]]\nname="e"\naxis="rz"\njoint=0', r"no \[\[joint\]\] tables found"),
-        ('name="x"\n[[joint]]\nname="a"\n[[element]]\nname="e"\naxis="rz"', r"every joint has to move"),
-        (
-            'name="x"\n[[joint]]\nname="a"\nkinds=1\n[[element]]\naxis="rz"',
-            r"there is no key 'kinds' .did you mean 'kind'",
-        ),
-    ):
-        path.write_text(text)
-        with pytest.raises(RobotError, match=message):
-            description.read(path)
+A, E = '[[joint]]\nname="a"\n', '[[element]]\nname="e"\naxis="rz"\n'
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (f"{A}{E}joint=0", r"'name' is missing"),
+        (f'name="x"\nbase=5\n{A}{E}joint=0', r"'base' has to be text, found 5"),
+        (f'name="x"\n{E}joint=0', r"no \[\[joint\]\] tables found"),
+        (f'name="x"\n{A}{E}', r"every joint has to move"),
+        (f'name="x"\n{A}kinds=1\n{E}', r"there is no key 'kinds' .did you mean 'kind'"),
+    ],
+)
+def test_complaints_about_the_whole(tmp_path, text, message):
+    (tmp_path / "robot.toml").write_text(text)
+    with pytest.raises(RobotError, match=message):
+        description.read(tmp_path / "robot.toml")
 
 
 def test_library_holds_what_it_says():

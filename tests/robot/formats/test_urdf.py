@@ -225,50 +225,23 @@ def test_bad_files(source, message):
         urdf.parse(source, "bad")
 
 
-def arm(*joints: str) -> str:
-    return robot(*joints, links="base one two three")
-
-
 @pytest.mark.parametrize(
-    "source, message",
+    "one, two, three, message",
     [
-        (
-            arm(
-                joint("a", "revolute", "base", "one", Z + '<mimic joint="b"/>'),
-                joint("b", "revolute", "one", "two", Z),
-                joint("c", "fixed", "two", "three"),
-            ),
-            r"joint 'a': the joint it mimics, 'b', comes after it",
-        ),
-        (
-            arm(
-                joint("a", "revolute", "base", "one", Z + '<mimic joint="b"/>'),
-                joint("b", "revolute", "one", "two", Z + '<mimic joint="a"/>'),
-                joint("c", "revolute", "two", "three", Z),
-            ),
-            r"joint 'a': it mimics a circle",
-        ),
-        (
-            arm(
-                joint("a", "revolute", "base", "one", Z),
-                joint("b", "revolute", "one", "two", Z + '<mimic joint="aa"/>'),
-                joint("c", "revolute", "two", "three", Z),
-            ),
-            r"joint 'b': it mimics 'aa', which is no joint",
-        ),
-        (
-            arm(
-                joint("a", "revolute", "base", "one", Z),
-                joint("b", "floating", "one", "two"),
-                joint("c", "revolute", "two", "three", Z),
-            ),
-            r"joint 'b': type 'floating' cannot be part of an arm",
-        ),
+        (("revolute", "b"), ("revolute", ""), ("fixed", ""), r"joint 'a': the joint it mimics, 'b', comes after it"),
+        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': it mimics a circle"),
+        (("revolute", ""), ("revolute", "aa"), ("revolute", ""), r"joint 'b': it mimics 'aa', which is no joint"),
+        (("revolute", ""), ("floating", ""), ("revolute", ""), r"joint 'b': type 'floating' cannot be part of an arm"),
     ],
 )
-def test_bad_arms(source, message):
+def test_bad_arms(one, two, three, message):
+    ends = (("base", "one"), ("one", "two"), ("two", "three"))
+    joints = [
+        joint(name, kind, *own, Z + f'<mimic joint="{leader}"/>' * bool(leader))
+        for name, (kind, leader), own in zip("abc", (one, two, three), ends)
+    ]
     with pytest.raises(RobotError, match=message):
-        urdf.parse(source)
+        urdf.parse(robot(*joints, links="base one two three"))
 
 
 def test_missing_and_placeholder_limits_are_infinite():
