@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.arrays import frozen
+from calib.arrays import Frozen
 from calib.data.poses.choices import IN_HAND
 from calib.errors import refuse_data
 from calib.estimation import robust
@@ -38,7 +38,7 @@ MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
 
 
 @dataclass(frozen=True, eq=False)
-class ImageNoise:
+class ImageNoise(Frozen):
     """The noise of one block of images.
 
     Attributes:
@@ -55,9 +55,6 @@ class ImageNoise:
     turn: float = 0.0
     weight: np.ndarray = field(default_factory=lambda: np.ones(0))
     shared: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "weight", frozen(self.weight))
 
     @property
     def deviations(self) -> np.ndarray:

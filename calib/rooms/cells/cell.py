@@ -68,21 +68,18 @@ class Cell:
     unmodelled: PositionErrors = field(default_factory=PositionErrors)
 
 
-def true_poses(cell: Cell, q: np.ndarray, hidden: bool = True, warm: float = np.inf) -> np.ndarray:
+def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
     """Return the tool's poses (m, 4, 4) in the station's frame, without noise.
 
     Args:
         cell: the cell.
         q: (m, n) joint values in the order in which the arm takes them [rad or m].
-        hidden: with deflections and unmodelled errors; without, the rigid truth.
         warm: how many poses the arm has moved to before; infinite for a warm arm.
     """
     q = shaped(q, (None, cell.truth.chain.n), "joint values")
     arm = cell.truth.chain
     torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
     bases = evaluate(cell.truth.deflection, q, torque)
-    if not hidden:
-        return see(cell.truth, q, bases=np.zeros_like(bases)).poses()
     beyond = displacements(cell.unmodelled, arm, q, torque, warm)
     seen = see(cell.truth, q, bases=bases, given=beyond).poses()
     return drooping(cell.unmodelled, arm, seen, cell.truth.stations[0])

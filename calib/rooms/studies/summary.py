@@ -13,9 +13,9 @@ taken that is cheap: no more than `ALIKE` times the processor time of the cheape
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import comb
 
 import numpy as np
+from scipy.stats import binomtest
 
 from calib.rooms.studies.conditions import Condition, Study
 from calib.rooms.studies.trial import TrialRow
@@ -187,7 +187,6 @@ def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
     """
     both = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
     larger, smaller = sum(a > b for a, b in both), sum(a < b for a, b in both)
-    count, few = larger + smaller, min(larger, smaller)
-    if count < MIN_DATA_SETS:
+    if larger + smaller < MIN_DATA_SETS:
         return 1.0
-    return min(1.0, 2.0 * sum(comb(count, k) for k in range(few + 1)) / 2.0**count)
+    return float(binomtest(larger, larger + smaller).pvalue)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import frozen
+from calib.arrays import Frozen
 from calib.robot.collision import find_mesh, urdf_meshes
 from calib.robot.formats.urdf_tree import numbers, origin
 
@@ -13,17 +13,13 @@ DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer s
 
 
 @dataclass(frozen=True, eq=False)
-class Visual:
+class Visual(Frozen):
     """A mesh file that moves with a link: its placement (4, 4) in the link's frame, its scale (3,)."""
 
     link: str
     file: Path
     placement: np.ndarray
     scale: np.ndarray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "placement", frozen(self.placement))
-        object.__setattr__(self, "scale", frozen(self.scale))
 
 
 def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:

@@ -11,14 +11,8 @@ from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case
 from calib.simulation.loop.closed_loop import Plant
 
-SHARES = (
-    1.0,
-    0.9,
-    0.75,
-    0.5,
-    0.25,
-    0.0,
-)  # of least squares on the way to a regular robot, where it cannot be simulated
+# shares of least squares, the rest being a regular robot, that are tried until one can be simulated
+SHARES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
