@@ -53,7 +53,7 @@ def images(
     image_topic: str | None = None,
     joint_topic: str | None = None,
 ) -> None:
-    """Find the board in images or a bag; say which are useless. A bag's images become a folder.
+    """Find the board in images or a bag. What is useless is named; a bag's images become a folder.
 
     A folder that was looked at holds corners.csv, and goes where a CSV file of measured poses goes: calib fit ROBOT
     FOLDER. See calib formats images.
