@@ -123,7 +123,7 @@ def redo(folder: Folder, step: str, plots: bool = True) -> None:
 
 @command(app)
 def status(folder: Folder) -> None:
-    """Show how far a session is, and what is stale; with -v, what was noted as its steps were made."""
+    """Show how far a session is, and what is stale. With -v, what was noted as its steps were made."""
     from calib.procedure.session import commands
 
     say(*commands.status_lines(folder), result=True)
