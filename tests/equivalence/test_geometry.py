@@ -1,7 +1,5 @@
 """`calib fit` and a session's steps fit, validate and certificate give one answer to the same files."""
 
-from __future__ import annotations
-
 import html
 import shutil
 from collections.abc import Callable, Iterable

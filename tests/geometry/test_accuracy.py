@@ -1,7 +1,5 @@
 """Errors in figures: each nature of measurement by hand-made numbers, and what does not depend on frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Counts: how many parameters poses can tell, against 4R + 2P + 6 and the numbers of the literature."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors that a fit expects of itself hold on unseen poses whose truth the model cannot express, and grow away."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """First guess: exact without noise, good enough with arm errors and outliers to end at the global optimum."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

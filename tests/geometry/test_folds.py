@@ -1,7 +1,5 @@
 """Folds: a partition of the rows that keeps together what belongs together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

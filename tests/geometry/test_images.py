@@ -1,7 +1,5 @@
 """Claims of corners in images: exact derivatives, an exact reduction, recovery of what was planted, honest sigmas."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Inverse kinematics of deflected arms: what it promises, robot by robot."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ladder takes up what was planted, and nothing where the truth is rigid."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise

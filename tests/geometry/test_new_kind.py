@@ -1,7 +1,5 @@
 """Claim: a further kind of measurement is a type and one residual function; the fit and its errors follow."""
 
-from __future__ import annotations
-
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import ClassVar
 

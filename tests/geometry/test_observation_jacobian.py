@@ -1,7 +1,5 @@
 """Derivative: every column of every kind of residual against finite differences along `parameters.step`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of full poses that hold nearly one orientation: placed as well as by their positions, and honestly left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

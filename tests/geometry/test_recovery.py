@@ -1,7 +1,5 @@
 """Recovery: planted arms come back within the covariance the fit states, for every kind of measurement and mixtures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where errors are larger is found from their squares alone, and what was not learnt is expected to be worse."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.geometry.uncertainty.left_out import Unevenness, unevenness

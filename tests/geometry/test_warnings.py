@@ -1,7 +1,5 @@
 """Two-sided: every warning on measurements and poses is given where it is due, and not where it is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

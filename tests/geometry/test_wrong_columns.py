@@ -1,7 +1,5 @@
 """Reversed joints are found, and looked for only where no placement could make up for them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

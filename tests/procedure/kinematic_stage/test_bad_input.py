@@ -1,7 +1,5 @@
 """Whatever is wrong with the input: one message that says where, exit code 2, and nothing half-written."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

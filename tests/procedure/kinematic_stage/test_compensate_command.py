@@ -1,7 +1,5 @@
 """`calib compensate`: from nominal targets to commands that put the true tool there."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -61,16 +59,6 @@ def fitted(cell, tmp_path_factory) -> Path:
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def calib(capsys):
-    def run(*arguments: object) -> tuple[int, str, str]:
-        code = cli.run([str(argument) for argument in arguments])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run
 
 
 def commands(path: str = "commands.csv") -> list[dict[str, str]]:

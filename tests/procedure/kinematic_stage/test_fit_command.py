@@ -1,7 +1,5 @@
 """What `calib fit` promises: its files, its figures, its exit codes."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -47,8 +45,7 @@ def test_a_planted_arm_is_found_and_the_contract_is_kept(cell, calib):
     assert [rung["model"] for rung in metrics["ladder"]] == ["frames", "offsets", "geometry"]
     assert metrics["ladder"][-1]["parameters"] == metrics["fit"]["parameters"]
     assert metrics["verdict"] == "pass"
-    assert "verdict: pass" in out
-    assert "day2.csv" in out
+    assert "verdict: pass" in out and "day2.csv" in out
 
 
 def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
@@ -101,10 +98,8 @@ def test_residuals_are_those_of_the_metrics(cell, calib):
 
 def test_holdout_keeps_the_last_share_of_the_permutation(cell, calib):
     file = cell.write("day1.csv", cell.measure(60))
-    assert calib("fit", "ur5", file, "--holdout", "0.25", "--seed", "3", "--model", "offsets", "--out", "done")[0] in (
-        0,
-        1,
-    )
+    start = ("fit", "ur5", file, "--holdout", "0.25", "--seed", "3", "--model", "offsets", "--out", "done")
+    assert calib(*start)[0] in (0, 1)
     metrics = json.loads(Path("done/metrics.json").read_text())
     assert metrics["fit"]["poses"] == 45
     assert metrics["validation"]["day1.csv"]["poses"] == 15
@@ -202,9 +197,10 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
     code, out, _ = calib(
         "fit", "arm", bad, "--validate", good, "--refit-frames", "--model", "geometry", "--out", "worse"
     )
-    assert code == 1
-    assert "verdict: fail" in out
-    assert json.loads(Path("worse/metrics.json").read_text())["verdict"] == "fail"
+    assert (code, json.loads(Path("worse/metrics.json").read_text())["verdict"]) == (
+        1,
+        "fail",
+    ) and "verdict: fail" in out
 
 
 def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
@@ -216,10 +212,8 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     assert "coefficient * b(q)" in Path("done/joint_corrections.txt").read_text()
     metrics = json.loads(Path("done/metrics.json").read_text())
     q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in cell.measure(90)])
-    from calib.geometry.installation import see
-
     seen = np.array([[row[axis] for axis in "xyz"] for row in cell.measure(90)])
-    size = np.linalg.norm(see(placed, q).point.T - seen, axis=1)
+    size = np.linalg.norm(installation.see(placed, q).point.T - seen, axis=1)
     assert np.isclose(1e3 * np.sqrt(np.mean(size**2)), metrics["fit"]["calibrated"]["position_mm"]["rms"], rtol=1e-6)
     # a URDF alone is the best rigid geometry, beside the one that the corrections belong to
     alone = metrics["fit"]["urdf_alone"]["position_mm"]["rms"]

@@ -1,7 +1,5 @@
 """ISO 9283's numbers against their definitions, and repeated poses kept together."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every kind of measurement through the command: a planted arm comes out better on poses that were kept aside."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

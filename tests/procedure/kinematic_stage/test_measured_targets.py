@@ -7,8 +7,6 @@ its own judge. (The tool on it is where the calibration puts it: in the Motoman'
 guess of it is 0.67 m off, and turns of 0.2 mrad would count with that lever.)
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

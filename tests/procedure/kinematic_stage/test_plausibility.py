@@ -1,7 +1,5 @@
 """Measurements that are not what they claim: no verdict of pass stands on them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

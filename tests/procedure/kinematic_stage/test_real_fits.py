@@ -1,7 +1,5 @@
 """The real recordings, by the command that a user types. Bounds are the goals, or what is explained beside them."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

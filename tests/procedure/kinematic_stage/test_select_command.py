@@ -1,7 +1,5 @@
 """What `calib select` promises: better poses than chance gives, within the constraints, by seed."""
 
-from __future__ import annotations
-
 import csv
 import pickle
 from pathlib import Path

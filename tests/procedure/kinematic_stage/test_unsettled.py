@@ -1,7 +1,5 @@
 """A placement of base and tool that did not settle is said, and not scored."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
