@@ -7,11 +7,13 @@ reason, where the folder is absent.
 from __future__ import annotations
 
 import gc
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import loaded as processes
+import produced
 import pytest
 from hypothesis import HealthCheck, settings
 from recordings import DATA
@@ -33,11 +35,19 @@ settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("fixed")
 
 
+if "CALIB_FINDINGS" in os.environ:  # see tests/procedure/test_findings.py
+    produced.note()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_blas_thread() -> Iterator[None]:
     """Limit BLAS for tests that call what stands behind the API, as the API does."""
     with one_blas_thread():
         yield
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.name == "test_every_entry_is_produced")  # by all tests before it
 
 
 def pytest_collection_finish() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 from pathlib import Path
 from string import Formatter
 
+import produced
 import pytest
 
 from calib.errors import finding
@@ -33,6 +35,12 @@ def test_an_entry_is_short_plain_and_complete(code):
 def test_every_entry_is_used():
     sources = "".join(path.read_text(encoding="utf-8") for path in Path(findings.__file__).parents[1].rglob("*.py"))
     assert [code for code in CODES if f'"{code}"' not in sources] == []
+
+
+@pytest.mark.skipif("CALIB_FINDINGS" not in os.environ, reason="set CALIB_FINDINGS and run all tests, slow ones, too")
+def test_every_entry_is_produced():
+    """Real and spoiled files of all tests together make the sources say every entry; runs last."""
+    assert sorted({code for code in CODES if not code.startswith("earlier")} - produced.CODES) == []
 
 
 def test_every_finding_of_the_code_has_the_values_its_entry_needs():
