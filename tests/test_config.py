@@ -193,9 +193,9 @@ def test_identify_options_that_cannot_be(table: dict[str, Any], words: str | Non
 def test_what_holds_for_every_recording_is_handed_down_to_one() -> None:
     table = {"filter": {"band": 5.0, "order": 2}, "gains": [1.0], "files": {"a.npz": {"filter": {"band": 7.0}}}}
     found = identify_options.parse_options(table)
-    own = found.for_file("x/a.npz")
+    own = found.file_settings("x/a.npz")
     assert (own.filter.band, own.filter.order, own.gains, own.payload) == (7.0, 2, (1.0,), ())
-    assert found.for_file("b.npz").filter.band == 5.0
+    assert found.file_settings("b.npz").filter.band == 5.0
 
 
 @FEW

@@ -105,7 +105,7 @@ from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
-from calib.dynamics.torque_rows import MOTOR, ROWS, TorqueRows
+from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refused_as
 from calib.identification.settings import Choices, Coupling, IdentificationSettings, Payload
 
@@ -203,18 +203,13 @@ class IdentifyOptions:
     accept: tuple[str, ...] = ()
     source: str = ""
 
-    def for_file(self, path: str | Path) -> FileSettings:
-        """Return the settings of the recording at `path`, whose torques are those the model's rows explain."""
-        found = own_table(self.files, path) or self.every
-        return replace(found, recording=_for_rows(found.recording, self.settings.torque_rows))
-
-    def file_settings(self, path: str) -> FileSettings:
-        """Return the settings of a recording that may have a cut behind its name."""
-        return self.for_file(parse_cut(path)[0])
-
-
-def _for_rows(recording: RecordingOptions, rows: TorqueRows) -> RecordingOptions:
-    return replace(recording, rows=rows.name, motors=rows.driven, sensors=rows.sensed)
+    def file_settings(self, path: str | Path) -> FileSettings:
+        """Return the settings of a recording, maybe with a cut, whose torques are those the model's rows explain."""
+        found = own_table(self.files, parse_cut(str(path))[0]) or self.every
+        rows = self.settings.torque_rows
+        return replace(
+            found, recording=replace(found.recording, rows=rows.name, motors=rows.driven, sensors=rows.sensed)
+        )
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:

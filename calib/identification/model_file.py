@@ -146,17 +146,12 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
             for one, value in zip(model.columns, dynamics.values[bodies:])
         ],
         "base": dict(zip(base.names, expressions(base))),
-        "regrouping": _regrouping(base),
+        "regrouping": {
+            name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
+            for name, row in zip(base.names, base.transform)
+        },
         "covariance": estimate_files.COVARIANCE,
         "note": NOTE,
-    }
-
-
-def _regrouping(base: Base) -> dict[str, dict[str, float]]:
-    """Return, by base parameter, the coefficients of the standard ones it stands for, in full."""
-    return {
-        name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
-        for name, row in zip(base.names, base.transform)
     }
 
 

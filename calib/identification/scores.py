@@ -58,7 +58,6 @@ class IntervalCoverage:
         median: (rows,) half width of the intervals in the torque's unit.
         samples: at which this was judged.
         extrapolated_percent: of these samples, how many lie outside the training range.
-        extrapolates: in words how the motion leaves the training range.
     """
 
     coverage_percent: float
@@ -66,7 +65,6 @@ class IntervalCoverage:
     median: Array
     samples: int
     extrapolated_percent: float
-    extrapolates: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -239,11 +239,11 @@ class TorqueIntervals:
         """(M,) whether a sample extrapolates."""
         return np.asarray(self.extrapolated.any(axis=(0, 2)))
 
-    def coverage(self, joints: Sequence[str]) -> IntervalCoverage:
-        """Return the shares of errors inside, as a record; `joints`: their names."""
+    def coverage(self) -> IntervalCoverage:
+        """Return the shares of errors inside, as a record."""
         return IntervalCoverage(
             100.0 * self.covered, 100.0 * self.joints, self.median, int(self.known.sum()),
-            100.0 * float(self.beyond.mean()), tuple(self.ways(joints)),
+            100.0 * float(self.beyond.mean()),
         )  # fmt: skip
 
     def ways(self, joints: Sequence[str]) -> list[str]:

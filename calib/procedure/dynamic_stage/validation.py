@@ -163,8 +163,7 @@ def assess(
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     fit = {case.name: scores[case.name] for case in inputs.cases}
-    names = inputs.chain.joint_names
-    stated = {name: one.coverage(names) for name, one in expected.items()}
+    stated = {name: one.coverage() for name, one in expected.items()}
     validation = {
         case.name: replace(scores[case.name], evidence=case.name not in repeated, interval95=stated.get(case.name))
         for case in inputs.unseen

@@ -173,7 +173,7 @@ def test_every_key_of_the_documented_options_is_read(tmp_path):
     path.write_text("\n".join(line[4:] for line in text.splitlines()))
     found = identify_options.read_options(path)
     assert found.settings.ratio == 20.0 and found.gain_pair is not None
-    assert found.for_file("x/run_load.npz").payload == ("tool",)
+    assert found.file_settings("x/run_load.npz").payload == ("tool",)
     assert found.settings.couplings[0].joints == (4, 5)
 
 

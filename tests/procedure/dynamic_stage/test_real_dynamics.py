@@ -136,7 +136,7 @@ def gains(folder: Path, pair: str) -> tuple[np.ndarray, np.ndarray]:
     )
     chain = load(folder / "model.urdf")
     paths = [str(folder / name) for name in (unloaded, loaded)]
-    motions = {path: read_motion(path, chain, options.for_file(path)) for path in paths}
+    motions = {path: read_motion(path, chain, options.file_settings(path)) for path in paths}
     found = find_gains(chain, options, motions, paths, lambda words: None).found
     assert found is not None
     return found.gains, found.sigma
