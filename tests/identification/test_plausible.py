@@ -101,15 +101,15 @@ def test_velocities_that_are_no_slopes_are_told(clock: float, level: str | None)
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02, 0.05, -0.05, 0.1, 0.2])
 def test_a_lag_of_all_torques_is_found_and_taken_back(late: float) -> None:
     lag = compare_sizes(case_of(recorded(late)), ARM).lag
-    assert lag is not None and lag.seconds == pytest.approx(late, abs=0.001) and lag.told == (abs(late) > 0.015)
+    assert lag is not None and lag.seconds == pytest.approx(late, abs=0.001) and lag.certain == (abs(late) > 0.015)
     told = coded(found(recorded(late)), "torques-late")
-    assert [level_of(one) for one in told] == ([] if not lag.told else ["fail" if abs(late) > 0.04 else "marginal"])
-    if lag.told:
+    assert [level_of(one) for one in told] == ([] if not lag.certain else ["fail" if abs(late) > 0.04 else "marginal"])
+    if lag.certain:
         assert told[0].values["by"] == pytest.approx(abs(late), abs=5e-4)
         assert told[0].values["way"] == ("later" if late > 0 else "earlier")
         assert told[0].values["sigma"] == pytest.approx(0.005, abs=5e-4)
         back = compare_sizes(case_of(earlier(recorded(late), lag.seconds)), ARM).lag
-        assert back is not None and not back.told
+        assert back is not None and not back.certain
 
 
 def bending(t: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -127,14 +127,14 @@ def test_friction_that_turns_over_late_is_no_lag(late: float) -> None:
     tau = planted.torques(q, v, a) + np.array(planted.DRIVES["Fc"]) * (bending(t, v) - np.sign(v))
     tau = np.column_stack([np.interp(t - late, t, own) for own in tau.T])
     lag = compare_sizes(case_of(recorded(tau=tau)), ARM).lag  # 31 ms more, were friction taken to turn at once
-    assert lag is not None and lag.seconds == pytest.approx(late, abs=0.008) and lag.told == (late > 0)
+    assert lag is not None and lag.seconds == pytest.approx(late, abs=0.008) and lag.certain == (late > 0)
 
 
 def test_halves_that_disagree_and_short_motion_tell_no_lag() -> None:
     late, early = recorded(0.1).effort, recorded(-0.02).effort
     tau = np.where(recorded().t[:, None] < 10.0, late, early)
     lag = compare_sizes(case_of(recorded(tau=tau)), ARM).lag
-    assert lag is not None and lag.sigma > 0.05 and not lag.told
+    assert lag is not None and lag.sigma > 0.05 and not lag.certain
     assert compare_sizes(case_of(recorded(0.1).cut(2.0, 4.5)), ARM).lag is None
 
 
@@ -142,7 +142,7 @@ def test_one_joint_that_comes_late_is_no_clock_and_named() -> None:
     tau = recorded().effort.copy()
     tau[:, 2] = recorded(0.05).effort[:, 2]
     lag = compare_sizes(case_of(recorded(tau=tau)), ARM).lag
-    assert lag is not None and not lag.told and lag.joint == 2
+    assert lag is not None and not lag.certain and lag.joint == 2
     (one,) = coded(found(recorded(tau=tau)), "torques-late", "joint-late")
     assert (one.code, level_of(one), one.values["joint"]) == ("joint-late", "marginal", "joint3")
     assert one.values["way"] == "later" and one.values["by"] == pytest.approx(0.049, abs=5e-4)

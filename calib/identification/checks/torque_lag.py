@@ -18,7 +18,7 @@ from calib.identification.checks.recorded_motion import CREEP, MotionSamples, ba
 
 LAGS = 0.25  # largest lag that is tried [s], in steps of
 STEP = 0.005
-MIN_LAG, MIN_LAG_SIGMAS = 0.015, 3.5  # least lag that is told [s], and in sigmas
+MIN_LAG, MIN_LAG_SIGMAS = 0.015, 3.5  # smallest lag that is reported [s], and in sigmas
 ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
 
 
@@ -45,7 +45,7 @@ class Lag:
     joint: int | None
 
     @property
-    def told(self) -> bool:
+    def certain(self) -> bool:
         """Whether all torques come late, surely, and by enough."""
         least = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
         # and what is left without it over what is left with it: of another robot any lag may be the best
@@ -62,7 +62,7 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
         rate: of its motion [Hz].
     """
     m = len(samples.index)
-    min_time = 2.0  # time with samples below which a motion tells no lag: bodies then stand for it [s]
+    min_time = 2.0  # time with samples below which no lag is estimated: bodies make up for it [s]
     if m * float(np.median(np.diff(samples.index))) < min_time * rate:
         return None
     whole = _lag_in(samples, rate)

@@ -180,7 +180,7 @@ def _unlike(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
     if lag is None:
         return
-    if lag.told:
+    if lag.certain:
         yield finding(
             "torques-late", file=name, by=abs(lag.seconds), sigma=lag.sigma, way=_way(lag.seconds), lag=lag.seconds,
             before=lag.before, after=lag.after, times=lag.factor,
