@@ -177,8 +177,9 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
         (m, 6, n): linear velocity of the point, then angular velocity, both in the reference frame.
     """
     moving = chain.driven if before is None else chain.driven[chain.driven < before]
-    columns = element_jacobian(chain, walked, point, moving)
-    return np.tensordot(chain.rates[: len(moving)].T, columns, 1).transpose(2, 1, 0)
+    columns, rates = element_jacobian(chain, walked, point, moving), chain.rates[: len(moving)]
+    own = columns if np.array_equal(rates, np.eye(chain.n)) else np.tensordot(rates.T, columns, 1)
+    return own.transpose(2, 1, 0)
 
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -190,13 +191,18 @@ def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
 def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames behind every element that a joint moves, followers included: (moving, m, 4, 4)."""
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
-    passed = _walk(chain, q, _start(None, len(q)))
-    return np.array([pose(r.transpose(2, 1, 0), p.T) for element, _, r, p in passed if element.joint is not None])
+    frames = np.zeros((len(chain.driven), len(q), 4, 4))
+    frames[..., 3, 3] = 1.0
+    moving = (each for each in _walk(chain, q, _start(None, len(q))) if each[0].joint is not None)
+    for frame, (_, _, rotation, position) in zip(frames, moving):
+        frame[:, :3, :3], frame[:, :3, 3] = rotation.transpose(2, 1, 0), position.T
+    return frames
 
 
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames right after each joint's moving element, (n, m, 4, 4): where `Chain.inertias` are given."""
-    return moving_frames(chain, q)[np.searchsorted(chain.driven, chain.moving)]
+    frames = moving_frames(chain, q)
+    return frames if np.array_equal(chain.driven, chain.moving) else frames[np.searchsorted(chain.driven, chain.moving)]
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
