@@ -32,7 +32,7 @@ from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.calibrated import as_calibrated
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.truth import true_base
 from calib.rooms.cells.unmodelled import TorqueErrors
 from calib.rooms.cells.virtual_arm import MovingArm, moving_arm, record

@@ -13,7 +13,7 @@ import numpy as np
 
 import calib
 from calib.rooms.cells import cell, demo, measured_files, virtual_arm, virtual_cells
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 
 NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
 TAUGHT = NEAR + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))

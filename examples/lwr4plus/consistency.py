@@ -43,7 +43,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
 from calib.simulation.loop.references import Reference
 from calib.workers import workers

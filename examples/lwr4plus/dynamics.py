@@ -43,7 +43,7 @@ from calib.identification.rows import Case, make_case, observe
 from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots, lwr4plus
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.simulation.loop.closed_loop import Plant, Sensing, feed_forward, simulate, tracking_error
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference

@@ -44,7 +44,7 @@ from calib.identification.methods.instrumental import Instrumental, Round, ident
 from calib.identification.parameter_constraints import ConstraintSettings, hold, make_constraints
 from calib.identification.rows import Case, make_case, observe
 from calib.rooms.cells import known_robots
-from calib.rooms.cells.random_motions import random_fourier, trapezoidal
+from calib.rooms.cells.known_robots import random_fourier, trapezoidal
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference

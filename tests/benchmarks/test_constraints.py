@@ -19,7 +19,7 @@ from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
 from calib.identification.rows import make_case
 from calib.rooms.cells import known_robots
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.simulation.loop.closed_loop import Sensing, simulate
 
 PLANT = known_robots.plant("tx40", coupled=True)

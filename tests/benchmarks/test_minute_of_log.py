@@ -23,7 +23,7 @@ from calib.identification.rows import make_case
 from calib.identification.scores import score
 from calib.identification.settings import IdentificationSettings
 from calib.robot.load import load
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 
 CHAIN = load("lwr4plus")
 N, RATE, SECONDS = 7, 1000.0, 60.0

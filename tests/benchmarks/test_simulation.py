@@ -22,7 +22,7 @@ from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.rows import Case, make_case
 from calib.robot import description, library
 from calib.rooms.cells import known_robots
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
 from calib.simulation.loop.references import Reference
 

@@ -16,7 +16,7 @@ from calib.robot.formats import urdf_write
 from calib.robot.load import load
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.cell import measure
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_arm import moving_arm, record
 from calib.rooms.cells.virtual_cells import virtual_cell
 

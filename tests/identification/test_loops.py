@@ -17,7 +17,7 @@ from calib.errors import CalibError, UsageError
 from calib.identification import identify_options
 from calib.identification.loop import loop_settings
 from calib.identification.possible import information
-from calib.rooms.cells import random_motions
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
@@ -39,7 +39,7 @@ def plant() -> Plant:
 @cache
 def motion(seed: int) -> references.Reference:
     limit = np.full(3, 1.5)
-    return random_motions.random_fourier(-limit, limit, np.full(3, 3.0), 16.0, RATE, 10, acceleration=15.0, seed=seed)
+    return known_robots.random_fourier(-limit, limit, np.full(3, 3.0), 16.0, RATE, 10, acceleration=15.0, seed=seed)
 
 
 @cache

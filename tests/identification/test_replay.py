@@ -13,7 +13,7 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.identification.loop import replay as replays
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import Case, make_case
-from calib.rooms.cells import random_motions
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, replayed_error, simulate
 
@@ -28,7 +28,7 @@ def plant() -> Plant:
 def recorded() -> tuple[references.Reference, np.ndarray, Case]:
     """Return what was asked, what pushed, what came of it and the case; torques without noise."""
     limit = np.full(3, 1.2)
-    asked = random_motions.random_fourier(-limit, limit, np.full(3, 2.5), 12.0, 1000.0, 8, acceleration=10.0, seed=3)
+    asked = known_robots.random_fourier(-limit, limit, np.full(3, 2.5), 12.0, 1000.0, 8, acceleration=10.0, seed=3)
     omega = 2 * np.pi * np.array([0.7, 1.3, 2.9])
     push = np.array([3.0, 2.0, 0.6]) * np.sin(np.outer(asked.t, omega) + np.arange(3.0))
     run = simulate(plant(), PD, asked, push=push)

@@ -17,7 +17,7 @@ from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import make_case, observe
 from calib.robot import mdh
-from calib.rooms.cells import random_motions
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
@@ -43,7 +43,7 @@ def robot() -> tuple[Plant, IdentificationModel, bases.Base]:
 @cache
 def motion(rate: float = RATE) -> references.Reference:
     limit = np.array([1.5, 0.6])
-    return random_motions.random_fourier(-limit, limit, np.full(2, 3.0), 5.0, rate, 8, acceleration=20.0, seed=5)
+    return known_robots.random_fourier(-limit, limit, np.full(2, 3.0), 5.0, rate, 8, acceleration=20.0, seed=5)
 
 
 def problem(seed: int, sigma_q: float = 0.0, sigma_tau: float = 0.05, rate: float = RATE) -> IdentificationProblem:

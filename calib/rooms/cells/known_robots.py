@@ -1,17 +1,119 @@
-"""Robots with known dynamics and known controllers, from the truths in the library."""
+"""Robots with known dynamics and known controllers, from the truths in the library.
+
+Motions for simulated robots: random Fourier series within limits, and moves with trapezoidal velocities.
+"""
 
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from calib.arrays import shaped
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot import description, library
 from calib.simulation.loop.closed_loop import Plant
 from calib.simulation.loop.controllers import Controller, pd
+from calib.simulation.loop.references import Reference
+
+
+def _fourier(
+    centre: np.ndarray, sines: np.ndarray, cosines: np.ndarray, base: float, duration: float, rate: float
+) -> Reference:
+    """Return q_i = q_i0 + Σ_k [a_ik sin(k ω t) + b_ik cos(k ω t)] (Swevers et al. 1997; Kolyubin et al. 2019, eq. 23).
+
+    Args:
+        centre: (n,) q_i0.
+        sines, cosines: (n, h) a and b.
+        base: ω [rad/s].
+        duration, rate: [s], [Hz].
+    """
+    sines, cosines = np.asarray(sines, dtype=float), np.asarray(cosines, dtype=float)
+    t = np.arange(round(duration * rate) + 1) / rate
+    speed = base * np.arange(1, sines.shape[1] + 1)
+    sin, cos = np.sin(np.outer(t, speed)), np.cos(np.outer(t, speed))
+    q = np.asarray(centre) + sin @ sines.T + cos @ cosines.T
+    v = (cos * speed) @ sines.T - (sin * speed) @ cosines.T
+    return Reference(t, q, v, -(sin * speed**2) @ sines.T - (cos * speed**2) @ cosines.T)
+
+
+def random_fourier(
+    lower: np.ndarray, upper: np.ndarray, velocity: np.ndarray, duration: float, rate: float,
+    harmonics: int = 5, acceleration: float = np.inf, seed: int | np.random.Generator = 0,
+) -> Reference:  # fmt: skip
+    """Return a random Fourier motion of one period inside the limits, at rest at both ends.
+
+    Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is
+    scaled until its first limit is met, then centred. A stand-in for designed excitation, not a replacement.
+
+    Args:
+        lower, upper, velocity: (n,) limits, kept everywhere on the grid of `rate`.
+        acceleration: largest in any joint.
+    """
+    lower, upper, velocity = (np.asarray(x, dtype=float) for x in (lower, upper, velocity))
+    rng, n = np.random.default_rng(seed), len(lower)
+    order = np.arange(1, harmonics + 1)
+    sines, cosines = rng.normal(size=(2, n, harmonics)) / order
+    for rows, across in ((sines, order), (cosines, order**2)):
+        rows -= np.outer(rows @ across, across) / (across @ across)
+    base = 2 * np.pi / duration
+    raw = _fourier(np.zeros(n), sines, cosines, base, duration, rate)
+    low, high = raw.q.min(axis=0), raw.q.max(axis=0)
+    shares = [
+        (upper - lower) / (high - low),
+        velocity / np.abs(raw.v).max(axis=0),
+        acceleration / np.abs(raw.a).max(axis=0),
+    ]
+    scale = np.min(shares, axis=0)
+    centre = 0.5 * (lower + upper) - 0.5 * scale * (low + high)
+    return _fourier(centre, scale[:, None] * sines, scale[:, None] * cosines, base, duration, rate)
+
+
+def trapezoidal(
+    points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, rate: float, pause: float = 0.1
+) -> Reference:
+    """Return moves from point to point with trapezoidal velocities, all joints at rest together, and pauses.
+
+    The slowest joint sets the duration of a move; the others accelerate for the same share of it.
+
+    Args:
+        points: (P, n).
+        velocity, acceleration: (n,) limits.
+        pause: at rest after every move and before the first [s].
+    """
+    points = shaped(points, (None, None), "points")
+    velocity, acceleration = (
+        np.broadcast_to(np.asarray(x, dtype=float), points.shape[1]) for x in (velocity, acceleration)
+    )
+    still = np.zeros((round(pause * rate), points.shape[1]))
+    parts = [(still + points[0], still, still)]
+    for start, stop in pairwise(points):
+        parts += [_move(start, stop, velocity, acceleration, rate), (still + stop, still, still)]
+    q, v, a = (np.concatenate(series) for series in zip(*parts))
+    return Reference(np.arange(len(q)) / rate, q, v, a)
+
+
+def _move(start, stop, velocity, acceleration, rate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return one move with s(t) from 0 to 1: ramps of r seconds, T seconds in all, peak velocity 1 / (T - r)."""
+    far = np.abs(stop - start)
+    ramp = float(np.max(velocity / acceleration, where=far > 0, initial=1.0 / rate))
+    cruise = max(float(np.max(far / velocity)), float(np.max(far / acceleration)) / ramp)
+    ramp = max(ramp, 2.0 / rate)
+    total = max(cruise, ramp) + ramp
+    t = np.arange(1, int(np.ceil(total * rate)) + 1) / rate
+    peak, late = 1.0 / (total - ramp), np.maximum(total - t, 0.0)
+    s = np.where(
+        t < ramp,
+        0.5 * peak * t**2 / ramp,
+        np.where(late < ramp, 1 - 0.5 * peak * late**2 / ramp, peak * (t - ramp / 2)),
+    )
+    rate_ = np.where(t < ramp, peak * t / ramp, np.where(late < ramp, peak * late / ramp, peak))
+    change = np.where(t < ramp, peak / ramp, np.where((late < ramp) & (late > 0), -peak / ramp, 0.0))
+    return start + np.outer(s, stop - start), np.outer(rate_, stop - start), np.outer(change, stop - start)
+
 
 SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a joint with a torque sensor
 

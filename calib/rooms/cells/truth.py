@@ -17,7 +17,7 @@ from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells.cell import Cell, true_poses
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.unmodelled import WARM_TIME
 from calib.rooms.cells.virtual_arm import MovingArm
 from calib.transforms import to_quaternion

@@ -33,7 +33,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.load import load
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
-from calib.rooms.cells.random_motions import random_fourier
+from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
 from calib.rooms.studies.conditions import Condition
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, feed_forward, simulate

@@ -20,7 +20,7 @@ from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
 from calib.identification.rows import make_case
 from calib.robot import mdh
-from calib.rooms.cells import random_motions
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
@@ -48,7 +48,7 @@ def arm(v0: float = 0.5) -> tuple[Plant, IdentificationModel, bases.Base]:
 @cache
 def motion() -> references.Reference:
     limit = np.full(2, 1.8)
-    return random_motions.random_fourier(-limit, limit, np.full(2, 4.0), 10.0, RATE, 12, acceleration=25.0, seed=5)
+    return known_robots.random_fourier(-limit, limit, np.full(2, 4.0), 10.0, RATE, 12, acceleration=25.0, seed=5)
 
 
 def truth(v0: float = 0.5) -> np.ndarray:

@@ -12,7 +12,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain
-from calib.rooms.cells import known_robots, random_motions
+from calib.rooms.cells import known_robots
 from calib.simulation.loop import controllers
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
 from calib.simulation.loop.references import Reference
@@ -26,7 +26,7 @@ def bare(chain: Chain) -> Plant:
 
 
 def motion(seed: int = 1, duration: float = 2.0, rate: float = 5000.0) -> Reference:
-    return random_motions.random_fourier(-HIGH, HIGH, np.full(6, 3.0), duration, rate, acceleration=20.0, seed=seed)
+    return known_robots.random_fourier(-HIGH, HIGH, np.full(6, 3.0), duration, rate, acceleration=20.0, seed=seed)
 
 
 def still(q: np.ndarray, duration: float, rate: float) -> Reference:
@@ -242,10 +242,8 @@ def test_every_sample_may_have_parameters_of_its_own():
 
 
 def test_references_are_their_own_derivatives_and_keep_the_limits():
-    moves = random_motions.trapezoidal(
-        np.array([[0.0, 0.0], [1.0, -0.2], [0.5, 2.0]]), np.array([1.0, 2.0]), 5.0, 1000.0
-    )
-    wave = random_motions.random_fourier(-HIGH, HIGH, np.full(6, 2.0), 5.0, 1000.0, acceleration=15.0, seed=3)
+    moves = known_robots.trapezoidal(np.array([[0.0, 0.0], [1.0, -0.2], [0.5, 2.0]]), np.array([1.0, 2.0]), 5.0, 1000.0)
+    wave = known_robots.random_fourier(-HIGH, HIGH, np.full(6, 2.0), 5.0, 1000.0, acceleration=15.0, seed=3)
     for reference, close in ((moves, 6e-3), (wave, 1e-4)):
         v = np.gradient(reference.q, reference.period, axis=0)
         assert np.abs(v - reference.v)[1:-1].max() < close

@@ -9,8 +9,8 @@ from arms import motley_with_follower
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.errors import CalibError, NotConverged
-from calib.rooms.cells import known_robots, random_motions
-from calib.rooms.studies.methods.tangents import simulate_tangents
+from calib.rooms.cells import known_robots
+from calib.rooms.studies.methods.simulated_robot import simulate_tangents
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
@@ -38,7 +38,7 @@ def odd() -> Plant:
 
 def motion(n: int) -> references.Reference:
     limit = np.full(n, 0.8)
-    return random_motions.random_fourier(-limit, limit, np.full(n, 2.0), 0.6, RATE, acceleration=30.0, seed=3)
+    return known_robots.random_fourier(-limit, limit, np.full(n, 2.0), 0.6, RATE, acceleration=30.0, seed=3)
 
 
 LOOPS = {
@@ -102,7 +102,7 @@ def test_what_has_no_tangents_says_so():
 
 
 def short() -> references.Reference:
-    return random_motions.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 0.2, 5000.0)
+    return known_robots.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 0.2, 5000.0)
 
 
 @pytest.mark.slow  # the kernel takes 14 s to compile
@@ -117,7 +117,7 @@ def test_a_loop_that_saturation_alone_keeps_finite_is_said_to_be_unstable():
     """Its simulation ends; its slopes grow without bounds, and no method may be given them."""
     plant, controller = known_robots.plant("rv2sq"), known_robots.controller("rv2sq")
     rate = 5000.0
-    reference = random_motions.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 1.0, rate, acceleration=20.0, seed=0)
+    reference = known_robots.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 1.0, rate, acceleration=20.0, seed=0)
     wild = replace(controller, kp=60.0 * controller.kp, kd=1e-4 * controller.kd)
     simulate(plant, wild, reference, Sensing(every=10))
     with pytest.raises(NotConverged, match="these gains do not hold"):

@@ -9,8 +9,7 @@ choices):
 * noise of q: the level of each log's spectrum, the filtered log thinned to `rate_factor` times its cut-off;
 * process noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹;
 * parameters have none: they are constants, and a filter that knows its other noise needs none to converge;
-* they start where `calib.rooms.studies.methods.believed` says, as uncertain as `start_sigmas` standard deviations of
-least
+* they start where `simulated_robot.start_of` says, as uncertain as `start_sigmas` standard deviations of least
   squares, or as far from it as they are: that is next to nothing compared with what a pass adds.
 
 Where innovations are larger than the filter says, the covariance is widened by their mean square.
@@ -27,9 +26,8 @@ from calib.identification.loop.loop_recordings import low_passed
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import Case, segments
-from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, start_of
 from calib.rooms.studies.methods.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
-from calib.rooms.studies.methods.tangents import Stepper, stepper
+from calib.rooms.studies.methods.simulated_robot import BelievedRobot, Stepper, believed_robot, start_of, stepper
 from calib.simulation.loop.closed_loop import forward_dynamics
 
 NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider ones are no robots

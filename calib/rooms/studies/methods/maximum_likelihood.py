@@ -30,7 +30,7 @@ from calib.estimation.whiteness import scatter
 from calib.identification.methods.least_squares import samples_of, weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.prior import residual_inflation
-from calib.rooms.studies.methods.believed import with_friction
+from calib.rooms.studies.methods.simulated_robot import with_friction
 
 BLOCK = 1000  # samples at a time
 

@@ -27,8 +27,13 @@ from calib.identification.loop.loop_recordings import ClosedLoops, close_loops, 
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import thinned
-from calib.rooms.studies.methods.believed import BelievedRobot, believed_robot, serial_arm, start_of
-from calib.rooms.studies.methods.tangents import simulate_tangents
+from calib.rooms.studies.methods.simulated_robot import (
+    BelievedRobot,
+    believed_robot,
+    serial_arm,
+    simulate_tangents,
+    start_of,
+)
 from calib.simulation.loop.closed_loop import Sensing, simulate
 
 
