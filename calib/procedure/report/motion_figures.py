@@ -55,8 +55,10 @@ def _motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence
                     bare="" if last else "x",
                 )
             )  # fmt: skip
-            gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / max(upper[j] - lower[j], 1e-300)
-            if len(bounds) == 2 and gap < nearest:
+            if len(bounds) < 2 or upper[j] <= lower[j]:
+                continue
+            gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
+            if gap < nearest:
                 nearest, title = gap, f"{quantity} of {joint.name} comes nearest to its limit (dashed)"
     return Chart(panels, 0.7 + 0.75 * len(joints), len(series), title=title)
 
