@@ -28,15 +28,10 @@ class IdentifiedController:
 
     Attributes:
         controller: PD or PID with the gains found.
-        past, errors: (n, na) a and (n, nb + 1) b of the ARX model.
-        offset: (n,) c.
         explained: (n,) 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%] of the low-passed torque, by the PID's feedback.
     """
 
     controller: Controller
-    past: np.ndarray
-    errors: np.ndarray
-    offset: np.ndarray
     explained: np.ndarray
 
 
@@ -62,11 +57,10 @@ def identify_controller(
     edge = border(rate, band)
     basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
     found = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
-    gains = np.array([_read(past, errors, rate, band, integral) for past, errors, _ in found])
+    gains = np.array([_read(past, errors, rate, band, integral) for past, errors in found])
     controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
-    past, errors, offset = (np.array(part) for part in zip(*found))
     explained = [_explained(error[:, j], tau[:, j], gains[j], rate, band) for j in range(len(gains))]
-    return IdentifiedController(controller, frozen(past), frozen(errors), frozen(offset), frozen(explained))
+    return IdentifiedController(controller, frozen(explained))
 
 
 def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarray:
@@ -97,8 +91,8 @@ def _instruments(reference: Reference, count: int, rate: float, band: float) -> 
 
 def _joint(
     error: np.ndarray, tau: np.ndarray, basis: np.ndarray, orders: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return a, b, c of one joint by two-stage least squares with an orthonormal basis of instruments."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a, b of one joint by two-stage least squares with an orthonormal basis of instruments."""
     if not np.ptp(error) > 0.0:
         raise MeasurementError("the position error is zero throughout: a log of the reference, not of the encoder?")
     na, nb = orders
@@ -109,7 +103,7 @@ def _joint(
     matrix = np.column_stack([own @ (own.T @ np.column_stack(columns)), np.ones(count - first)])
     size = np.linalg.norm(matrix, axis=0)
     values = np.linalg.lstsq(matrix / size, own @ (own.T @ tau[first:]), rcond=None)[0] / size
-    return values[:na], values[na:-1], float(values[-1])
+    return values[:na], values[na:-1]
 
 
 def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integral: bool) -> np.ndarray:
