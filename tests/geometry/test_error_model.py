@@ -10,6 +10,7 @@ from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import select_model
+from calib.geometry.uncertainty import error_model
 from calib.geometry.uncertainty.error_model import END_SHARE, ErrorModel, learn_errors
 from calib.geometry.uncertainty.left_out import LeftOut
 from calib.robot.load import load
@@ -100,7 +101,8 @@ def test_sigma_grows_away_from_what_was_learnt_and_extrapolation_is_named(found)
     model, _ = found
     inside, outside = model.learnt[:50], model.learnt[:50] + 1.5
     assert np.median(model.position_sigma(outside)) > 1.5 * np.median(model.position_sigma(inside))
-    assert not model.beyond(inside).any() and model.beyond(outside).any(axis=1).all()
+    assert not error_model.outside(inside, model.learnt).any()
+    assert error_model.outside(outside, model.learnt).any(axis=1).all()
 
 
 def test_beyond_an_end_that_erred_more_when_left_out_intervals_are_wider():

@@ -147,10 +147,6 @@ class ErrorModel:
                 result = np.maximum(result, 1.0 + (factor - 1.0) * share)
         return result
 
-    def beyond(self, q: np.ndarray) -> np.ndarray:
-        """Return which joints (m, n) stand outside the training range: there a prediction extrapolates."""
-        return outside(q, self.learnt)
-
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
     """Return which joints (m, n) of poses q (m, n) stand outside the range of the fit's (k, n) [rad or m]."""
@@ -219,7 +215,8 @@ def learn_errors(
     min_poses = 20  # poses from which errors on rows left out are worth a model (our choice)
     if sum(len(block) for block in measured) < min_poses or not all(isinstance(block, Positions) for block in measured):
         return None
-    levers = _joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
+    q = np.concatenate([block.q for block in measured])
+    levers = _joint_levers(found.cell.chain, q)
     rows = _Rows(selected, measured, torques)
     near = [*rows.left_out(random_folds(measured, 5, seed), levers)]
     groups = [(-1, selected.folds), *_range_folds(measured)]
@@ -230,7 +227,6 @@ def learn_errors(
     low, high = (float(np.median(left.away[of])) for of in (left.near, ~left.near))
     reach = low, max(high, low * (1.0 + 1e-9) + 1e-12)
     wider = left.surprise(weights, reach)
-    q = np.concatenate([block.q for block in measured])
     wide = radii[0] * wider[0], radii[1] * wider[1]
     outside = left.wider(weights, wide, reach, rows.poses)
     kappa, floor, near_by, beyond = weights

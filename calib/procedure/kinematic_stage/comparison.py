@@ -14,7 +14,7 @@ from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
 from calib.geometry.checks.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
-from calib.geometry.uncertainty.error_model import ErrorModel
+from calib.geometry.uncertainty.error_model import ErrorModel, outside
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
@@ -189,7 +189,7 @@ def compare_unseen(
 
 def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes: np.ndarray) -> Intervals:
     """Return predicted σ (m,) [m] and interval of an error model on rows, with the errors' sizes (m,) [m]."""
-    beyond = np.atleast_2d(expected.beyond(block.q))
+    beyond = np.atleast_2d(outside(block.q, expected.learnt))
     names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
     return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)
 
