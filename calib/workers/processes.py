@@ -13,7 +13,7 @@ from threading import Lock, Thread
 from typing import Any
 
 from calib.errors import CalibError
-from calib.workers import Answer, Died, NotBegun, run_call
+from calib.workers.crew import Answer, Died, NotBegun, run_call
 
 GRACE = 3.0  # [s] that tasks have to hand back what they found after Ctrl-C (our choice)
 ATTEMPTS = 3  # processes that a task may take along before it is given up (our choice)
