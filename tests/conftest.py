@@ -4,8 +4,6 @@ They live outside the repository: ``CALIB_DATA``, default ``../shared/data``. Te
 reason, where the folder is absent.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

@@ -1,7 +1,5 @@
 """Which module may import which, held against every import in the sources, those inside functions included."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Threads of BLAS: one while calib computes, the caller's own number before and after, and wherever one was chosen."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

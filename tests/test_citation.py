@@ -1,7 +1,5 @@
 """CITATION.cff and pyproject.toml say the same of the project."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

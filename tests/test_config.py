@@ -1,7 +1,5 @@
 """Option files of every kind: whatever they hold, they are read or refused in one form, never with a traceback."""
 
-from __future__ import annotations
-
 import copy
 import datetime
 import json

@@ -1,7 +1,5 @@
 """Files of every kind that is read, damaged in every way: they are read, or refused as such, and stay as they were."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable

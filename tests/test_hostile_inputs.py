@@ -1,7 +1,5 @@
 """Hostile inputs, one row each: a command ends with its exit code and one line, quickly, and leaves nothing behind."""
 
-from __future__ import annotations
-
 import shutil
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Every option of every command with odd values: a complaint or a result, never a traceback, nothing overwritten."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

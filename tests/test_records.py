@@ -1,7 +1,5 @@
 """JSON becomes what a dataclass says, or the message names the place."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Result folders: whose files may be replaced, and what a killed run leaves."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

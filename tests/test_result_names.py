@@ -1,7 +1,5 @@
 """A result file's name is written in one module of `calib`: whoever else needs the file asks there."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Code lines (no blanks, comments, docstrings) by package: at most what the changelog's table allows, and near it."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """Internal errors: one message, a code of their own, and a file for whoever mends them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

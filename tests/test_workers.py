@@ -1,7 +1,5 @@
 """Parallel work: results as they come, whoever dies; the same for this process, processes, and a real Dask cluster."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

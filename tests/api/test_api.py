@@ -1,7 +1,5 @@
 """The Python API: few names, each documented; what it returns is what the commands write."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import tomllib

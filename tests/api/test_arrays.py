@@ -1,7 +1,5 @@
 """Arrays in place of files: measurements, recordings, and what a robot says of a pose."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 

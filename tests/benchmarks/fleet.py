@@ -3,8 +3,6 @@
 python tests/benchmarks/fleet.py --out DIR [--robots 20]
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import time

@@ -4,8 +4,6 @@ Needs the folder of recordings (``CALIB_DATA``). Rows go to ``learning_curves.js
 a time; ``--figure FILE`` draws those that are there, ``--no-fits`` without measuring any.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -6,8 +6,6 @@ Both are to be within a tenth of each other, alone and beside a busy process; th
 process that runs the verb, so that what else the machine does matters little.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -4,8 +4,6 @@ python -m pytest tests/benchmarks/test_constraints.py -m slow -s
 Ten seconds at 5 kHz, 60 parameters; processor time. Janot's slides tell of 40 s for PC-IDIM-IV.
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

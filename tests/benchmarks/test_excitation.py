@@ -7,8 +7,6 @@ joints), limits of the URDF on position and velocity, torque from the library's 
 at least 0.3 m from axis 1 and not below -0.2 m.
 """
 
-from __future__ import annotations
-
 import time
 import tomllib
 from collections.abc import Callable

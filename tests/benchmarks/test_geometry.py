@@ -3,8 +3,6 @@
 python -m pytest tests/benchmarks/test_geometry.py -o addopts= --benchmark-group-by=group --benchmark-columns=min,median
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -5,8 +5,6 @@ PYTHONPATH=.:/tmp/pandas python -m pytest tests/benchmarks/test_minute_of_log.py
     --benchmark-timer=time.process_time --benchmark-columns=min,median,rounds
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ python -m pytest tests/benchmarks/test_simulation.py -o addopts= --benchmark-gro
     --benchmark-columns=min,median,rounds
 """
 
-from __future__ import annotations
-
 import sys
 from functools import cache
 

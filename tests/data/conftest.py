@@ -1,7 +1,5 @@
 """A small measurement file and a recording that are right, to be spoilt in one place per test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """CSV tables: separators, units, comments, and complaints that name row and column."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

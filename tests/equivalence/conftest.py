@@ -1,7 +1,5 @@
 """The small arm of all equivalence tests: its measurements, and a finished session of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

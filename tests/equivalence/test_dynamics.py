@@ -1,7 +1,5 @@
 """`calib identify` and a session's steps identify and predict give one answer to the same recordings."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The camera study runs on small rendered images, and says what it claims to say."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

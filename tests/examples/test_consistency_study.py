@@ -1,7 +1,5 @@
 """The consistency study of the LWR4+ runs, and says what it claims to say."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The README's figures of the demonstration, and those in its picture, are the demonstration's."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The dynamic studies of TX40 and LWR4+ run, and say what they claim to say."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The table of errors away from the training motion is what the command makes, and its parts are what they say."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

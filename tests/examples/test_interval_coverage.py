@@ -1,7 +1,5 @@
 """What the table of real recordings says of stated intervals is what the command measures, and most rows hold."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

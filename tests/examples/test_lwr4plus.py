@@ -1,7 +1,5 @@
 """The scripted LWR4+ study runs, and says what it says."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

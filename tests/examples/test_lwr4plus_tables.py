@@ -4,8 +4,6 @@ Searches by processor time, the many seeds of the designs and the 500 calibratio
 that of one seed, which has to lie in the range that README gives for three.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The numbered examples: short, complete, and they do what their first line says."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The DualV study and the power model of the TX40 run, and show what they claim to."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The scripted planning study runs: with a margin a plan on the identified model can be followed, one on CAD cannot."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The figures of examples/real_recordings.md are those of a fresh run."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys

@@ -1,7 +1,5 @@
 """The survey: the rows that are kept are of the conditions of this version, and the tables come of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

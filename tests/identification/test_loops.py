@@ -1,7 +1,5 @@
 """The closed loop in ``calib identify``: instruments that are right where least squares is not, and refusals."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """Recordings that are not what they claim: signs, sizes and clocks, against the robot's own masses and stamps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

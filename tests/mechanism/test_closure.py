@@ -1,7 +1,5 @@
 """Loops that close, and those that do not: branch, reach, singularities, and files that contradict themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

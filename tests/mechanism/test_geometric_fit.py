@@ -1,7 +1,5 @@
 """Geometry of parallel robots from their closure: planted changes come back, and what cannot be told is said."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The dynamics of three parallel robots, planar and spatial, redundant or not, against Pinocchio's constrained ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from closed_tree import ClosedTree

@@ -1,7 +1,5 @@
 """Redundant actuators: overconstraint and share of torques, a simulated robot, identification with a payload."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from computed_torque import ComputedTorque, simulate

@@ -1,7 +1,5 @@
 """Claims on pose search for real arms of 4, 6 and 7 joints, with and without constraints."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

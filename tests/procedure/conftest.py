@@ -1,7 +1,5 @@
 """A small cell with a known truth: a UR5 whose parameters are a little off, seen by a tracker."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The catalogue of findings: wording and rules are tested here, once; elsewhere tests ask for codes and values."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """The formats are documented where they are read, and the command prints that."""
 
-from __future__ import annotations
-
 import tomllib
 
 import pytest

@@ -1,7 +1,5 @@
 """The commands on parallel robots: identify, excite, fit; what they refuse, and what is for serial arms."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drawing can be left out, and broken off: --no-plots, and Ctrl-C while figures are drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import planted_motion as planted

@@ -1,7 +1,5 @@
 """Distances on arms whose answers are known by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from arms import motley

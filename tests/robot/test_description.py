@@ -1,7 +1,5 @@
 """robot.toml: exact round trips, the library against what is known elsewhere, and how robots are found."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

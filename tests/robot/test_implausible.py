@@ -1,7 +1,5 @@
 """Robots that cannot be: refused where a chain is made, whatever file they come from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The element Jacobian against finite differences, for an MDH chain and for a URDF with every kind of joint."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from differences import check

@@ -1,7 +1,5 @@
 """MDH tables: the product, the proposal of beta, the numbers, the complaints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robot_oracle import pinocchio_poses

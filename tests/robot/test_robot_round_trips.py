@@ -1,7 +1,5 @@
 """Any chain, whatever its names, comes back from the files it is written to."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from strategies import chains

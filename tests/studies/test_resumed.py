@@ -1,7 +1,5 @@
 """A study that loses a worker, its process, or its patience: no trial is lost, none counts twice."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

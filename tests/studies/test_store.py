@@ -1,7 +1,5 @@
 """The store of a study: what is kept stays, what was half-written goes, nothing counts twice."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Studies: what a file may say, trials that are pure, summaries that count failures."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Arms for the tests: library ones, and one that has everything at once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

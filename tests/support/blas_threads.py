@@ -1,7 +1,5 @@
 """Print, as JSON, the threads of BLAS in and around calls of calib, in a process that starts with three of them."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from threading import Event, Thread

@@ -1,7 +1,5 @@
 """The same files asked about by command and by guided session, and the answers compared."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """A parallel robot as Pinocchio sees it: legs and a free platform, held together by rigid constraints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 from pinocchio_model import PINOCCHIO_ORDER, to_inertia

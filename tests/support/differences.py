@@ -1,7 +1,5 @@
 """The one finite-difference harness: every derivative in the toolkit is checked with `check`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

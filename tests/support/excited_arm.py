@@ -1,7 +1,5 @@
 """A robot for the tests: the LWR4+ of the library as callables, and a two-joint arm written out by hand."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small planted problems y = W x + ρ, shared by the tests of the linear estimators."""
 
-from __future__ import annotations
-
 import numpy as np
 
 TRUTH = np.array([2.0, -1.0, 0.5, 3.0, -0.3])

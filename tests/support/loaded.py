@@ -1,7 +1,5 @@
 """What a process has loaded at each of some stages: the command line, the API, its options, a fit, an options file."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

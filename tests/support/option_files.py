@@ -1,7 +1,5 @@
 """One option file of every kind, as its page documents it: its tables, and what reads them."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ Pinocchio's joint frame j is the frame right after the chain's j-th moving eleme
 standard parameters compare digit by digit with ``model.inertias[j + 1]``. Pinocchio is imported at the first call.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Robots for the planning tests: the LWR4+ with its drives, and a cart whose fastest motion is known in closed form."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

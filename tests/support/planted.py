@@ -1,7 +1,5 @@
 """Cells with planted truth, measured exactly or with noise in every kind of measurement."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A robot file and recordings for the command."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import planted_motion as planted

@@ -1,7 +1,5 @@
 """An arm of three joints with known dynamics, moved along Fourier series, and its recordings."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

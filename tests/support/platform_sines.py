@@ -1,7 +1,5 @@
 """Motions of a platform for the tests of parallel robots."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

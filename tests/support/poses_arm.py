@@ -1,7 +1,5 @@
 """The LWR4+ with a target off its flange: what measured poses, or positions, tell of it, for pose selection."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from calib.geometry.observability import observation, targets_of

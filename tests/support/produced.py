@@ -1,7 +1,5 @@
 """Which findings the tests' files make the sources say: codes that have a level, noted as they are made."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where the real recordings are: outside the repository, ``CALIB_DATA``, default ``../shared/data``."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pinocchio as the judge of kinematics, and small URDFs to judge by."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

@@ -1,7 +1,5 @@
 """Scripts run in this process, which has loaded long ago what a process of their own would load first."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sessions driven from tests: go on in silence, edit a file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from calib.procedure.session import steps

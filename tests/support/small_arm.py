@@ -1,7 +1,5 @@
 """An arm that turns and slides, in a closed loop, for methods that simulate it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Hypothesis strategies: names as people type them, serial chains of any kind, files as they arrive."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows of a study, made up."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from calib.rooms.studies.trial import TrialRow

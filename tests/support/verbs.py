@@ -1,7 +1,5 @@
 """The verbs of the Python API on real recordings, for processes that time them."""
 
-from __future__ import annotations
-
 import time
 from functools import cache
 from pathlib import Path

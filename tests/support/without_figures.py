@@ -1,7 +1,5 @@
 """Commands run in this process without figures, which cost more than most of what they show."""
 
-from __future__ import annotations
-
 from calib import cli
 
 DRAWING = ("select", "fit", "identify", "excite", "plan", "next", "redo", "demo", "run")

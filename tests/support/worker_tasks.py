@@ -1,7 +1,5 @@
 """Tasks for the tests of `calib.workers`; other processes import them from here."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """The search: feasible means feasible, exact gradients pay, goals are attained, and failure is named."""
 
-from __future__ import annotations
-
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

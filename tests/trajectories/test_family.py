@@ -1,7 +1,5 @@
 """The families: derivatives with respect to time and to the variables, rest at both ends, bounds, refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from differences import check

@@ -1,7 +1,5 @@
 """Every objective, every constraint and their assembly: exact gradients, against differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import excited_arm as arm

@@ -1,7 +1,5 @@
 """Tours are as short as the shortest of all orders; ways go around what is in between."""
 
-from __future__ import annotations
-
 from itertools import pairwise, permutations
 
 import numpy as np

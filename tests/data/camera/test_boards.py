@@ -1,7 +1,5 @@
 """Claims: corner tables and patterns are OpenCV's; prints are at true scale; a board that cannot be is refused."""
 
-from __future__ import annotations
-
 import re
 
 import cv2

@@ -1,7 +1,5 @@
 """Claims, on rendered images: corners are found to a few hundredths of a pixel, and useless images are said to be."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Claims: projections are OpenCV's; their derivatives are exact; rays are their inverse."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

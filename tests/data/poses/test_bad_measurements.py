@@ -1,7 +1,5 @@
 """Bad input: each file ends in one message that says what, where (file, row, column) and what to try."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from measured_rows import JOINTS, POSE

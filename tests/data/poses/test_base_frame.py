@@ -1,7 +1,5 @@
 """A base frame measured beside the target takes the instrument out of the measurement, and its noise comes in."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """The options file: every key is read, every unknown one refused by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

@@ -1,7 +1,5 @@
 """Claims: a folder of images is read like a measurement file; what is of no use in it is said, image by image."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import cv2

@@ -1,7 +1,5 @@
 """The measurement CSV: what is read, and how."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from measured_rows import JOINTS, POSE

@@ -1,7 +1,5 @@
 """Pose lists: written and read back; held against what was measured."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

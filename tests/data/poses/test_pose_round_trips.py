@@ -1,7 +1,5 @@
 """Joint and file names of any kind survive the tables they are written to."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

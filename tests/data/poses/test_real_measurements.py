@@ -1,7 +1,5 @@
 """Recordings that nobody here made, within the limits of their URDF."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files that RoboDK writes, and three reflectors without a header."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

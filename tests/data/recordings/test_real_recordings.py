@@ -1,7 +1,5 @@
 """Recordings that nobody here made: what they hold, and what is found in them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

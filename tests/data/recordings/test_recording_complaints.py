@@ -1,7 +1,5 @@
 """What is said of signs and of files that cannot be read: no alarm where gravity pays, and the right advice."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Recordings read from archives, tables and bags, cut, and refused with the row and the reason."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

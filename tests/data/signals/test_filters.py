@@ -1,7 +1,5 @@
 """Filters do not shift, derivatives are derivatives, and decimation commutes with the model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From a log with a bad clock, gaps and noise to the motion that was."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

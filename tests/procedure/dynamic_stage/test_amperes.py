@@ -1,7 +1,5 @@
 """Currents without gains: a model in amperes says so and goes nowhere; identified gains are kept."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the command says: whole file names where nobody looks, brackets as they are, the way on after Ctrl-C."""
 
-from __future__ import annotations
-
 import signal
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a verdict says of single joints, of motion beyond the limits, of parameters that motion does not tell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

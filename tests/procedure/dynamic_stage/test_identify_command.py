@@ -1,7 +1,5 @@
 """``calib identify``: the contract of its metrics, and what happens to input that cannot be."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

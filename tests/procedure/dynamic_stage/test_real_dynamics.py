@@ -1,7 +1,5 @@
 """Real recordings (see tests/recordings.py): the goals of the identification, on motion not used for the fit."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Motions for a robot whose fit found joint corrections are designed on its best rigid geometry, however it comes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

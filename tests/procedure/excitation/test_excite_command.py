@@ -1,7 +1,5 @@
 """What `calib excite` promises: a verified motion in files other programs read, and a clear refusal of bad input."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

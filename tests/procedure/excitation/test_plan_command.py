@@ -1,7 +1,5 @@
 """`calib plan`: files, figures and exit codes; bad input gets one clear message."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

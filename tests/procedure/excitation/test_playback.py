@@ -1,7 +1,5 @@
 """To the robot and back: approaches keep their limits, messages read back, a motion is found again and averaged."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a motion is said to tell, before it is played: held against what an identification states afterwards."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

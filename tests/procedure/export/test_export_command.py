@@ -1,7 +1,5 @@
 """What `calib export` promises: the source's file with other joint origins, and nothing else changed."""
 
-from __future__ import annotations
-
 import csv
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An identified robot in the forms others read: each read back by Pinocchio, nothing else of the source changed."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

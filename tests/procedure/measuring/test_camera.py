@@ -1,7 +1,5 @@
 """Claims: poses chosen for a camera see the board; boards are made; a session with images goes to its certificate."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial

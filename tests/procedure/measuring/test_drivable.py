@@ -1,7 +1,5 @@
 """A pose that no clear way leads to is driven on another turn of its joints, or a candidate takes its place."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses that one can drive and see: lines of sight change the choice, ways keep clear, predictions hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """One table, two renderers: what the console prints is what the page says; the first sheet holds the verdict."""
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, datetime
 from html.parser import HTMLParser

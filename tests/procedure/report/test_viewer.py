@@ -1,7 +1,5 @@
 """What `calib view` records is all that the folder holds: read back from the file, entity by entity."""
 
-from __future__ import annotations
-
 import csv
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """What arrives says of itself whether joints were read back, and whether anything moved while it was measured."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The certificate is one file, says what it has to, and the figures are what the numbers are."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

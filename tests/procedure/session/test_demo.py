@@ -1,7 +1,5 @@
 """The demonstration ends in a certificate, a robot other programs read, and errors near the instrument's."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A session with dynamics walks to its end, says what a wrong recording is, and survives what people do."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

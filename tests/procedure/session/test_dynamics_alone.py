@@ -1,7 +1,5 @@
 """A session for dynamics alone: the description is taken as calibrated, and a share of the recording judges."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

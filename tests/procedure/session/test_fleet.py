@@ -1,7 +1,5 @@
 """A fleet of sessions: each goes as far as it can, one that fails stops none, and the table says how they stand."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 from collections.abc import Callable, Generator, Iterable

@@ -1,7 +1,5 @@
 """Folders that an older version wrote (``older/``, of commit a217159) open, go on, and give what they gave then."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

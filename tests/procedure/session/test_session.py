@@ -1,7 +1,5 @@
 """A session survives being killed, moved, edited and run twice, and says what is stale."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """session.toml: what `calib new` writes is read back, old files open, and a wrong value is named."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import tomllib

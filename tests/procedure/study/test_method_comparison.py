@@ -1,7 +1,5 @@
 """Methods compared on recordings: ranked by motion they have not seen, with reasons where one is missing."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

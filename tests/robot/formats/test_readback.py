@@ -1,7 +1,5 @@
 """Exported URDFs as a second independent reader sees them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

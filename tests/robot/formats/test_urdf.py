@@ -1,7 +1,5 @@
 """URDF reading: trees of every kind against Pinocchio, the choice of base and tip, and the complaints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from recordings import DATA

@@ -1,7 +1,5 @@
 """URDF out: the edit in place changes origins and nothing else, and Pinocchio reads the calibrated robot from it."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

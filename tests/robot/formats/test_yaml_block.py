@@ -1,7 +1,5 @@
 """What our YAML writer writes is what PyYAML, a reader of YAML 1.1, reads."""
 
-from __future__ import annotations
-
 import pytest
 
 from calib.robot.formats.origin_files import block

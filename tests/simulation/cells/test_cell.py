@@ -1,7 +1,5 @@
 """The simulated cell: its truth can be found again, its noise is what it says, its hidden part has the paper's size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the virtual cells hide is outside every model, and behaves as gears, backlash, heat and friction do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Paths: C², through their waypoints, derivatives right, extremes found, bad waypoints named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from planned import CHAIN, WAYPOINTS

@@ -1,7 +1,5 @@
 """Tool lines are straight to a micrometre with the posture kept; the outer loop shortens and keeps the waypoints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from planned import CHAIN, WAYPOINTS, limits, lwr

@@ -1,7 +1,5 @@
 """Timing: known optima are met, limits are kept by full inverse dynamics, and some limit is active almost always."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio
 import pytest
