@@ -119,7 +119,7 @@ def ends(robot: Path, file: Path) -> Iterator[GeometryFit]:
 
 def torque_row(name: str, split: str, model: DynamicsModel) -> str:
     """Return a row of the torques' table: intervals on motion that the identification has not seen."""
-    cases = model.assessment.intervals
+    cases = model.intervals
     series = ("index", "sigma", "inside", "known")
     joined = {key: np.concatenate([getattr(one, key) for one in cases.values()]) for key in series}
     found = TorqueIntervals(**joined, extrapolated=np.concatenate([x.extrapolated for x in cases.values()], axis=1))
