@@ -1,4 +1,4 @@
-"""Joint kinematic-then-dynamic calibration of robots: geometry first, dynamics on it, uncertainty carried all the way.
+"""Joint kinematic-then-dynamic calibration of robots: geometry first, then dynamics, with propagated uncertainty.
 
     import calib
 

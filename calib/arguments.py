@@ -1,4 +1,4 @@
-"""Arguments of the Python API held against their annotations: what has another type is refused by its name.
+"""Checks of Python API arguments against their annotations: an argument of a wrong type is refused by name.
 
 Loads nothing heavy: the command line builds default settings before it knows what it is asked for.
 """
@@ -16,11 +16,11 @@ _PLAIN = {int: (Integral,), float: (Real,)}
 _WORDS = {
     bool: "True or False", int: "a whole number", float: "a number", str: "a text", NoneType: "None", Path: "a path",
 }  # fmt: skip
-_TABLE = "found a DataFrame: write it, frame.to_csv('table.csv', index=False), and give the file"
+_TABLE = "found a DataFrame: write it by frame.to_csv('table.csv', index=False) and give that file"
 
 
 def checked(given: C) -> C:
-    """Return a function, or a dataclass of settings, that refuses other arguments than its annotations allow.
+    """Return a function, or a settings dataclass, that refuses arguments which do not match its annotations.
 
     A function runs with one thread of BLAS, `calib.workers.threads`. Settings are read as an option file's table is,
     see `calib.config.parse`; without arguments nothing is loaded for that.
@@ -94,7 +94,7 @@ def _refuse_other_types(name: str, wanted: Signature, hints: dict[str, Any], arg
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Say whether a value is of an annotated type; what the annotation leaves open fits."""
+    """Return whether a value matches an annotated type; an annotation that states no type matches every value."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
@@ -118,7 +118,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _words(hint: Any) -> str:
-    """Return an annotated type in words."""
+    """Return the description of an annotated type, for messages."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         *first, last = dict.fromkeys(map(_words, inner))

@@ -16,7 +16,7 @@ def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
 
 
 class Frozen:
-    """Base of dataclasses whose fields annotated ``np.ndarray`` become read-only copies: of floats, or of flags."""
+    """Base of dataclasses whose fields annotated ``np.ndarray`` become read-only copies (floats or booleans)."""
 
     def __post_init__(self) -> None:
         for one in fields(self):  # type: ignore[arg-type]

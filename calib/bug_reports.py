@@ -1,4 +1,4 @@
-"""What is left of an internal error: one message, and a file that can be sent to whoever mends it.
+"""Reports of internal errors: one message, and a file to send to the developers.
 
 The file holds the command, versions, and where the program stood; of a person's data only what the error's own message
 quotes.
@@ -22,7 +22,7 @@ PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typ
 
 
 def report(error: BaseException, command: Sequence[str], folder: Path | None = None) -> str:
-    """Write what is needed to mend an unforeseen error, and return what to say of it, in one line.
+    """Write a bug report for an unexpected error, and return a one-line message about it.
 
     Args:
         error: with its traceback.
@@ -37,12 +37,12 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
             path = files.write(place / name, content)
         except CalibError:
             continue
-        return f"{said}; a bug report was written: {path}{_where_to()}. Was every input what it should be?"
-    return f"{said}; --debug shows where. Was every input what it should be?"
+        return f"{said}; a bug report was written: {path}{_where_to()}. Please check the input, too."
+    return f"{said}; --debug shows where. Please check the input, too."
 
 
 def _where_to() -> str:
-    """Say where a report is to be sent, as the package's metadata name it; nothing where they do not."""
+    """Return where to send a report, from the package's metadata; "" if they state no address."""
     try:
         known = metadata.metadata(PACKAGES[0]).get_all("Project-URL") or []
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Which small change of columns explains data far better? One search, over a table of changes for each kind of data.
+"""Search for a small change of columns (sign, order, coupling) that explains the data far better.
 
 Columns of poses or recordings may not be what they are said to be: a sign, an exchange, a zero, a unit, the hand of the
 axes, a joint that counts from the horizontal instead of from the link before it. Each `Change` of a table is made,
@@ -18,14 +18,14 @@ MAX_APART = 1.2  # what another change leaves, over what the best one leaves, up
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """One way in which columns may not be what they are said to be.
+    """One possible error in the meaning of columns.
 
     Attributes:
-        code: of the finding that says it.
-        make: data as recorded → what they are with the change.
-        joints: that it concerns, from 0.
-        values: what else the finding says.
-        max_left: the change counts where it leaves less than this share (rms) of what is left without it.
+        code: of the finding on this change.
+        make: data as recorded → changed data.
+        joints: indices of the joints concerned, from 0.
+        values: further values of the finding.
+        max_left: the change is significant if it reduces the rms residual below this share.
     """
 
     code: str
@@ -37,12 +37,12 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Changes that explain data better than these explain themselves.
+    """Changes of columns under which the model explains the data better than unchanged.
 
     Attributes:
         changes: one or more.
-        before, after: (k,) mean squares that are left without the changes and with them.
-        rival: another change that leaves nearly as little as a single one does; None without.
+        before, after: (k,) mean squared residuals without and with the changes.
+        rival: another change that explains the data nearly as well as a single one; None if absent.
     """
 
     changes: tuple[Change, ...]
@@ -52,22 +52,22 @@ class Explanation:
 
     @property
     def code(self) -> str:
-        """Of the finding that says it: the first change's."""
+        """Code of the finding, from the first change."""
         return self.changes[0].code
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Joints of all changes of the first one's kind; a single change keeps their order."""
+        """Joints of all changes of the same kind as the first; a single change keeps their order."""
         of_kind = [one.joints for one in self.changes if one.code == self.code]
         return of_kind[0] if len(of_kind) == 1 else tuple(sorted({joint for joints in of_kind for joint in joints}))
 
     @property
     def factor(self) -> float:
-        """What is left with the changes over what is left without, rms."""
+        """Ratio of the rms residual with the changes to that without."""
         return _share(self.after, self.before)
 
     def finding(self, names: Sequence[str], **values: Any) -> Finding:
-        """Return the finding that says it, with the names of the joints and other values."""
+        """Return the finding on these changes, with joint names and other values."""
         joints = [names[j] for j in self.joints]
         rival = self.rival and " at ".join([self.rival.code, *(names[j] for j in self.rival.joints[:1])])
         places = {"joint": joints[0], "other": joints[-1]} if joints else {}
@@ -81,7 +81,7 @@ def best_changes(
     at_least: Callable[[Any], np.ndarray] | None = None,
     max_changes: int = 1,
 ) -> Explanation | None:
-    """Make the change that explains most, then the next one beside it, as long as one counts; None where none does.
+    """Return the changes that explain the data best, added one by one while each is significant; None if none is.
 
     Args:
         data: as recorded.
@@ -123,19 +123,19 @@ def exchange(n: int, one: int, other: int) -> np.ndarray:
 
 
 def coupling(n: int, joint: int, other: int, way: float) -> np.ndarray:
-    """Return the matrix (n, n) that adds one of n columns, times `way`, to another: a joint that counts from it."""
+    """Return the matrix (n, n) that adds one of n columns, times `way`, to another (coupled joints)."""
     matrix = np.eye(n)
     matrix[joint, other] = way
     return matrix
 
 
 def couplings(n: int) -> list[tuple[int, int, float]]:
-    """Return the joints that may count from the one before them: joint, the other one, +1 or -1."""
+    """Return the joints whose values may be relative to the previous joint: joint, previous joint, +1 or -1."""
     return [(joint, joint - 1, way) for joint in range(1, n) for way in (1.0, -1.0)]
 
 
 def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which column (n,) holds each joint, and with which sign (n,).
+    """Return each joint's column (n,) and sign (n,).
 
     Args:
         cost: (2, n, n) of column k for joint j, as it is and reversed.
@@ -148,6 +148,6 @@ def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _share(after: np.ndarray, before: np.ndarray) -> float:
-    """Return the rms share that is left, the geometric mean of several."""
+    """Return the remaining rms as a share; of several shares the geometric mean."""
     with np.errstate(all="ignore"):
         return float(np.exp(0.5 * np.mean(np.log(np.asarray(after) / before))))

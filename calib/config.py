@@ -1,4 +1,4 @@
-"""Option files: TOML read within limits, held against frozen dataclasses, complained about in one form.
+"""Option files: TOML read within size limits, checked against frozen dataclasses, with error messages of one form.
 
 A table of a file is a dataclass under `strict`; its fields are the keys, and their annotated types
 (`calib.config_types`) say what a key may hold, in which unit, and which words a complaint uses. pydantic does the
@@ -53,13 +53,13 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
         raise error(f"{path}: is nested too deeply: more than {MAX_LEVELS} levels") from None
     except ValueError as wrong:  # of tomllib, of the decoder, of a number with thousands of digits, of a name with NUL
         words = "a whole number of thousands of digits" if "digits" in str(wrong) else wrong
-        raise error(f"{path}: is no TOML: {words}") from wrong
+        raise error(f"{path}: is not a TOML file: {words}") from wrong
     _check_size(found, str(path), error)
     return found
 
 
 def _check_size(found: Any, place: str, error: type[CalibError]) -> None:
-    """Refuse what nests too deeply, and whole numbers that TOML does not have; without recursion."""
+    """Refuse tables nested too deeply and integers outside TOML's range; without recursion."""
     ahead: list[tuple[tuple[Any, ...], Any]] = [((), found)]
     while ahead:
         loc, value = ahead.pop()
@@ -92,7 +92,7 @@ def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = Usage
 
 
 def read(kind: type[T], given: Tables | None, name: str, others: Collection[str] = ()) -> tuple[T, str]:
-    """Return what a TOML file, or its tables in memory, state, and what messages call it.
+    """Return the parsed content of a TOML file or of its tables in memory, and its name for messages.
 
     Args:
         name: in place of a file's; others: tables that another reader takes.
@@ -105,7 +105,7 @@ def read(kind: type[T], given: Tables | None, name: str, others: Collection[str]
 
 
 def plain_values(value: Any) -> Any:
-    """Return a value whose numbers and arrays of numpy, and tuples, are numbers and lists as a file holds them."""
+    """Return a value with numpy numbers, arrays and tuples converted to plain numbers and lists."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, Mapping):
@@ -114,7 +114,7 @@ def plain_values(value: Any) -> Any:
 
 
 def strict(kind: type[T]) -> type[T]:
-    """Let a dataclass stand for a table of a file: keys that are none of its fields are refused."""
+    """Make a dataclass the schema of a file's table: keys that are not its fields are refused."""
     kind.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]
     return kind
 
@@ -135,7 +135,7 @@ def schema(kind: type, title: str) -> dict[str, Any]:
 
 
 def _for_toml(found: Any) -> Any:
-    """Return a schema without nulls, which TOML does not have, hidden fields, and titles that repeat the key."""
+    """Return a schema without nulls (TOML has none), hidden fields and redundant titles."""
     if isinstance(found, list):
         return [_for_toml(item) for item in found]
     if not isinstance(found, dict):
@@ -158,7 +158,7 @@ def _for_toml(found: Any) -> Any:
 
 
 def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
-    """Return a file's table whose ``[files.NAME]`` tables hold what is said for every file, where they say nothing.
+    """Return a file's table whose ``[files.NAME]`` tables inherit missing keys from the table for all files.
 
     Args:
         table: the file.
@@ -179,7 +179,7 @@ def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
 
 
 def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
-    """Return what `files` holds under the name of the file at `path`, or the end of its path; None for nothing."""
+    """Return the table in `files` under the name of the file at `path`, or the end of its path; None if absent."""
     parts = Path(path).parts
     for name, own in files.items():
         wanted = Path(name).parts
@@ -189,7 +189,7 @@ def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
 
 
 def described(given: Any) -> dict[str, str]:
-    """Return what the docstrings of a function, or a class and its bases, say of each argument or attribute."""
+    """Return the description of each argument or attribute from the docstrings of a function or class."""
     found: dict[str, str] = {}
     for one in reversed(getattr(given, "__mro__", (given,))):
         found |= _entries(one.__doc__ or "")
@@ -197,7 +197,7 @@ def described(given: Any) -> dict[str, str]:
 
 
 def _entries(docstring: str) -> dict[str, str]:
-    """Return the names under ``Args:`` or ``Attributes:`` with their words, without marks for code."""
+    """Return names and descriptions under ``Args:`` or ``Attributes:``, without code marks."""
     parts = re.split("^(?:Args|Attributes):$", cleandoc(docstring), maxsplit=1, flags=re.M)
     return {
         name: " ".join(words.replace("``", "").split()).removesuffix(".")
@@ -212,14 +212,14 @@ def _entries(docstring: str) -> dict[str, str]:
 def check_keys(
     found: Mapping[str, Any], keys: Collection[str], place: str, error: type[CalibError] = UsageError
 ) -> None:
-    """Refuse a key that is none of `keys`, with the most similar one that is."""
+    """Refuse a key that is not among `keys`; the message suggests the most similar one."""
     for key in found:
         if key not in keys:
             raise error(f"{place}: {_no_key(key, keys)}")
 
 
 def located(loc: Sequence[Any]) -> str:
-    """Return a place in a file as TOML names it: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``."""
+    """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``."""
     result = ""
     for k, part in enumerate(loc):
         if isinstance(part, int):
@@ -236,7 +236,7 @@ def _no_key(key: str, keys: Collection[str]) -> str:
 
 
 def _complaint(errors: list[Any], kind: type, place: str) -> str:
-    """Return the first of pydantic's errors in our form; a key that is not known explains one that is missing."""
+    """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
     first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
     loc, name, found = tuple(first["loc"]), first["type"], first["input"]
     table = _type_at(kind, loc[:-1]) if name in (UNKNOWN, "missing") else None
@@ -261,7 +261,7 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
 
 
 def _keys(kind: Any) -> list[str]:
-    """Return the keys of the table that a dataclass stands for."""
+    """Return the keys of the table that a dataclass describes."""
     hints = get_type_hints(kind, include_extras=True)
     return [key for key, hint in hints.items() if Hidden() not in getattr(hint, "__metadata__", ())]
 
@@ -274,7 +274,7 @@ def _needed(kind: Any) -> str:
 
 
 def _type_at(kind: Any, loc: Sequence[Any]) -> Any:
-    """Return the dataclass that stands for the table at a place."""
+    """Return the dataclass that describes the table at a location."""
     for part in loc:
         kind = get_type_hints(kind)[part] if is_dataclass(kind) else get_args(kind)[-1 if isinstance(part, str) else 0]
         while get_origin(kind) is not None and type(None) in get_args(kind):

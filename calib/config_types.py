@@ -1,4 +1,4 @@
-"""What a key of an option file may hold: types with bounds, units and words, for the annotations of its dataclass.
+"""Types of keys in option files: annotations of dataclass fields with bounds, units and messages.
 
 pydantic checks by them and `calib.config` makes its complaints readable; it is imported where a file is read and not
 before.
@@ -23,7 +23,7 @@ _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
 
 
 class _Short(reprlib.Repr):
-    """Shows a value in at most about a line; dates as TOML writes them."""
+    """Representation of a value in about one line; dates in TOML format."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ _SHORT = _Short()
 
 
 def shown(value: Any) -> str:
-    """Return a value as a complaint shows it, at most a line long."""
+    """Return a value as text for messages, at most one line long."""
     try:
         return _SHORT.repr(value)
     except ValueError:
@@ -48,7 +48,7 @@ def shown(value: Any) -> str:
 
 
 def number(value: Any, place: str, quantity: str = "", error: type[CalibError] = UsageError) -> float:
-    """Return a number in SI, from a number of TOML or a text: an expression with pi, and a unit behind it.
+    """Return a number in SI, from a number of TOML or a text: an expression with pi, followed by a unit.
 
     Args:
         value: ``0.4``, ``"-pi/2"``, ``"90 deg"``; infinite ones count.
@@ -126,14 +126,14 @@ def _float(value: Any) -> float:
 
 
 class _Refused(ValueError):
-    """What was expected of a value, and what was found."""
+    """Error that states the expected and the given value."""
 
     def __init__(self, expected: str, value: Any, hint: str = "") -> None:
         super().__init__(f"expected {expected}, found {shown(value)}{hint and f'; {hint}'}")
 
 
 class _Read(ABC):
-    """What a key may hold: pydantic hands it to `read`, which returns the value, or raises the complaint."""
+    """Type of a key: pydantic passes the value to `read`, which returns it converted or raises an error."""
 
     @abstractmethod
     def read(self, value: Any) -> Any: ...
@@ -153,7 +153,7 @@ class _Read(ABC):
 
 @dataclass(frozen=True)
 class Real(_Read):
-    """A finite number, made a float.
+    """A finite number, converted to float.
 
     Attributes:
         above, least, most: what it has to be above, and its least and largest values; beyond `most`, another unit is
@@ -183,7 +183,7 @@ class Real(_Read):
         return found
 
     def _expected(self, found: float) -> str:
-        """Return what was expected where a number is beyond the bounds; empty where it keeps them."""
+        """Return a description of the expected number if it is out of bounds; empty otherwise."""
         finite = math.isfinite(found) or (self.infinite and not math.isnan(found))
         if not finite or (self.above is not None and found <= self.above):
             return "a number" if self.above is None else f"a number above {self.above:g}"
@@ -208,7 +208,7 @@ class Real(_Read):
 
 @dataclass(frozen=True)
 class Whole(_Read):
-    """A whole number from `least` to `most`, made one that counts from `start`; `of` says what it counts."""
+    """A whole number from `least` to `most`, converted to count from `start`; `of` names what it counts."""
 
     least: int = 0
     most: int = 2**63 - 1
@@ -228,7 +228,7 @@ class Whole(_Read):
 
 @dataclass(frozen=True)
 class OneOf(_Read):
-    """A text that is one of a few; `hint` follows the complaint.
+    """A text that is one of a few; `hint` is added to the error message.
 
     Attributes:
         allowed: the texts; or ``module:Name`` of the `Literal` that holds them, of a module that is loaded late.
@@ -247,7 +247,7 @@ class OneOf(_Read):
 
     @property
     def words(self) -> str:
-        """The texts as a sentence lists them; nothing of a module that is loaded late."""
+        """The texts as a list for messages; empty if they belong to a module loaded later."""
         return "" if isinstance(self.allowed, str) else " or ".join((", ".join(self.allowed[:-1]), self.allowed[-1]))
 
     def read(self, value: Any) -> str:
@@ -263,7 +263,7 @@ class OneOf(_Read):
 
 @dataclass(frozen=True)
 class Expect:
-    """What is expected, for complaints; numbers, texts and flags in it are not converted into each other."""
+    """Description of the expected value, for error messages; numbers, texts and flags are not converted."""
 
     words: str
 
@@ -293,7 +293,7 @@ def _unconverted(one: Any) -> Any:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a function makes of a value before what stands to its left looks at it.
+    """A function applied to a value before the annotations to its left check it.
 
     Attributes:
         read: raises `ValueError` with the complaint's words.
@@ -307,7 +307,7 @@ class Checked:
         return self.around(handler(source))
 
     def around(self, inner: Any) -> Any:
-        """Return pydantic's schema `inner` behind the function."""
+        """Return pydantic's schema `inner`, applied after the function."""
         from pydantic_core import core_schema as core
 
         return core.no_info_before_validator_function(self.read, inner)
@@ -318,7 +318,7 @@ class Checked:
 
 @dataclass(frozen=True)
 class Spread:
-    """One value for all, or a list: made a tuple, of `count` where that is stated."""
+    """One value for all, or a list, stored as a tuple; of length `count` if given."""
 
     count: int | None = None
     words: str = "a number, or a list with one per joint"
@@ -349,7 +349,7 @@ class Filled:
 
 @dataclass(frozen=True)
 class Hidden:
-    """A field that no file states: as a key it is unknown."""
+    """A field that files cannot set: its name is an unknown key."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import PydanticCustomError
@@ -366,7 +366,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Typed:
-    """How a setting is typed on the command line: the option's name, and the unit of its number, which is SI here."""
+    """Command-line form of a setting: the option's name, and the unit of its number (SI in Python)."""
 
     name: str = ""
     unit: str = ""
@@ -374,7 +374,7 @@ class Typed:
 
 @dataclass(frozen=True)
 class OneOrMany(_Read):
-    """A number, or a list of them, which means something else: made a float or a tuple."""
+    """A number, converted to float, or a list of numbers, converted to a tuple; the two differ in meaning."""
 
     of: Real
 
@@ -421,4 +421,4 @@ JointNumber = Annotated[int, Whole(1, 99, start=1)]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
 Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]
-"""A number or a text with a unit that the caller reads by `number`: of what quantity it is, another key says."""
+"""A number or a text with a unit, read by `number`; another key states its quantity."""

@@ -1,4 +1,4 @@
-"""The exceptions of the toolkit, and findings: one root, and leaves that hold the data a caller needs.
+"""The exceptions of the toolkit, and findings: one base class, and subclasses with the data a caller needs.
 
 Every message says what was found, where, and what to try. ``poses`` and ``trajectories`` import nothing from here and
 raise their own subclasses of `ValueError`.
@@ -26,7 +26,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # o
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was noticed of data or of a result; its sentence stands in the catalogue.
+    """An observation about data or a result; its text is in the catalogue.
 
     Attributes:
         code: in `calib.procedure.findings`.
@@ -51,23 +51,23 @@ def _plain(value: Any) -> Any:
 
 
 class CalibError(Exception):
-    """Root of all errors this toolkit raises on purpose."""
+    """Base class of all errors that this toolkit raises on purpose."""
 
 
 class CalibWarning(UserWarning):
-    """What whoever uses a result must know of it."""
+    """A warning that users of a result must read."""
 
 
 class UsageError(CalibError):
-    """A command, an option or an options file that is wrong or contradicts another."""
+    """A wrong or contradictory command, option or options file."""
 
 
 class RobotError(CalibError):
-    """A robot description that cannot be read or does not hold together."""
+    """A robot description that is unreadable or inconsistent."""
 
 
 class NoPosture(CalibError):
-    """Samples at which the loops do not close, or a posture is singular; ``samples`` are their numbers from 0."""
+    """Samples at which the loops do not close or the posture is singular; ``samples``: their indices from 0."""
 
     def __init__(self, message: str, samples: Sequence[int] = ()):
         self.samples = tuple(samples)
@@ -75,7 +75,7 @@ class NoPosture(CalibError):
 
 
 class MeasurementError(CalibError):
-    """Measured data that cannot be what they claim to be.
+    """Measured data that contradict their description (columns, units, robot).
 
     Attributes:
         file, row, column: where it was found; ``row`` counts data rows from 1 (the header is not a row), None where
@@ -118,15 +118,15 @@ class NotConverged(CalibError):
 
 
 class CannotSimulate(NotConverged):
-    """Parameters of a robot that no simulation can follow, nor any near them."""
+    """Robot parameters that cannot be simulated, nor any parameters near them."""
 
 
 class Diverged(NotConverged):
-    """An iteration whose estimates went from bad to worse."""
+    """An iteration whose estimates diverged."""
 
 
 class TaskLost(CalibError):
-    """A task of many whose worker process died, also when it was tried again; the others' results are good.
+    """A task whose worker process died at every attempt; the results of the other tasks are valid.
 
     Attributes:
         number: of the task, from 0.
@@ -143,13 +143,13 @@ class SessionError(CalibError):
 
 
 def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: Any) -> None:
-    """Raise `kind(message, *details)` unless `holds`; for messages that can be formed whether it holds or not."""
+    """Raise `kind(message, *details)` unless `holds`; for messages that can be formatted in both cases."""
     if not holds:
         raise kind(message, *details)
 
 
 def refuse_robot(place: object, words: str) -> NoReturn:
-    """Refuse a robot's description for what stands at a place of it: a file, a line, a joint, a row."""
+    """Refuse a robot's description for an error at a location: a file, a line, a joint, a row."""
     raise RobotError(f"{place}: {words}")
 
 
@@ -159,7 +159,7 @@ def refuse_data(file: str | Path, words: str, column: str | None = None, row: in
 
 
 def refuse_option(place: object, words: str) -> NoReturn:
-    """Refuse an option, a command or an options file for what stands at a place of it."""
+    """Refuse an option, a command or an options file for an error at a location."""
     raise UsageError(f"{place}: {words}")
 
 
@@ -174,7 +174,7 @@ def one_of(word: Any, words: Collection[str], what: str, kind: type[Exception] =
 def refused_as(
     kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], words: str, *details: Any
 ) -> Iterator[None]:
-    """Raise what others raise inside, of `kinds`, as `kind(words, *details)`; ``{}`` in `words` is what they say.
+    """Convert exceptions of `kinds` in the block to `kind(words, *details)`; ``{}`` in `words`: the original message.
 
     An error of the operating system says its reason without the file's name, which `details` or `words` have.
     """
@@ -188,18 +188,18 @@ def refused_as(
 
 
 def command_line(*words: object, program: str = "calib") -> str:
-    """Return a command as a shell takes it: ``calib next 'cell 7'``."""
+    """Return a command quoted for a shell: ``calib next 'cell 7'``."""
     return shlex.join([program, *map(str, words)])
 
 
 def brief(error: BaseException, most: int = 200) -> str:
-    """Return what an error says in one line of at most `most` letters."""
+    """Return an error's message in one line of at most `most` characters."""
     words = " ".join(str(error).split())
     return words if len(words) <= most else f"{words[:most]}…"
 
 
 def suggestion(word: str, words: Collection[str]) -> str:
-    """Return `` (did you mean '...'?)`` for the most similar of `words`, or nothing."""
+    """Return `` (did you mean '...'?)`` with the most similar of `words`, or ""."""
     lower = {str(other).lower(): other for other in words}
     close = difflib.get_close_matches(word.lower(), lower, 1, 0.6)
     return f" (did you mean '{lower[close[0]]}'?)" if close else ""
@@ -207,7 +207,7 @@ def suggestion(word: str, words: Collection[str]) -> str:
 
 @contextmanager
 def as_ours() -> Iterator[None]:
-    """Raise what ``poses`` and ``trajectories`` refuse as errors of this toolkit, the original as their cause."""
+    """Convert errors of ``poses`` and ``trajectories`` to errors of this toolkit, the original as cause."""
     try:
         yield
     except ValueError as error:
@@ -218,7 +218,7 @@ def as_ours() -> Iterator[None]:
 
 
 def complaint(error: Exception) -> tuple[str, int] | None:
-    """Return what to say of an error that is no bug of ours, and its exit code; None for others.
+    """Return message and exit code of an error that is not a bug of the toolkit; None for others.
 
     Beside our own: what the operating system refuses with a file's name, or for want of room, and want of memory.
     """
@@ -228,13 +228,13 @@ def complaint(error: Exception) -> tuple[str, int] | None:
         place = "" if error.filename is None else f"{error.filename}: "
         return f"{place}{error.strerror or error}", 2
     if isinstance(error, MemoryError):
-        return f"the memory does not suffice ({error}): is a number or a file larger than meant?", 2
+        return f"not enough memory ({error}): is a number or a file larger than intended?", 2
     return None
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what numpy, scipy, matplotlib and others say to programmers from the console; a `CalibWarning` passes.
+    """Hide warnings of numpy, scipy, matplotlib and others from the console; show `CalibWarning`.
 
     With CALIB_DEBUG everything passes.
     """

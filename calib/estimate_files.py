@@ -38,7 +38,7 @@ class StoredEstimate:
 
 
 def write_estimate(folder: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write rows under `header`, which holds ``name``, ``unit``, ``value`` and ``sigma``."""
+    """Write the rows of an estimate; `header` includes ``name``, ``unit``, ``value`` and ``sigma``."""
     files.write_table(folder / ESTIMATE, header, rows)
 
 
@@ -67,7 +67,7 @@ def write_covariance(path: Path, names: Sequence[str], covariance: np.ndarray) -
 
 
 def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return p names and their covariance (p, p).
+    """Return p parameter names and their covariance (p, p).
 
     Args:
         path: of the table, or of the folder that holds ``covariance.csv``.

@@ -1,4 +1,4 @@
-"""What the rooms of `calib.rooms` add to the core, which imports none of them: found by folder, loaded at first use.
+"""Extensions of the core by the packages in `calib.rooms`: listed by folder, loaded at first use.
 
 A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and where, as ``module:name`` below the room
 (``:name`` for the package itself, ``module:`` for a module). The core asks for
@@ -34,29 +34,29 @@ ROOMS = "calib.rooms"
 
 
 def offered(what: str) -> list[Any]:
-    """Return what all rooms offer under a name, in the order of the rooms' names."""
+    """Return the extensions of all packages under a name, in the order of the packages' names."""
     return [_loaded(room, places[what]) for room, places in _offers().items() if what in places]
 
 
 def merged(what: str) -> dict[str, Any]:
-    """Return the tables that rooms offer under a name, as one."""
+    """Return the merged tables of all packages under a name."""
     return {key: value for table in offered(what) for key, value in table.items()}
 
 
 def needed(what: str) -> Any:
-    """Return what one room offers under a name.
+    """Return the extension under a name, from the one package that provides it.
 
     Raises:
         UsageError: where no room offers it.
     """
     for each in offered(what):
         return each
-    raise UsageError(f"{what.replace('_', ' ')}: no package of {ROOMS} offers it; is the installation complete?")
+    raise UsageError(f"{what.replace('_', ' ')}: no package of {ROOMS} provides it; is the installation complete?")
 
 
 @cache
 def _offers() -> dict[str, dict[str, str]]:
-    """Return the table of each room, by the room's full name."""
+    """Return each package's table of extensions, by the package's full name."""
     try:
         package = import_module(ROOMS)
     except ImportError:

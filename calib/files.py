@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", defaul
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Let all files that are written inside appear at the end, or, where one cannot be written, none of them."""
+    """Publish all files written in the block together at its end, or none if one cannot be written."""
     if _staged.get() is not None:  # part of a larger whole
         yield
         return
@@ -55,7 +55,7 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> Iterator[None]:
-    """Write files inside as results of their own: checked (`check_results`), together, and known as ours afterwards."""
+    """Write the files of the block together as results: checked (`check_results`) and registered as ours."""
     check_results(targets, inputs, overwrite)
     with together():
         yield
@@ -69,7 +69,7 @@ def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrit
 
 
 def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> None:
-    """Refuse, before any work is done, files that cannot be written or are read (`check_target`), or are one file.
+    """Refuse, before any work is done, target files that cannot be written, are inputs, or coincide.
 
     Args:
         targets: to be written, each with the suffixes that it may have; what stands there is replaced where an earlier
@@ -101,7 +101,7 @@ def _written(path: Path) -> dict[str, str]:
 
 
 def write(path: str | Path, content: str | bytes) -> Path:
-    """Write `content` to `path` by way of a temporary file in the same folder and a rename (see `together`).
+    """Write `content` to `path` by a temporary file in the same folder and a rename (see `together`).
 
     A killed process or a full disk leaves the old file as it was.
 
@@ -134,12 +134,12 @@ def write(path: str | Path, content: str | bytes) -> Path:
 
 
 def staged_name(path: Path) -> tuple[str, str]:
-    """Return prefix and suffix of what will become `path` while it is written: the process stands in it."""
+    """Return prefix and suffix of the temporary file for `path`: the prefix contains the process id."""
     return f".{path.name}.{os.getpid()}.", ".part"
 
 
 def clear_leftovers(path: Path) -> None:
-    """Remove what earlier processes left of `path` when they were killed; not what a living one is filling."""
+    """Remove temporary files of `path` from killed processes; those of running processes stay."""
     pattern = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.[^.]+\.part")
     for name in os.listdir(path.parent):
         found = pattern.fullmatch(name)
@@ -162,7 +162,7 @@ def _alive(process: int) -> bool:
 
 
 def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Sequence[str] = ()) -> None:
-    """Refuse, before any work is done, a file that cannot be written, has another suffix, or is read.
+    """Refuse, before any work is done, a target file that cannot be written, has a wrong suffix, or is an input.
 
     Args:
         out: the file to write.
@@ -180,7 +180,7 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
 
 
 def check_writable(folder: Path, target: Path | None = None) -> None:
-    """Refuse, before any work is done, a folder that cannot be written to, or made, for `target` (the folder itself).
+    """Refuse, before any work is done, a folder that cannot be created or written to, for `target` (default: itself).
 
     Raises:
         UsageError: with the target, the folder and the reason.
@@ -195,7 +195,7 @@ def check_writable(folder: Path, target: Path | None = None) -> None:
 
 
 def _reached(path: Path) -> bool:
-    """Return whether a file or folder exists at `path`; refuse a path that cannot exist.
+    """Return whether a file or folder exists at `path`; refuse an invalid path.
 
     Raises:
         UsageError: for a link to nowhere or to itself, a name too long, a file taken for a folder.
@@ -211,7 +211,7 @@ def _reached(path: Path) -> bool:
 
 
 def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]) -> None:
-    """Refuse, before any work is done, to write onto a file or folder that is read.
+    """Refuse, before any work is done, a target that is one of the input files or folders.
 
     Args:
         targets: to be written.
@@ -229,12 +229,12 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Return whether two paths lead to the same file, also where upper and lower case are the same."""
+    """Return whether two paths name the same file, also on file systems that ignore case."""
     return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
 
 
 def check_regular(path: str | Path, streams: bool = False) -> None:
-    """Refuse to read a pipe or a device, which nobody may ever fill, and which can be read once at most.
+    """Refuse to read a pipe or a device.
 
     Args:
         path: of a file, or a folder.
@@ -244,15 +244,15 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
         OSError: with the reason.
     """
     if str(path).encode(errors="ignore").decode() != str(path):
-        raise OSError(errno.EILSEQ, "its name is no UTF-8: rename the file", str(path))
+        raise OSError(errno.EILSEQ, "its name is not UTF-8: rename the file", str(path))
     mode = os.stat(path).st_mode
     handed = streams and str(path).startswith(("/dev/fd/", "/dev/stdin", "/proc/self/fd/"))
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or handed or str(path) == os.devnull):
-        raise OSError(errno.EINVAL, "is a pipe or a device, not a file: write what it gives to a file first", str(path))
+        raise OSError(errno.EINVAL, "is a pipe or a device, not a file: write its content to a file first", str(path))
 
 
 def fingerprint(path: Path) -> str:
-    """Return the SHA-256 of a file in hex; the file is read again only after it changed."""
+    """Return the SHA-256 of a file in hex; the file is read again only if it changed."""
     found = path.stat()
     return _digest(path.absolute(), found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
@@ -286,7 +286,7 @@ def write_json(path: str | Path, value: Any) -> Path:
 
 
 def _not_finite(value: Any, place: str) -> Iterator[str]:
-    """Yield where numbers are not finite, as ``fit.nominal.position_mm.rms``."""
+    """Yield the paths of numbers that are not finite, as ``fit.nominal.position_mm.rms``."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from _not_finite(item, f"{place}.{key}" if place else str(key))
@@ -298,7 +298,7 @@ def _not_finite(value: Any, place: str) -> Iterator[str]:
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a CSV table; floats with 12 significant digits, so that a table read back serves as the value.
+    """Write a CSV table; floats have 12 significant digits.
 
     Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
     a whole header that would be taken for one with other separators, or for a comment. A text that a spreadsheet would
@@ -313,7 +313,7 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
 def write_numbers(
     path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = (), notes: Sequence[str] = ()
 ) -> Path:
-    """Write values (N, k), a name before each row or none, as `write_table` does, in half its time: logs are long.
+    """Write values (N, k) as CSV, optionally with a name per row, twice as fast as `write_table`.
 
     Args:
         notes: comment lines above the header.
@@ -349,7 +349,7 @@ def _headed(header: Sequence[str]) -> io.StringIO:
 
 
 def umask() -> int:
-    """Return the bits of permission that new files of this process leave out."""
+    """Return the permission bits that new files of this process do not get (umask)."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

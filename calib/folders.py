@@ -1,4 +1,4 @@
-"""Folders of results: written whole, beside their place, then moved there."""
+"""Folders of results: written completely to a temporary folder, then moved to their place."""
 
 import os
 import shutil
@@ -11,17 +11,17 @@ from calib import files
 from calib.errors import CalibError, UsageError, refused_as
 
 METRICS, SESSION = "metrics.json", "session.toml"
-"""By which results and sessions are known; the metrics are written last: they say that the rest is there."""
+"""Files that identify results and sessions; the metrics are written last and mark a folder as complete."""
 REPORT, CERTIFICATE = "report.json", "certificate.html"
-"""What figures and a certificate are made from, and the certificate."""
+"""The certificate, and the data for it and its figures."""
 OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
-"""By which an export is known, of a geometry and of dynamics."""
+"""Files that identify an export, of a geometry and of dynamics."""
 
 
 def check_target(
     out: Path, ours: Collection[str], marks: Collection[str], what: str, inputs: Iterable[str | Path | None] = ()
 ) -> None:
-    """Refuse, before any work is done, a folder that cannot be written, or whose files are not ours to replace.
+    """Refuse, before any work is done, a folder that cannot be written, or that contains files of another origin.
 
     Args:
         out: where results are to go.
@@ -45,14 +45,14 @@ def check_target(
 
 
 def files_of(folder: Path, ours: Collection[str]) -> list[str]:
-    """Return the names in a folder that are among `ours`, names or patterns; none where there is no folder."""
+    """Return the file names in a folder that match `ours` (names or patterns); empty if the folder is missing."""
     if not folder.is_dir():
         return []
     return sorted(name for name in os.listdir(folder) if any(fnmatchcase(name, one) for one in ours))
 
 
 def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], object]) -> Path:
-    """Let `write` fill a temporary folder beside `out`, and move its files there.
+    """Run `write` on a temporary folder next to `out`, then move its files to `out`.
 
     A folder that is not there appears whole; in one from an earlier run each file is replaced, its own other files
     (`ours`, names or patterns) go, and what else lies there stays.
@@ -88,7 +88,7 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
 
 
 def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
-    """Replace the files of an earlier run one by one, the metrics last: they show that the folder is complete."""
+    """Replace the files of an earlier run one by one, the metrics last: their presence marks the folder as complete."""
     fresh = sorted(path.name for path in staging.iterdir())
     with refused_as(UsageError, OSError, f"cannot write to {out}: {{}}"):
         for name in sorted(fresh, key=lambda name: name == METRICS):

@@ -1,4 +1,4 @@
-"""Records: results stored as they are typed, and read back by the same type.
+"""Records: results stored by their type, and read back by the same type.
 
 A record is a frozen dataclass (or named tuple) of numbers, texts, arrays and other records. `plain` turns it into what
 JSON holds, field by field under the fields' names; `read_record` turns that into an equal record. A new number is a new
@@ -28,7 +28,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")  # what a spreadsheet's formula
 
 
 def shielded(text: str) -> str:
-    """Return a text as a cell of a table holds it: with an apostrophe where a spreadsheet would take it for a formula.
+    """Return a text as a table cell: with an apostrophe if a spreadsheet would read it as a formula.
 
     Numbers stay as they are.
     """
@@ -42,7 +42,7 @@ def shielded(text: str) -> str:
 
 
 def plain_text(cell: str) -> str:
-    """Return the text that `shielded` made this cell of."""
+    """Return the original text of a cell written by `shielded`."""
     return cell[1:] if cell[:1] == "'" and cell[1:2] in _FORMULA else cell
 
 
@@ -79,7 +79,7 @@ def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
 def read_json(
     path: Path, advice: str = "make it again", kind: Any = dict, current: Callable[[Any], Any] | None = None
 ) -> Any:
-    """Return what a JSON file of ours holds, as a value of `kind` (see `read_record`).
+    """Return the content of a JSON file of ours as a value of `kind` (see `read_record`).
 
     Args:
         current: moves what an earlier version wrote to today's keys.
@@ -95,13 +95,13 @@ def read_json(
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file, none where it is missing; damaged letters are replaced."""
+    """Return the lines of a text file, empty if it is missing; invalid characters are replaced."""
     return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
 
 @dataclass(frozen=True)
 class _Null:
-    """How pydantic reads a number, or an array of numbers, that JSON holds with null in place of `value`."""
+    """Pydantic type of a number, or an array of numbers, with null in JSON in place of `value`."""
 
     value: float = math.nan
     array: bool = False
@@ -123,15 +123,15 @@ Number = Annotated[float, _Null()]
 Array = Annotated[np.ndarray, _Null(array=True)]
 """An array of numbers of a record, any of which may be NaN; nested lists in JSON, read-only when read back."""
 Unbounded = Annotated[np.ndarray, _Null(math.inf, array=True)]
-"""An array of limits, infinite where there is none: null in JSON."""
+"""An array of limits; infinite for no limit, null in JSON."""
 
 
 class stored(property):
-    """A property of a record that `plain` writes beside the fields; it is not read back, but computed again."""
+    """A property that `plain` writes in addition to the fields; it is computed again, not read back."""
 
 
 def plain(value: Any, null: bool = False) -> Any:
-    """Return a record, or anything made of records, arrays, mappings and lists, as JSON holds it.
+    """Return a record, or any nesting of records, arrays, mappings and lists, as plain JSON values.
 
     Args:
         null: whether null stands for a number that is not finite; of an array it does.
@@ -152,7 +152,7 @@ def plain(value: Any, null: bool = False) -> Any:
 
 @cache
 def _keys(kind: type) -> dict[str, bool]:
-    """Return the names of a record's fields and stored properties, and whether null stands for NaN there."""
+    """Return the names of a record's fields and stored properties, and whether null means NaN in each."""
     hints = get_type_hints(kind, include_extras=True)
     computed = [name for one in kind.__mro__ for name, item in vars(one).items() if isinstance(item, stored)]
     return {one.name: _nullable(hints[one.name]) for one in fields(kind)} | dict.fromkeys(computed, True)

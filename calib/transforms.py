@@ -1,4 +1,4 @@
-"""Rigid transforms as (..., 4, 4) arrays; rotations are scipy's wherever scipy has them.
+"""Rigid transforms as (..., 4, 4) arrays; rotations by scipy if possible.
 
 A pose maps coordinates of its own frame to its reference: p_ref = T @ [p; 1]. Quaternions are x, y, z, w;
 roll-pitch-yaw is URDF's: R = Rz(yaw) Ry(pitch) Rx(roll).
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 
 def pose(rotation: ArrayLike | Rotation | None = None, position: ArrayLike | None = None) -> np.ndarray:
-    """Assemble poses (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3) [m]; either may be left out."""
+    """Assemble poses (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3) [m]; both are optional."""
     matrix = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
     matrix = np.eye(3) if matrix is None else np.asarray(matrix, dtype=float)
     point = np.zeros(3) if position is None else np.asarray(position, dtype=float)
@@ -34,7 +34,7 @@ def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> np.ndarray:
 
 
 def to_xyz_rpy(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); the round trip stays exact near pitch ±90°, too.
+    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); the round trip is exact near pitch ±90°, too.
 
     Roll is taken from Rz(-yaw) R instead of from R, so that it makes up for whatever yaw is where yaw is ill defined.
     """

@@ -1,4 +1,4 @@
-"""Units: those of files that are read, with their factor to SI; those that are printed, with their factor from SI.
+"""Units: input units with their factor to SI, output units with their factor from SI.
 
 SI stands in every file that we write, unless a header or a key names another.
 """
@@ -14,7 +14,7 @@ LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 POSITIONS = {"rad": 1.0, "m": 1.0, "deg": DEG, "°": DEG, "mrad": 1e-3, "mm": 1e-3}
 TURNED = ("rad", "deg", "°", "mrad", "rad/s", "deg/s", "°/s", "rpm")
-"""Those among `POSITIONS` and `VELOCITIES` that turning joints have; the others are those of sliding ones."""
+"""Units in `POSITIONS` and `VELOCITIES` of turning joints; the others are for sliding joints."""
 VELOCITIES = {"rad/s": 1.0, "m/s": 1.0, "deg/s": DEG, "°/s": DEG, "mm/s": 1e-3, "rpm": math.pi / 30}
 EFFORTS = {
     **{f"n{dot}{length}": size for length, size in (("m", 1.0), ("mm", 1e-3)) for dot in ("", "·", ".", "*", " ", "-")},
@@ -31,26 +31,26 @@ QUANTITIES: Mapping[str, Mapping[str, float]] = {
     "force": {"N": 1.0},
     "frequency": {"rad/s": 1.0, "Hz": 2 * math.pi},
 }
-"""Quantity → unit → factor to SI; what is said of a unit that is none of them begins with the first."""
+"""Quantity → unit → factor to SI; the message on an unknown unit names the first quantity."""
 
 ERRORS: Mapping[str, tuple[float, str]] = {
     "position": (1e3, "mm"),
     "orientation": (1 / DEG, "deg"),
     "distance": (1e3, "mm"),
 }
-"""Nature of a residual → factor from SI and unit in which its size is printed."""
+"""Kind of a residual → factor from SI and printed unit."""
 
 SMALL: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}
-"""SI unit of a parameter → factor and unit in which its small changes and standard deviations are printed."""
+"""SI unit of a parameter → factor and printed unit of its small changes and standard deviations."""
 
 JOINT: Mapping[str, tuple[float, str]] = {"revolute": (1 / DEG, "deg"), "prismatic": (1e3, "mm")}
-"""Kind of a joint → factor from SI and unit in which its coordinate is printed."""
+"""Kind of a joint → factor from SI and printed unit of its coordinate."""
 
 TORQUE = "N m"
 
 
 def small(value: float, unit: str, digits: int = 3) -> str:
-    """Return a small change or a standard deviation of a parameter [m or rad] as it is printed."""
+    """Return the printed text of a small change or a standard deviation of a parameter [m or rad]."""
     factor, printed = SMALL[unit]
     return f"{factor * value:.{digits}g} {printed}"
 
@@ -64,13 +64,13 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
 
 
 def without_gains(unit: str) -> str:
-    """Say in words what the torques of a model in `unit` are, "A of joint 2", that were identified from currents."""
+    """Return a description of the torque unit `unit` ("A of joint 2") of a model identified from currents."""
     scaled = unit.removeprefix("A of ")
     return f"in amperes, {f'scaled to {scaled}, ' if scaled != unit else ''}because no drive gains are known"
 
 
 def per_ampere(own: str, unit: str) -> str:
-    """Return a parameter's unit in a model whose torques are in `unit`: of amperes, all are divided by a gain [N m/A].
+    """Return a parameter's unit in a model whose torques are in `unit`: if amperes, each is divided by a gain [N m/A].
 
     ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
     """
@@ -80,7 +80,7 @@ def per_ampere(own: str, unit: str) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Return the number that a text is, in ASCII digits; Python would read ``0_5`` as 5, and other scripts' digits.
+    """Return the number of a text in ASCII digits; ``0_5`` and digits of other scripts are refused.
 
     Raises:
         ValueError: for anything else.

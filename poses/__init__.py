@@ -1,1 +1,1 @@
-"""Experiment design for geometry: observability indices and the selection of measurement poses. No robot inside."""
+"""Experiment design for geometry: observability indices and the selection of measurement poses. No robot classes."""

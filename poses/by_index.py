@@ -1,4 +1,4 @@
-"""Exchange over candidates for any index, by the singular values of every trial set."""
+"""Exchange of candidates for any observability index, by the singular values of each trial set."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ def exchanged_by_index(
     sweeps: int = 20,
     screen: int = 32,
 ) -> tuple[tuple[int, ...], float]:
-    """Replace one member at a time by a candidate until no screened replacement improves the index.
+    """Replace one member at a time by a candidate until no replacement tried improves the index.
 
     O2-O5 and cond have no determinant lemma: a trial costs the eigenvalues of a p × p matrix. Trials are therefore
     screened: those with the largest first-order gain tr(J_i G J_iᵀ), G = ∂ log O / ∂M, and those with the largest

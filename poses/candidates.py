@@ -1,4 +1,4 @@
-"""Candidates: low-discrepancy poses within limits that keep every constraint and predicate."""
+"""Candidates: low-discrepancy poses within limits that satisfy all constraints and the predicate."""
 
 from collections.abc import Callable
 
@@ -51,8 +51,8 @@ def draw_candidates(
         found += len(kept[-1])
     if found < count:
         raise NothingFeasible(
-            f"{found} of {drawn} drawn poses are feasible ({100 * found / drawn:.3g} %), {count} were wanted: "
-            "loosen the narrowest constraint, check the frames it is written in, draw more, or ask for fewer",
+            f"{found} of {drawn} random poses are feasible ({100 * found / drawn:.3g} %), {count} are needed: "
+            "loosen the narrowest constraint, check its frames, or ask for fewer",
             found,
             drawn,
         )

@@ -1,4 +1,4 @@
-"""Constraints on a measurement pose: tool height, distance from the axis, orientation seen by an instrument, sight.
+"""Constraints on a measurement pose: tool height, distance from the axis, orientation to an instrument, line of sight.
 
 The quantities of the LWR4+ study's Table 1, and the line of sight. None knows a robot: they take the caller's forward
 kinematics as a callable, ``tool(q: (m, n)) -> (rotation (m, 3, 3), position (m, 3))`` in whatever frame the limits are
@@ -19,7 +19,7 @@ ToolJacobian = Callable[[np.ndarray], np.ndarray]
 
 
 def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Keep lowest ≤ z ≤ highest [m] of the tool's point."""
+    """Keep the tool point's height within lowest ≤ z ≤ highest [m]."""
     limits = tuple((sign, bound) for sign, bound in ((-1.0, lowest), (1.0, highest)) if np.isfinite(bound))
     slope = None if jacobian is None else partial(_height_gradient, jacobian, limits)
     return PoseConstraint("height", partial(_height, tool, limits), slope)
@@ -57,7 +57,7 @@ def orientation(
     pitch: tuple[float, float],
     jacobian: ToolJacobian | None = None,
 ) -> PoseConstraint:
-    """Keep roll and pitch of the tool seen from the camera within limits [rad].
+    """Keep the tool's roll and pitch in the camera frame within limits [rad].
 
     R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). The convention is our reading of Table 1, which does not state
     it. Not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
@@ -76,7 +76,7 @@ def orientation(
 def line_of_sight(
     tool: Tool, instrument: ArrayLike, axis: ArrayLike, half_angle: float, jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Keep the instrument in the target's cone of acceptance: cos(half_angle) − (R a)·u ≤ 0, u = (s − x)/‖s − x‖.
+    """Keep the instrument inside the target's acceptance cone: cos(half_angle) − (R a)·u ≤ 0, u = (s − x)/‖s − x‖.
 
     Args:
         tool: forward kinematics of the target's centre x and orientation R.

@@ -1,4 +1,4 @@
-"""The D-optimal relaxation: an upper bound on what any choice of poses can reach.
+"""The D-optimal relaxation: an upper bound for any choice of poses.
 
 Choosing m of N poses is relaxed to weights x in [0, 1] with Σ x = m (a pose at most once; without the cap, x ≤ m: poses
 may be repeated),
@@ -29,7 +29,7 @@ from poses.information import Candidates, log_det, prepared
 
 @dataclass(frozen=True)
 class Bound:
-    """An upper bound on det(WᵀW)^(1/p) over all choices of m poses, with its certificate.
+    """Upper bound on det(WᵀW)^(1/p) over all choices of m poses, with the weights that certify it.
 
     Attributes:
         weights: (N,) relaxed choice, Σ = m.
@@ -54,7 +54,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class _Certified:
-    """A feasible x with the bound certified at M(x), in transformed coordinates."""
+    """Feasible weights x with the bound certified at M(x), in transformed coordinates."""
 
     x: np.ndarray
     scores: np.ndarray
@@ -65,7 +65,7 @@ class _Certified:
 def bound(
     jacobians: ArrayLike, m: int, *, existing: ArrayLike | None = None, capped: bool = True, tolerance: float = 1e-3
 ) -> Bound:
-    """Bound det(WᵀW)^(1/p) over all choices of m candidates from above.
+    """Return an upper bound on det(WᵀW)^(1/p) over all choices of m candidates.
 
     Args:
         jacobians: (N, rows, p) whitened Jacobians of the candidates.
@@ -102,7 +102,7 @@ def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: f
 
 
 def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = True) -> float:
-    """Return the upper bound on log det M that weights x (N,) certify, however bad they are (+inf if M is singular)."""
+    """Return the upper bound on log det M that any weights x (N,) certify (+inf if M is singular)."""
     return _certify(candidates.z, candidates.known, x, m, capped).log_upper + candidates.shift
 
 
@@ -132,14 +132,14 @@ def _certify(z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, capped: bo
 
 
 def _tighter(one: _Certified, other: _Certified) -> _Certified:
-    """Return the better weights of the two with the tighter bound of the two."""
+    """Return the better weights of two, and the tighter bound of two."""
     upper = min(one.log_upper, other.log_upper)
     better = other if other.logdet >= one.logdet else one
     return _Certified(better.x, better.scores, better.logdet, upper)
 
 
 def _warm(z: np.ndarray, known: np.ndarray, m: int, cap: float, steps: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights after a few multiplicative steps, and the scores there."""
+    """Return initial weights by a few multiplicative steps, and their scores."""
     x = np.full(len(z), m / len(z))
     scores = scores_of(z, information_of(z, known, x))
     for _ in range(steps if len(z) * cap > m else 0):  # with no choice left x = 1 is the answer
@@ -156,7 +156,7 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, most: int) -> np.ndarray:
-    """Return the next active set: those with weight or near the price, and the worst violators outside."""
+    """Return the next active set: candidates with weight or near the price, and the worst violators."""
     keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
     if len(keep) < x.sum() + 2:  # all at the cap: leave the interior point room to move
         keep = active
@@ -200,7 +200,7 @@ def _interior(
 
 
 def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return d (K,) and Q (K, K) of a few candidates."""
+    """Return gradient d (K,) and matrix Q (K, K) of the Newton step for a few candidates."""
     count, rows, p = z.shape
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = (z.reshape(-1, p) @ root.T).reshape(count, rows, p)

@@ -1,4 +1,4 @@
-"""A set of chosen candidates whose determinant follows one addition or removal at a time.
+"""A set of chosen candidates, with its determinant updated per addition or removal.
 
 With C = M⁻¹ and one pose z (rows, p), the matrix determinant lemma and Woodbury's identity give
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from poses.information import log_det
 
-"""Information added to every design against the unit mean information of one candidate, so that sets still short of
+"""Information added to every design, relative to the unit mean information of one candidate, so that sets without
 full rank can be compared: our choice; values reported to the user never contain it."""
 
 
 @dataclass(frozen=True)
 class Pool:
-    """What designs are chosen from: candidates z (N, rows, p) and known information (p, p), transformed."""
+    """Candidates z (N, rows, p) to choose from, and known information (p, p), transformed."""
 
     z: np.ndarray
     known: np.ndarray
@@ -45,7 +45,7 @@ class Design:
 
 
 def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
-    """Build the design of some members afresh (this also sheds the rounding errors of many updates)."""
+    """Return the design of given members, recomputed (this removes rounding errors of many updates)."""
     p = pool.z.shape[2]
     rows = pool.z[list(members)].reshape(-1, p)
     ridge = 1e-6
@@ -68,7 +68,7 @@ def with_removed(pool: Pool, design: Design, i: int) -> Design:
 
 
 def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 48) -> tuple[int, float]:
-    """Return the candidate outside the design that raises log det most, and by how much.
+    """Return the candidate outside the design that raises log det most, and its gain.
 
     Exact, though few blocks are formed: by the arithmetic-geometric mean det(I + B) ≤ (1 + tr(B)/r)^r for r rows, so
     candidates whose score alone cannot beat the best one found (or `above`) are skipped.

@@ -1,14 +1,14 @@
-"""The errors of pose selection: each says what was found, why it may be so, and what to try."""
+"""The errors of pose selection: each states the finding, its likely cause, and advice."""
 
 import numpy as np
 
 
 class BadInput(ValueError):
-    """An array or an option that cannot be what it should be (shape, NaN, an unknown name)."""
+    """An invalid array or option (shape, NaN, unknown name)."""
 
 
 def require(holds: object, message: str, kind: type[Exception] = BadInput) -> None:
-    """Raise `kind(message)` unless `holds`; for messages that can be formed whether it holds or not."""
+    """Raise `kind(message)` unless `holds`; for messages that can be formatted in both cases."""
     if not holds:
         raise kind(message)
 
@@ -26,7 +26,7 @@ class TooFewCandidates(ValueError):
 
 
 class NothingFeasible(ValueError):
-    """Limits and predicate leave no pose, or fewer than asked for.
+    """No pose, or fewer than asked for, within limits and predicate.
 
     Attributes:
         found, draws: feasible poses found and poses drawn.

@@ -8,14 +8,14 @@ import numpy as np
 from poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
 Report = Callable[[Design], None]
-"""Called with every design of the wanted size that beats all before."""
+"""Called with each design of the requested size that is better than all before."""
 
 TOLERANCE = 1e-9
-"""A gain of log det below this counts as none: our choice."""
+"""Smallest gain of log det that counts: our choice."""
 
 
 def greedy(pool: Pool, m: int) -> Design:
-    """Add the candidate that raises det M most, m times, from the known information alone."""
+    """Add the candidate that raises det M most, m times, starting from the known information."""
     design = design_of(pool, ())
     for _ in range(m):
         design = with_added(pool, design, best_addition(pool, design)[0])
@@ -23,7 +23,7 @@ def greedy(pool: Pool, m: int) -> Design:
 
 
 def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: int = 50) -> Design:
-    """Replace one member at a time by the best candidate until no replacement raises det M.
+    """Replace members one by one by the best candidate until no replacement raises det M.
 
     The modified Fedorov exchange (Fedorov 1972; one member after another: Cook & Nachtsheim 1980). The result is a
     local optimum: no single exchange improves it.
@@ -93,7 +93,7 @@ def kicked(
     weights=None,
     seconds: float = np.inf,
 ) -> Design:
-    """Leave local optima by kicks: swap `size` random members for random candidates, exchange, keep the better.
+    """Leave local optima: swap `size` random members for random candidates, exchange, keep the better set.
 
     Iterated local search (Lourenço, Martin & Stützle 2003). Newcomers are drawn by their relaxed weights where known;
     size and law are our choice.
@@ -131,7 +131,7 @@ def kicked(
 def _excursion(
     pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
 ) -> tuple[Design | None, set[frozenset[int]]]:
-    """Return the design one excursion comes back with (None if it went too far) and the designs seen on the way."""
+    """Return the design at the end of one excursion (None if it went too far), and the designs passed."""
     m, seen, design, larger = len(start.members), set[frozenset[int]](), start, upwards
     while True:
         size = len(design.members) + (1 if larger else -1)

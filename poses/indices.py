@@ -30,7 +30,7 @@ _POWERS = {"O2": (1.0, 1.0), "O3": (1.0, 0.0), "O4": (2.0, 1.0), "cond": (1.0, 1
 
 
 def observability(W: ArrayLike, index: Index = "O1", m: int | None = None) -> float:
-    """Return an observability index of a set of poses; the formulas stand at the head of this module.
+    """Return an observability index of a set of poses; formulas: see the module's docstring.
 
     Args:
         W: (m, rows, p) whitened Jacobians of the poses, or (m rows, p) the same stacked; unitless rows.
@@ -67,7 +67,7 @@ def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[f
 
 
 def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float, np.ndarray]:
-    """Return what the searches maximise, and its gradient: log O (−log cond), O1 with m = 1 poses.
+    """Return the merit that searches maximise, log O (−log cond; O1 with m = 1), and its gradient.
 
     O2, O3, O4 and cond have kinks where singular values meet, which is where their optima lie. A finite sharpness a
     replaces log s1 by (1/a) log Σ s_i^a and log sp by −(1/a) log Σ s_i^−a: smooth, and at most log(p)/a too pessimistic
@@ -95,7 +95,7 @@ def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float
 
 
 def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
-    """Return the index of singular values given along the last axis, largest first.
+    """Return the observability index from singular values (last axis, largest first).
 
     Args:
         s: (..., p) singular values.
@@ -122,7 +122,7 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
 
 
 def has_kinks(index: Index) -> bool:
-    """Return whether an index hangs on single singular values, so that searches need `merit`'s sharpness."""
+    """Return whether an index depends on single singular values, so that `merit` needs a smoothing sharpness."""
     return index in _POWERS
 
 
@@ -149,15 +149,13 @@ def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarr
 
 
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
-    """Return W as (rows in all, p) and the number of poses."""
+    """Return W as (all rows, p) and the number of poses."""
     if index not in get_args(Index):
         raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
     array = np.asarray(W, dtype=float)
     require(array.ndim in (2, 3) and array.size, f"W: expected (m, rows, p) or (m rows, p), found {array.shape}")
     if not np.isfinite(array).all():
-        raise BadInput(
-            "W holds values that are not finite; look for poses outside the model's domain or failed divisions"
-        )
+        raise BadInput("W contains values that are not finite; check for poses outside the model's domain")
     if array.ndim == 2 and m is None and index == "O1":
         raise BadInput("O1 of a stacked W needs the number of poses: give m, or W as (m, rows, p)")
     poses = m if m is not None else len(array)

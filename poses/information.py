@@ -1,4 +1,4 @@
-"""Jacobians of candidates, checked and brought to coordinates in which all parameters weigh alike."""
+"""Jacobians of candidates, checked and scaled so that all parameters have equal weight."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from poses.errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidates in the coordinates z = J T where the mean information of all of them is the unit matrix.
+    """Candidates in coordinates z = J T, in which their mean information is the unit matrix.
 
     D-optimality does not see the change (log det shifts by a constant), numerics do.
 
@@ -50,7 +50,7 @@ def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
 
 
 def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) -> Candidates:
-    """Return candidates in well-scaled coordinates, after checking that m of them can determine all parameters.
+    """Return candidates in well-scaled coordinates; refuse them if m poses cannot determine all parameters.
 
     T = D⁻¹ R⁻¹ with D the root mean square of the columns and RᵀR the mean information after that scaling.
 
@@ -88,7 +88,7 @@ def log_det(matrices: np.ndarray) -> np.ndarray:
 
 
 def _check_counts(count: int, rows: int, p: int, m: int, measured: int) -> None:
-    require(m >= 1, f"m = {m}: at least one pose is to be chosen")
+    require(m >= 1, f"m = {m}: choose at least one pose")
     if count < m:
         raise TooFewCandidates(
             f"{count} candidates for {m} poses: draw more candidates or ask for fewer poses", count, m

@@ -1,4 +1,4 @@
-"""One verb for every way of choosing poses, and what it returns."""
+"""Selection of poses by any method, and its result."""
 
 import time
 from collections.abc import Callable
@@ -28,20 +28,20 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How poses are searched for.
+    """Settings of the search for poses.
 
     Attributes:
         index: "O1" ... "O5", "cond". O1 is the default because its ranking of sets does not depend on the units of the
             parameters.
         method: see `select_poses`.
-        count: candidates to draw where none are given.
+        count: candidates to generate if none are given.
         seed: of every random draw; the same seed gives the same selection.
-        kicks: random restarts of detmax around its best set; left out where at most 0.5 % can be won.
-        starts: sets of multistart.
-        evaluations: most evaluations of one local search.
-        rule: numbers of the tabu search.
-        seconds: of processor time for the search, whatever it has reached by then; bounds and baseline not counted.
-        climbs: local searches for poses that break the bound, see `poses.whole_space`; 0: the bound covers the
+        kicks: random restarts of detmax around its best set; skipped if at most 0.5 % can be gained.
+        starts: start sets of multistart.
+        evaluations: largest number of evaluations of one local search.
+        rule: settings of the tabu search.
+        seconds: processor time after which the search stops; bounds and baseline not counted.
+        climbs: local searches for poses that exceed the bound, see `poses.whole_space`; 0: the bound covers the
             candidates and the chosen poses only.
     """
 
@@ -62,7 +62,7 @@ DEFAULT_SEARCH = SearchSettings()
 
 @dataclass(frozen=True)
 class Selection:
-    """Chosen poses and how good they are.
+    """Chosen poses with their index, efficiency and bounds.
 
     Attributes:
         q: (m, n) joint values [rad or m]; None where candidates came without joint values.
@@ -98,19 +98,19 @@ class Selection:
 
     @property
     def joints(self) -> np.ndarray:
-        """The joint values (m, n) [rad or m] of poses chosen by them.
+        """The joint values (m, n) [rad or m] of the chosen poses.
 
         Raises:
             BadInput: where candidates came without joint values.
         """
         if self.q is None:
-            raise BadInput("the candidates came without joint values: the chosen ones are `indices`")
+            raise BadInput("the candidates have no joint values: use `indices` of the chosen ones")
         return self.q
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """What a method hands back: members or joint values, merits on the way, work done."""
+    """Result of a method: members or joint values, history of merits, number of evaluations."""
 
     members: tuple[int, ...] | None
     q: np.ndarray | None
@@ -121,7 +121,7 @@ class _Chosen:
 
 @dataclass(frozen=True)
 class _Request:
-    """What every method needs: the candidates, their relaxation, and the request."""
+    """Input of every method: the candidates, their relaxation, and the request."""
 
     jacobians: np.ndarray
     q: np.ndarray | None
@@ -176,7 +176,7 @@ def select_poses(
     if method not in get_args(Method):
         raise BadInput(f"method '{method}' is not known; take one of {', '.join(get_args(Method))}")
     if method != "detmax" and space is None:
-        raise BadInput(f"method '{method}' leaves the candidates: give space, with limits and a Jacobian")
+        raise BadInput(f"method '{method}' moves joint values continuously: give space, with limits and a Jacobian")
     array, joints = _candidates(jacobians, q, space, settings.count, seed)
     before = None if existing is None else checked(existing, "existing")
     report = progress or (lambda done, total, message: None)
@@ -200,7 +200,7 @@ def select_poses(
 def random_baseline(
     jacobians: np.ndarray, m: int, index: Index = "O1", existing: np.ndarray | None = None, *, seed: int = 0, sets=1000
 ) -> float:
-    """Return the best index among random sets of m candidates: what choosing without thought would reach.
+    """Return the best index among random sets of m candidates: the baseline without optimisation.
 
     Args:
         jacobians: (N, rows, p) candidates.
@@ -230,7 +230,7 @@ def _candidates(
     joints = None if q is None else np.asarray(q, dtype=float)
     if jacobians is None:
         if space is None:
-            raise BadInput("no candidates: give jacobians, or a space to take them from")
+            raise BadInput("no candidates: give jacobians, or a space")
         if joints is None:
             joints = draw_candidates(space.lower, space.upper, count, lambda x: is_feasible(space, x), seed=seed)
         jacobians = space.jacobian(joints)
@@ -295,7 +295,7 @@ def _exchange(task: _Request) -> _Chosen:
 
 
 def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
-    """Go on from the D-optimal set by exchanges for another index."""
+    """Improve the D-optimal set by exchanges for another index."""
     p = task.jacobians.shape[2]
     past = np.zeros((0, p)) if task.before is None else task.before.reshape(-1, p)
     known = past.T @ past
@@ -310,7 +310,7 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
 
 
 def _polished(task: _Request) -> _Chosen:
-    """Choose among the candidates, then move all joint values."""
+    """Choose among the candidates, then refine all joint values continuously."""
     began = time.process_time()
     chosen = _exchange(task)
     if chosen.interrupted:
@@ -323,7 +323,7 @@ def _polished(task: _Request) -> _Chosen:
 
 
 def _multistart(task: _Request, starts: int) -> _Chosen:
-    """Search from random sets of the candidates."""
+    """Run the local search from random sets of candidates."""
     space, joints = _movable(task)
 
     def report(number: int, _: Improved) -> None:
@@ -339,13 +339,13 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
 
 def _movable(task: _Request) -> tuple[SearchSpace, np.ndarray]:
     if task.space is None or task.q is None:
-        raise BadInput("polish, local and multistart move joint values: give space, and q with jacobians")
+        raise BadInput("polish, local and multistart change joint values: give space, and q with jacobians")
     return task.space, task.q
 
 
 def _tabu(task: _Request) -> _Chosen:
     if task.space is None:
-        raise BadInput("tabu draws its own poses: give space")
+        raise BadInput("tabu generates its own poses: give space")
 
     def report(chosen: int, _: float) -> None:
         task.progress(chosen, task.m, "poses constructed")
@@ -368,7 +368,7 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
     value = _value(jacobians, task.before, task.index)
     if not value > 0 or not np.isfinite(value):
         raise NotIdentifiable(
-            f"no set of {task.m} poses of full rank was found, though all candidates together have it: ask for more "
+            f"no set of {task.m} poses of full rank was found, although the candidates together have it: ask for more "
             "poses"
         )
     poses = task.m + (0 if task.before is None else len(task.before))
@@ -385,7 +385,7 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
 
 
 def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
-    """Return the bound over candidates and chosen poses, and over all feasible ones where climbs are asked for."""
+    """Return the bound over candidates and chosen poses, or over all feasible poses if `climbs` is set."""
     space, joints = task.space, task.q
     if space is None or joints is None or q is None or (not climbs and np.isin(q, joints).all()):
         return Ceiling(task.bound.upper, task.bound.gap, 0, 0.0, np.zeros((0, 0)), 0)
@@ -398,7 +398,7 @@ def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
 
 
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:
-    """Return an index of chosen Jacobians together with those measured before."""
+    """Return an index of the chosen and the previously measured Jacobians together."""
     p = jacobians.shape[2]
     poses = len(jacobians) + (0 if existing is None else len(existing))
     past = np.zeros((0, p)) if existing is None else existing.reshape(-1, p)

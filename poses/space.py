@@ -1,4 +1,4 @@
-"""Where poses may lie when a search leaves the candidates: limits, constraints, predicate, and the Jacobian there."""
+"""Search space of continuous searches: limits, constraints, predicate, and Jacobian."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ STEP = 1e-5
 
 @dataclass(frozen=True)
 class PoseConstraint:
-    """Inequalities a pose must keep.
+    """Inequality constraints of a pose.
 
     Attributes:
         name: what a message calls it.
@@ -28,7 +28,7 @@ class PoseConstraint:
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """The continuous problem.
+    """The continuous search space of poses.
 
     Attributes:
         jacobian: (m, n) -> (m, rows, p) whitened observation Jacobians in base columns.
@@ -58,7 +58,7 @@ class SearchSpace:
 
 
 def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
-    """Return whether each pose (m, n) keeps limits, constraints and predicate (m,)."""
+    """Return whether each pose (m, n) satisfies limits, constraints and predicate, (m,)."""
     good = np.all((q >= space.lower - tolerance) & (q <= space.upper + tolerance), axis=1)
     good = np.asarray(good, dtype=bool)
     for constraint in space.constraints:
@@ -70,7 +70,7 @@ def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> n
 
 
 def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n): exact where the space knows it, else central differences."""
+    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n): exact if the space provides it, else by central differences."""
     if space.jacobian_product is not None:
         return np.asarray(space.jacobian_product(q, G), dtype=float)
     return np.einsum("mrp,mkrp->mk", G, central_difference(space.jacobian, q))
@@ -95,7 +95,7 @@ def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray
 
 
 def central_difference(function: Callable[[np.ndarray], np.ndarray], q: np.ndarray) -> np.ndarray:
-    """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) that treats every pose by itself, in one batch."""
+    """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) with independent poses, in one batch."""
     m, n = q.shape
     steps = STEP * np.eye(n)
     both = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)

@@ -1,4 +1,4 @@
-"""An upper bound on what any poses within limits and constraints can reach, not only those among the candidates.
+"""An upper bound over all poses within limits and constraints, not only over the candidates.
 
 The relaxation of `poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ of mass
 m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m poses
@@ -26,12 +26,12 @@ from poses.information import log_det, prepared
 from poses.space import SearchSpace, is_feasible, product
 
 BLOCK = 8
-"""Poses that climb together: few enough for SLSQP to be quick, enough for the Jacobian to pay. Our choice."""
+"""Poses optimised together: few for a fast SLSQP, many for an efficient Jacobian. Our choice."""
 
 
 @dataclass(frozen=True)
 class Ceiling:
-    """An upper bound on det(WᵀW)^(1/p) of any m feasible poses together with those measured before.
+    """Upper bound on det(WᵀW)^(1/p) of any m feasible poses together with those measured before.
 
     Attributes:
         upper: the bound.
@@ -63,7 +63,7 @@ def bound_over_space(
     seed: int = 0,
     report: Callable[[int, float], None] | None = None,
 ) -> Ceiling:
-    """Bound det(WᵀW)^(1/p) of any m feasible poses from above; see the head of this module.
+    """Return an upper bound on det(WᵀW)^(1/p) of any m feasible poses; see the module's docstring.
 
     Args:
         space: limits, constraints, Jacobian.
@@ -110,7 +110,7 @@ def bound_over_space(
 
 
 def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the feasible local maxima (K, n) of d(q) = ‖J(q) root‖² that poses climb to, and the evaluations."""
+    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² found from start poses, and the evaluations."""
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
         spread = np.asarray(space.jacobian(q), dtype=float) @ root
@@ -132,7 +132,7 @@ def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[
 def _starts(
     space: SearchSpace, q: np.ndarray, scores: np.ndarray, count: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Return half of the poses from the highest d, pairwise apart, and half at random."""
+    """Return start poses: half with the highest d, pairwise distinct, and half at random."""
     ranked = _apart(q[np.argsort(-scores, kind="stable")[: 20 * count]])[: count - count // 2]
     rest = count - len(ranked)
     return np.concatenate([
@@ -142,7 +142,7 @@ def _starts(
 
 
 def _apart(q: np.ndarray, least: float = 0.1) -> np.ndarray:
-    """Return the poses that differ from all kept before by `least` [rad or m] in some joint; our choice."""
+    """Return the poses that differ pairwise by at least `least` [rad or m] in some joint; our choice."""
     kept = np.zeros((0, q.shape[1]))
     for pose in q:
         if not len(kept) or (np.abs(kept - pose).max(1) > least).all():

@@ -110,10 +110,10 @@ def test_a_topic_without_schema_says_which_have_one(capsys: pytest.CaptureFixtur
         (b"a = " + b"{b=" * 5000 + b"1" + b"}" * 5000, "is nested too deeply"),
         (b"a." * 5000 + b"a = 1", "is nested too deeply"),
         (b"a = " + b"[" * 40 + b"]" * 40, "is nested too deeply: more than 32 levels"),
-        (b"a = 1\nb = \n", "is no TOML.*line 2"),
-        (b"a = '\xff'", "is no TOML"),
+        (b"a = 1\nb = \n", "is not a TOML file.*line 2"),
+        (b"a = '\xff'", "is not a TOML file"),
         (b"# " + b"x" * 8_000_000, "is larger than 8 MB"),
-        (b"a = 2021-13-40", "is no TOML"),
+        (b"a = 2021-13-40", "is not a TOML file"),
     ],
 )
 def test_hostile_files_get_a_message(tmp_path: Path, content: bytes, words: str) -> None:

@@ -86,7 +86,7 @@ def test_results_come_as_tasks_complete(crews: dict[str, Workers], where: str, t
 def test_one_run_at_a_time(crews: dict[str, Workers], where: str) -> None:
     results = crews[where].completed(square, range(9))
     assert next(results)
-    with pytest.raises(RuntimeError, match="at work"):
+    with pytest.raises(RuntimeError, match="busy"):
         list(crews[where].map(square, [1]))
     assert len(list(results)) == 8
 
@@ -126,7 +126,7 @@ def test_a_task_lost_for_good_costs_no_other_result(crews: dict[str, Workers]) -
     lost = found.pop(2)
     assert found == {0: 0, 1: 1, 3: 3, 4: 4}
     assert isinstance(lost, TaskLost) and (lost.number, lost.task) == (2, 2)
-    assert "task 3 (2) is lost: 3 processes died of it, the last by signal 9" in str(lost)
+    assert "task 3 (2) is lost: 3 processes died running it, the last by signal 9" in str(lost)
 
 
 def test_in_order_a_lost_task_is_raised_in_its_place() -> None:
@@ -297,7 +297,7 @@ def test_no_process_outlives_its_parent(tmp_path: Path) -> None:
 def test_a_script_that_starts_itself_again_is_told(tmp_path: Path) -> None:
     running = script(tmp_path, guard="True")
     _, err = running.communicate(timeout=SECONDS)
-    assert "CalibError: worker processes end as they start" in err and "lacks if __name__" in err
+    assert "CalibError: worker processes die at start" in err and "lacks if __name__" in err
 
 
 def test_what_is_nearly_done_survives_one_interrupt_and_not_two() -> None:

@@ -1,1 +1,1 @@
-"""Experiment design for dynamics: exciting motions within a robot's limits. Knows no robot: arrays and callables."""
+"""Experiment design for dynamics: exciting motions within limits, from arrays and callables (no robot classes)."""

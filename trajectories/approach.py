@@ -55,7 +55,7 @@ def _trajectory(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarra
     result = ruckig.Trajectory(len(start))
     said = ruckig.Ruckig(len(start)).calculate(given, result)
     if said not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise BadInput(f"no approach was found ({said}): check that limits are neither tiny nor huge")
+        raise BadInput(f"no approach was found ({said}): check for tiny or huge limits")
     return result
 
 

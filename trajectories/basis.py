@@ -1,4 +1,4 @@
-"""Motions that are linear in free variables: what the Fourier and the B-spline family have in common.
+"""Motions that are linear in free variables: common part of the Fourier and B-spline families.
 
     d^r q_j / dt^r (t_i) = offset_j[r, i] + Σ_c table_j[r, i, c] · x_{j,c},      r = 0 … 3
 
@@ -40,7 +40,7 @@ class SampledMotion:
         return len(self.times)
 
     def evaluated(self, regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return regressor(q, v, a), evaluated once: objectives and torque limits have one in common."""
+        """Return regressor(q, v, a), evaluated once: objectives and torque limits share it."""
         if regressor not in self._evaluated:
             self._evaluated[regressor] = regressor(self.q, self.v, self.a)
         return self._evaluated[regressor]
@@ -56,7 +56,7 @@ class SampledMotion:
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """A family at fixed times.
+    """A motion family evaluated at fixed times.
 
     Attributes:
         times: (N,) [s].
@@ -103,7 +103,7 @@ class Basis:
 
 
 class Family(Protocol):
-    """What an optimiser needs of a family of periodic motions; `Fourier` and `BSpline` have it."""
+    """Interface of a family of periodic motions for the optimiser; see `Fourier` and `BSpline`."""
 
     @property
     def period(self) -> float: ...
@@ -119,7 +119,7 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """The coefficients (C,) of one joint that keep its equations: particular (C,) + null (C, c) x."""
+    """Coefficients (C,) of one joint that satisfy its equations: particular (C,) + null (C, c) x."""
 
     particular: np.ndarray
     null: np.ndarray
@@ -138,7 +138,7 @@ def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
 def holding(
     counts: Sequence[int], none: int, start: np.ndarray | None, held: Mapping[int, float] | None
 ) -> tuple[tuple[int, ...], list[float | None]]:
-    """Return the coefficient counts and the start values of the joints, those held at a value put in.
+    """Return coefficient counts and start values of the joints, including joints held at a fixed value.
 
     Args:
         none: the count that locks a joint.
@@ -151,13 +151,13 @@ def holding(
         if not 0 <= j < len(found) or not np.isfinite(value):
             raise BadInput(f"joint {j + 1} of {len(found)} cannot be held at {value:g}")
         if start is not None and start[j] != value:
-            raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion is to start from {start[j]:g}")
+            raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion starts from {start[j]:g}")
         found[j], first[j] = none, float(value)
     return tuple(found), first
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
-    """Return the basis of joints with coefficient tables (4, N, C_j) under their equations."""
+    """Return the basis from the joints' coefficient tables (4, N, C_j) and equations."""
     n, widest = len(tables), max(max(f.null.shape[1] for f in freedoms), 1)
     offsets = np.zeros((4, len(times), n))
     stacked, used = np.zeros((n, 4, len(times), widest)), np.zeros((n, widest), dtype=bool)
@@ -180,7 +180,7 @@ def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -
 
 
 def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:
-    """Return `count` instants over one whole period, the end left out [s]; `shift` in steps."""
+    """Return `count` times [s] over one period without its end; `shift` in steps."""
     return (np.arange(count) + shift) * (period / count)
 
 

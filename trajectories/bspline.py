@@ -15,7 +15,7 @@ from trajectories.errors import BadInput, require
 
 @dataclass(frozen=True, eq=False)
 class BSpline:
-    """A family of periodic splines.
+    """Family of periodic splines as joint motions.
 
     Attributes:
         period: T0 [s].

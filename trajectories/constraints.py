@@ -1,4 +1,4 @@
-"""What a motion must keep, as values that are at most zero at every sample, with exact slopes.
+"""Constraints of a motion: values that are at most zero at every sample, with exact gradients.
 
 Joint, velocity, acceleration and jerk limits are linear in the variables; torques come from a regressor and parameters,
 with a margin for their uncertainty; places of the tool and of named points, and distances between bodies, come from
@@ -27,7 +27,7 @@ UNITS = ("rad", "rad/s", "rad/s²", "rad/s³")
 
 
 class MotionConstraint(Protocol):
-    """Values (N, k), feasible where ≤ 0, that depend on one sample each.
+    """Constraint with values (N, k), feasible if ≤ 0, each depending on one sample.
 
     Attributes:
         name, unit: what messages call it, and what its values are in.
@@ -54,7 +54,7 @@ class MotionConstraint(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class BoxLimit:
-    """lower ≤ d^r q / dt^r ≤ upper.
+    """Box limit lower ≤ d^r q / dt^r ≤ upper.
 
     Attributes:
         order: r, 0 to 3.
@@ -80,7 +80,7 @@ class BoxLimit:
                 "not move is locked with 0 harmonics"
             )
         if self.order and not ((lower < 0) & (upper > 0)).all():
-            raise BadInput(f"{kind} limits have to hold zero inside: the motion starts at rest; found {lower}, {upper}")
+            raise BadInput(f"{kind} limits must include zero (the motion starts at rest), found {lower}, {upper}")
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         object.__setattr__(self, "unit", self.unit or UNITS[self.order])
@@ -115,7 +115,7 @@ class BoxLimit:
 
 @dataclass(frozen=True, eq=False)
 class TorqueLimit:
-    """|Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max: the model's uncertainty is a margin.
+    """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max: the model's uncertainty is a margin.
 
     Attributes:
         regressor, product: Y (N, n, b) of q, v, a, and its derivative product.
@@ -228,7 +228,7 @@ class Smoothed(NamedTuple):
     own: np.ndarray
 
     def slopes(self, motion: SampledMotion) -> np.ndarray:
-        """Return the slopes (r, 4, N, n) of the values by the motion they were found at."""
+        """Return the slopes (r, 4, N, n) of the values by q, v, a, jerk of their motion."""
         group, row = np.nonzero((self.own[:, None] & (self.shares > 1e-9)).any(axis=2))  # nine digits without the rest
         weights = np.where(self.own[group], self.shares[row] / self.constraint.scale, 0.0)
         result = np.zeros((len(self.own), 4, *motion.q.shape))
@@ -239,7 +239,7 @@ class Smoothed(NamedTuple):
 def smoothed(
     constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
 ) -> Smoothed:
-    """Return the smoothed constraints of a motion, whose slopes are found where they are asked for.
+    """Return the smoothed constraints of a motion; slopes are computed on demand.
 
     Args:
         sharpness: ρ.

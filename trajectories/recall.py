@@ -76,7 +76,7 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     if q.ndim != 2 or r.ndim != 2 or q.shape[1] != r.shape[1]:
         raise BadInput(f"recording {q.shape} and reference {r.shape} need one column per joint, the same ones")
     if not (np.isfinite(q).all() and np.isfinite(r).all()):
-        raise BadInput("recording or reference hold values that are no numbers: cut them out before")
+        raise BadInput("recording or reference hold values that are no numbers: cut them out first")
     if len(q) < len(r):
         raise BadInput(f"the recording has {len(q)} samples, one period of the motion {len(r)}: it is not all there")
     similarity = _likeness(q, r)

@@ -1,1 +1,1 @@
-"""What stands behind the names of `calib`: the procedure's stages as verbs, and results that print themselves."""
+"""Implementation of the Python API: functions for the stages, and results that print themselves."""

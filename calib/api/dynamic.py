@@ -1,4 +1,4 @@
-"""The dynamic half in Python: identify a robot's dynamics on its calibrated geometry."""
+"""Dynamic calibration in Python: identify a robot's dynamics on its calibrated geometry."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ Recorded = str | Path | Recording
 
 
 class DynamicsModel(Judged, identify.IdentificationOutcome):
-    """Identified dynamics and how far to trust them. ``print`` shows errors on other motion, friction and verdict."""
+    """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
 
     @property
     def robot(self) -> CalibratedChain:
-        """The robot whose dynamics these are."""
+        """The robot of these dynamics."""
         return self.inputs.robot
 
     @property
     def estimate(self) -> Estimate:
-        """The base parameters with their covariance, the geometry's share in it where that is known."""
+        """The base parameters with their covariance, including the geometry's contribution if known."""
         found, carried = self.found.fitted.estimate, self.carried
         return found if carried is None else replace(found, covariance=carried.covariance)
 
@@ -53,7 +53,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
 
     @one_blas_thread()
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the standard deviations (N, rows) [N m or N] of the errors of `torques`: 1.96 of them hold 95 %.
+        """Return the standard deviations (N, rows) [N m or N] of the errors of `torques`: ± 1.96 σ covers 95 %.
 
         They are those of recorded torques, with what of them no model in the band explains.
 
@@ -62,7 +62,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
         """
         expected = self.errors
         if expected is None:
-            raise UsageError("too little was recorded to say what errors the torques have: record longer")
+            raise UsageError("the recording is too short to estimate torque errors: record longer")
         return expected.sigma(self.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
     @checked
@@ -84,7 +84,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
         return plain(metrics.metrics(self))
 
     def to_dataframe(self) -> Any:
-        """Return the base parameters as a pandas DataFrame: name, unit, value, sigma; NaN where a constraint holds."""
+        """Return the base parameters as a pandas DataFrame: name, unit, value, sigma (NaN: constraint active)."""
         found, held = self.estimate, metrics.on_bounds(self.found)
         sigma = np.where(np.isin(self.found.names, held), np.nan, found.sigma)
         rows = zip(found.names, found.units, found.values.tolist(), sigma.tolist())
@@ -103,7 +103,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
 
 
 def methods() -> tuple[Method, ...]:
-    """Return the methods of identification: ``name``, ``description``, ``source``, and what each ``needs``."""
+    """Return the identification methods as records: ``name``, ``description``, ``source``, ``needs``."""
     return tuple(METHODS.values())
 
 
@@ -123,7 +123,7 @@ def identify_dynamics(
     on_read: Callable[[inputs.IdentificationInputs], None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> DynamicsModel:
-    """Identify a robot's dynamics on its geometry, and judge them on motion they have not seen.
+    """Identify a robot's dynamics on its geometry, and judge them on unseen motion.
 
     A robot that comes from a fit (``fit.robot``) brings the covariance of its geometry, which is added to that of the
     estimate: Σ = Σ_torque + S Σ_geometry Sᵀ.
@@ -144,7 +144,7 @@ def identify_dynamics(
         MeasurementError: for logs that cannot be right, naming row and column.
         Unidentifiable: where the motion identifies no parameter.
     """
-    require(settings is None or options is None, "settings and options say the same: give one of them", UsageError)
+    require(settings is None or options is None, "settings and options overlap: give only one of them", UsageError)
     progress = progress_shown(progress)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
     chosen = chosen if settings is None else options_of(settings)

@@ -1,4 +1,4 @@
-"""What leaves the toolkit: calibrated geometry and identified dynamics in the forms other programs read.
+"""Exports: calibrated geometry and identified dynamics in the formats of other programs.
 
 Results held against measurements they have not seen.
 """
@@ -33,7 +33,7 @@ def validate(
     result: GeometryFit | DynamicsModel | MechanismResult,
     unseen: Measured | Recorded | Sequence[Measured | Recorded | Sequence[Measured]],
 ) -> Any:
-    """Hold a result against poses or motion it has not seen, and judge it anew.
+    """Validate a result on unseen poses or motion, and update its verdict.
 
     Args:
         result: a fit or an identification; nothing is fitted again.
@@ -46,7 +46,7 @@ def validate(
         MeasurementError: for files that cannot be right, naming row and column.
     """
     given = listed(unseen)
-    require(given, "validate: unseen: nothing is given to validate on", UsageError)
+    require(given, "validate: unseen is empty; give poses or recordings to validate on", UsageError)
     if isinstance(result, GeometryFit):
         return arm_fit.assessed(result, measured.with_unseen(result.inputs, given, result.options, result.settings))
     if not isinstance(result, DynamicsModel):
@@ -62,7 +62,7 @@ def export(
     urdf: str | Path | None = None,
     prior: str = "entropic",
 ) -> tuple[str, ...]:
-    """Write a calibrated robot, with its dynamics where they were identified, for other programs.
+    """Write a calibrated robot, with identified dynamics if available, for other programs.
 
     Of a fit: robot.urdf, joint_offsets.csv, ur_kinematics.yaml of a UR arm, joint corrections where there are any. Of
     an identification also masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is read back by
@@ -98,9 +98,9 @@ def export(
 
 
 def _source_of(place: Path) -> Path:
-    """Return the description that a fit's folder says it was made from."""
+    """Return the path of the robot description that a fit was made from."""
     source = geometry.read(place).source
     with refused_as(
-        UsageError, RobotError, f"{place} was fitted from {source}, which is not there: name its URDF (urdf)"
+        UsageError, RobotError, f"{place} was fitted from {source}, which is missing: give its URDF (urdf)"
     ):
         return resolve(source)

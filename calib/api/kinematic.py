@@ -1,4 +1,4 @@
-"""The kinematic half in Python: choose poses, fit, compensate."""
+"""Kinematic calibration in Python: choose poses, fit, compensate."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
 class PoseSelection(selection.Chosen):
-    """Poses at which a robot's geometry shows best. ``print`` shows index, bound and what random poses reach."""
+    """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
 
     @property
     def q(self) -> np.ndarray:
@@ -52,7 +52,7 @@ class PoseSelection(selection.Chosen):
 
     @checked
     def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
-        """Write the poses as CSV under the joints' names [rad or m], and next to it what they predict.
+        """Write the poses as CSV under the joints' names [rad or m], and the predicted errors next to it.
 
         That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`. Files that no
         earlier selection left, or that hold measurements since, are refused unless `overwrite`.
@@ -68,13 +68,13 @@ class PoseSelection(selection.Chosen):
 
     @checked
     def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
+        """Write the measuring run, poses in order, as CSV: t [s], pose (0 for a via-point), joints."""
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return write_run(Path(path), self.run, self.chain)
 
     @one_blas_thread()
     def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: sigma of the tool's position over the workspace, and by number of poses.
+        """Return the figures by name: σ of the tool position over the workspace, and over the number of poses.
 
         There are none where a parameter is not identifiable.
         """
@@ -91,7 +91,7 @@ class PoseSelection(selection.Chosen):
         return {name: figure(charts[name]()) for name in self.figures}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""
+        """Return the results of the selection: index, its value, that of random sets, efficiency, seconds, notes."""
         return selection.record(self)
 
     def to_dataframe(self) -> Any:
@@ -107,14 +107,14 @@ class PoseSelection(selection.Chosen):
 
 
 class PredictedPoses(NamedTuple):
-    """Poses (m, 4, 4) [m] of a tool in the robot's base, and σ (m, 2) of position [m] and orientation [rad]."""
+    """Poses (m, 4, 4) [m] of a tool in the robot's base frame, with σ (m, 2) of position [m] and orientation [rad]."""
 
     pose: np.ndarray
     sigma: np.ndarray
 
 
 class GeometryFit(Judged, fit.Outcome):
-    """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict."""
+    """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
 
     @property
     def estimate(self) -> Estimate:
@@ -123,7 +123,7 @@ class GeometryFit(Judged, fit.Outcome):
 
     @one_blas_thread()
     def predict(self, q: Any, tool: int = 0) -> PredictedPoses:
-        """Return where the calibrated robot puts a tool at any joint values, in its base, and σ of that.
+        """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
         σ of the position is all that is to be expected (`position_sigma`) where the fit states it, else that of the
         parameters, as σ of the orientation is.
@@ -140,7 +140,7 @@ class GeometryFit(Judged, fit.Outcome):
 
     @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
-        """Return the standard deviation (m,) [m] of the tool position error, all axes together, at any poses.
+        """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         Parameters' covariance and unmodelled effects, estimated on held-out rows: it grows with the distance from the
         poses of the fit. 95 % of errors are within ``expected.discrepancy.radius`` times that.
@@ -153,12 +153,12 @@ class GeometryFit(Judged, fit.Outcome):
             UsageError: where no positions were measured.
         """
         if self.expected is None:
-            raise UsageError("this fit knows no errors to expect: it takes 20 measured positions or more")
+            raise UsageError("no expected errors for this fit: at least 20 measured positions are needed")
         poses, torque = self._poses(q)
         return self.expected.position_sigma(poses.q, torque, tool=tool)
 
     def _poses(self, q: Any) -> tuple[PoseMeasurements, np.ndarray | None]:
-        """Return poses at joint values (m, n), and their gravity torques (m, n) [N m] where masses are known."""
+        """Return poses at joint values (m, n), and their gravity torques (m, n) [N m] if masses are known."""
         chain = self.inputs.chain
         poses = PoseMeasurements(
             shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q"), chain.joint_names
@@ -213,7 +213,7 @@ class JointCommands(compensation.Commands):
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the commands as CSV; `partial` writes what is reached, even where some targets are not.
+        """Write the commands as CSV; `partial` writes the reached targets even if others are not reached.
 
         A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
         """
@@ -240,7 +240,7 @@ def select_poses(
     workers: str | int = 1,
     progress: Progress | None = None,
 ) -> PoseSelection:
-    """Choose the poses at which a robot's geometry shows best, that it can drive, and that an instrument can see.
+    """Choose reachable, visible poses that determine a robot's geometry best.
 
     With no file poses keep away from joint limits, from the arm itself and from the floor it stands on; what was not
     checked is listed. ``SelectionSettings.without`` names what need not be kept.
@@ -284,7 +284,7 @@ def fit_geometry(
     on_read: Callable[[inputs.Inputs], None] | None = None,
     progress: Progress | None = None,
 ) -> GeometryFit:
-    """Fit a robot's geometry to measured poses, and judge it on poses it has not seen.
+    """Fit a robot's geometry to measured poses, and judge it on unseen poses.
 
     Args:
         robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result
@@ -321,7 +321,7 @@ def fit_geometry(
 
 
 def read_fitted(folder: str | Path) -> compensation.Fitted:
-    """Return what the folder of a fit says of the arm in its cell, `calib.procedure.kinematic_stage.compensation.read`.
+    """Return the fitted arm in its cell from the folder of a fit, see `kinematic_stage.compensation.read`.
 
     Raises:
         UsageError: where it is none, lacks something, or is of a parallel robot.

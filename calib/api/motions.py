@@ -1,4 +1,4 @@
-"""Motions in Python: design exciting ones, plan time-optimal ones."""
+"""Motions in Python: design of excitation, planning of time-optimal motions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _columns(track: Setpoints) -> Sampled:
 
 
 class ExcitationDesign(design.Designed):
-    """A motion that shows a robot's dynamics, proved to keep its limits. ``print`` shows condition numbers, margins."""
+    """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
 
     def sampled(self, rate: float | None = None) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], ends included.
@@ -77,7 +77,7 @@ class MotionPlan(planning.Planned):
 
     @property
     def duration(self) -> float:
-        """How long the motion takes [s]."""
+        """Duration of the motion [s]."""
         return self.track.duration
 
     def sampled(self) -> Sampled:

@@ -1,4 +1,4 @@
-"""Robots and measurements from files, as the verbs of `calib` take them."""
+"""Reading robots and measurements from files, as inputs of the API functions."""
 
 from pathlib import Path
 from typing import Any, cast

@@ -1,4 +1,4 @@
-"""Results as text and HTML: what the commands print, for ``print(result)``; a certificate's page for a notebook.
+"""Results as text and HTML: console text for ``print(result)``, and the certificate as a page for notebooks.
 
 What the verbs take in several forms: one or many, a file that may be missing, a result or its folder.
 """
@@ -23,7 +23,7 @@ from calib.errors import refused_as
 
 
 def listed(given: object | Sequence[object]) -> list:
-    """Return what was given, one or several, some of them several in turn, as a list."""
+    """Return one argument, or several (nested), as a flat list."""
     if isinstance(given, (str, Path)) or not isinstance(given, Sequence):
         return [given]
     return [one for each in given for one in listed(each)]
@@ -35,7 +35,7 @@ def optional(given: Any) -> Any:
 
 
 def progress_shown(progress: Callable[[str], None] | None) -> Callable[[str], None] | None:
-    """Return what reports progress: what was given; by default, in a notebook, a line under its cell; else None."""
+    """Return the progress reporter: the given one; by default a line under the cell in a notebook; else None."""
     notebook = sys.modules.get("IPython")
     if progress is not None or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
         return progress
@@ -45,7 +45,7 @@ def progress_shown(progress: Callable[[str], None] | None) -> Callable[[str], No
 
 @contextmanager
 def saved(result: Any) -> Iterator[Path]:
-    """Yield the folder of a result: a path as it is, a result in memory written for as long as it is needed."""
+    """Yield the folder of a result: a given path unchanged, or a temporary folder of a result in memory."""
     if isinstance(result, (str, Path)):
         yield Path(result)
     else:
@@ -57,7 +57,7 @@ WIDTH = 120
 
 
 def as_text(renderables: Iterable[Any]) -> str:
-    """Return rich renderables as plain text without colours."""
+    """Return rich renderables as plain text."""
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None)
@@ -67,7 +67,7 @@ def as_text(renderables: Iterable[Any]) -> str:
 
 
 class Judged(ABC):
-    """A result that one section of a report shows: on a console, by ``print``, and as a page in a notebook."""
+    """A result shown as a section of a report: on a console, by ``print``, and as a page in a notebook."""
 
     @abstractmethod
     def section(self) -> Section:
@@ -75,11 +75,11 @@ class Judged(ABC):
 
     @property
     def outcome(self) -> Self:
-        """The result itself: earlier versions kept what it holds apart."""
+        """The result itself (for compatibility with earlier versions)."""
         return self
 
     def renderables(self) -> Iterator[Any]:
-        """Yield what ``print`` shows, for a rich console."""
+        """Yield the rich renderables that ``print`` shows."""
         from calib.procedure.report import page
 
         yield from page.section(self.section())
@@ -107,6 +107,6 @@ def data_frame(rows: Iterable[Any], columns: list[str]) -> Any:
     """
     from calib.errors import UsageError
 
-    with refused_as(UsageError, ImportError, "to_dataframe needs pandas: pip install pandas; to_dict does without"):
+    with refused_as(UsageError, ImportError, "to_dataframe needs pandas: pip install pandas, or use to_dict"):
         from pandas import DataFrame  # pyright: ignore[reportMissingImports]
     return DataFrame(list(rows), columns=columns)

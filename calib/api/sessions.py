@@ -1,4 +1,4 @@
-"""Guided sessions in Python: one folder per robot, made once, run as far as it goes."""
+"""Guided sessions in Python: one folder per robot, created once, run as far as possible."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ def new_session(
     seed: int = 0,
     **motion: Any,
 ) -> Path:
-    """Make the folder of a guided session for a robot, as `calib new` does.
+    """Create the folder of a guided session for a robot, like `calib new`.
 
     Args:
         folder: new.
@@ -63,7 +63,7 @@ def run_sessions(
     plots: bool = True,
     command: str = "calib.run_sessions",
 ) -> Iterator[fleet.FleetRow]:
-    """Run sessions as far as they go, and yield how each ended; none stops another.
+    """Run sessions as far as possible, and yield the outcome of each; failures do not stop the others.
 
     Args:
         folders: of the sessions, or their ``session.toml``; one or several.

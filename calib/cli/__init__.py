@@ -25,9 +25,9 @@ GARBAGE = (20_000, 10, 10)
 
 EXIT_CODES = (
     "Exit codes: 0 done (the verdict is pass or marginal), 1 the verdict is fail, 2 input or usage, 3 not identifiable "
-    "or not converged, 4 an internal error: calib-bug-….txt says where."
+    "or not converged, 4 an internal error: details in calib-bug-….txt."
 )
-INTERRUPTED = "interrupted; nothing was left half-written"
+INTERRUPTED = "interrupted; no incomplete files were left"
 RESUMED = ("next", "redo", "demo", "study")  # keep what they have done; every other command starts over
 
 app = typer.Typer(
@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 @lru_cache(maxsize=1)
 def _command() -> Any:
-    """Return the commands as Typer makes them of the functions' signatures, once for a process that runs many."""
+    """Return the Typer commands, built once per process from the functions' signatures."""
     return get_command(app)
 
 
@@ -101,8 +101,8 @@ def run(arguments: list[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     for before, word in zip(["calib", *given], given):
         if word.encode(errors="ignore").decode() != word or not word:
-            what = "is no UTF-8 (rename the file)" if word else "is empty (leave the option out, or give it a value)"
-            return _complain(f"what stands behind {before} {what}", 2)
+            what = "is not UTF-8 (rename the file)" if word else "is empty (leave the option out, or give it a value)"
+            return _complain(f"the argument after {before} {what}", 2)
     try:
         code = int(_command()(args=_spread(given), standalone_mode=False) or 0)
         return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
@@ -122,7 +122,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _failed(error: Exception, given: list[str]) -> int:
-    """Say what went wrong, and return the exit code that it has."""
+    """Print the error, and return its exit code."""
     from calib import bug_reports
     from calib.errors import complaint
 
@@ -133,7 +133,7 @@ def _failed(error: Exception, given: list[str]) -> int:
 
 
 def _spread(arguments: list[str]) -> list[str]:
-    """Return arguments with ``--validate a b`` written as ``--validate a --validate b``, of the commands that take it.
+    """Return the arguments with ``--validate a b`` expanded to ``--validate a --validate b``.
 
     Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
     """

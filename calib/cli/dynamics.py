@@ -34,9 +34,9 @@ def identify_dynamics(
         out: folder for the identified model and its report
         validate: recording of other motion; may be repeated
         method: wls and others: calib study --list-methods
-        friction: auto, standard, or one rung: load, presliding, cable, stribeck, ...
-        options: TOML: drives, payloads, gains, filters, how to identify
-        excitation: folder of calib excite: what it predicted is held against what is found
+        friction: auto, standard, or one step: load, presliding, cable, stribeck, ...
+        options: TOML: drives, payloads, gains, filters, identification
+        excitation: folder of calib excite: its prediction is compared with the result
     """
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
@@ -101,10 +101,10 @@ def excite(
 
 @command(app)
 def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = False) -> None:
-    """Find a designed motion in a log, and average its periods. What comes out is a recording for calib identify.
+    """Find a designed motion in a log, and average its periods. The result is a recording for calib identify.
 
     Args:
-        folder: what calib excite wrote
+        folder: folder written by calib excite
         log: a recording of it; log.npz@0:90 cuts
         out: the averaged period: .npz with its variance, or .csv
         skip: whole periods to leave out at the beginning

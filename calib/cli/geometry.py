@@ -37,7 +37,7 @@ def fit(
         out: folder for the calibrated robot and its report
         validate: CSV file of unseen poses; may be repeated
         options: TOML, see calib formats options
-        selection: CSV of calib select, or its folder: what it predicted is held against what is found
+        selection: CSV of calib select, or its folder: its prediction is compared with the result
     """
     from calib.api.kinematic import fit_geometry
     from calib.procedure.report.geometry_section import read_lines
@@ -73,7 +73,7 @@ def select(
     plots: bool = True,
     overwrite: bool = False,
 ) -> None:
-    """Choose the poses at which the geometry of ROBOT shows best.
+    """Choose the poses that determine the geometry of ROBOT best.
 
     Beside OUT.csv, OUT_prediction.json holds what the poses are predicted to identify (calib fit --selection),
     OUT_predicted.png shows how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more
@@ -83,7 +83,7 @@ def select(
         out: CSV file of the chosen joint values, rad
         constraints: TOML, see calib formats constraints
         run: CSV of the run: t, pose (0: via-point), joints; calib view rehearses it
-        existing: CSV of poses measured before, which count
+        existing: CSV of poses measured before, included in the selection
     """
     from calib.api.kinematic import select_poses
     from calib.data.poses.fit_options import FitOptions
@@ -134,13 +134,13 @@ def export(
 
     Args:
         folder: the folder of a fit, or of an identification
-        urdf: the URDF to put the calibrated geometry into (it stays as it is)
+        urdf: the URDF to put the calibrated geometry into (the file is not changed)
         out: the URDF to write
         ur_kinematics: write ur_description's kinematics YAML
         offsets: write a CSV of joint offsets
-        into: folder for all forms, with identified dynamics: calib formats exports
-        for_corrections: the URDF that joint_corrections.csv belongs to, worse without it
-        prior: with --into: what masses that the torques do not identify are regularised towards, entropic or euclidean
+        into: folder for all formats, with identified dynamics: calib formats exports
+        for_corrections: the URDF to use only together with joint_corrections.csv
+        prior: with --into: distance from the prior for unidentified masses, entropic or euclidean
     """
     from calib.errors import UsageError, require
     from calib.files import results
@@ -154,7 +154,7 @@ def export(
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
         with progress() as show:
-            show("all forms, and each file read back")
+            show("all formats, each file verified by reading it back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
         say_written(lines, into, delivery.verdicts(folder).level)
         return
@@ -172,7 +172,7 @@ def export(
         )
     say(*lines)
     if found.corrections is not None:
-        say(f"note: the corrections in {folder}/joint_corrections.csv are in none of these files")
+        say(f"note: the corrections in {folder}/joint_corrections.csv are not included in these files")
     if own.level:
         say(str(own))
     exit_failed(own.level)
@@ -201,15 +201,15 @@ def compensate(
     Targets of an offline model of the cell, which stand in the robot's base: --frame base.
 
     Args:
-        folder: the folder of a fit, or of a session that has one
+        folder: the folder of a fit, or of a session with a fit
         targets: CSV of nominal joints or tool poses: calib formats targets
         out: CSV file of joint commands
-        frame: what the targets are in: base (of the calibrated robot), nominal, or a station
-        tool: what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]
-        dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only
-        start: q1,...,qn [rad, m] near which targets without joints are sought
-        tolerance: what a command may leave by the calibrated model
-        partial: write what is reached, even where some targets are not
+        frame: frame of the targets: base (of the calibrated robot), nominal, or a station
+        tool: what is placed at the targets: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]
+        dof: constrained degrees: 6; 5, free about the tool's z axis; 3, position only
+        start: q1,...,qn [rad, m] initial guess for targets without joints
+        tolerance: largest error of a command by the calibrated model
+        partial: write the reached targets even if others are not reached
     """
     from calib.api import kinematic
     from calib.files import check_results

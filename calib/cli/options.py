@@ -1,4 +1,4 @@
-"""Commands made of functions: parameters are options, settings one per field, and docstrings say what each is about."""
+"""Commands made of functions: parameters and settings fields become options, docstrings their help."""
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
@@ -27,8 +27,8 @@ class Common:
         tip: URDF: the link the arm ends at.
         workers: local processes, or the address of a Dask scheduler.
         plots: draw figures, or leave them out.
-        verbose: print all that there is to say, tables included.
-        overwrite: replace files, whatever they hold; without: those of an earlier run.
+        verbose: print all details, tables included.
+        overwrite: replace any existing files; without: only those of an earlier run.
     """
 
 
@@ -73,7 +73,7 @@ def command(app: typer.Typer, name: str | None = None, listing: bool = False) ->
 
 
 def _with_help(hint: Any, words: str, names: Sequence[str], positional: bool) -> Any:
-    """Return an annotation whose option, or argument, has a help; its metadata may say what else typer is to know."""
+    """Return an annotation with the help of its option or argument, and further metadata for Typer."""
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     option = next((copy(one) for one in metadata if isinstance(one, ParameterInfo)), None)
     option = option or (typer.Argument() if positional else typer.Option(*names))
@@ -115,13 +115,13 @@ def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _is_repeated(plain: Any) -> bool:
-    """Say whether an option is given once for each item of a tuple; numbers stand in one text with commas."""
+    """Return whether an option is repeated per item of a tuple; numbers are given as one comma-separated text."""
     first, last = get_args(plain)[0], get_args(plain)[-1]
     return last is ... and _plain(first)[0] is not float
 
 
 def _built(kind: Any, given: dict[str, Any]) -> Any:
-    """Return settings of what the command line gave; what it did not is left to their defaults, which load nothing."""
+    """Return settings from the values of the command line; missing values take the defaults."""
     chosen = _chosen(kind, given)
     return parse(kind, chosen, "") if chosen else kind()
 
@@ -139,7 +139,7 @@ def _chosen(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(hint: Any, value: Any) -> Any:
-    """Return a value as an option file would hold it: texts with commas as lists, a unit behind a number."""
+    """Return a value as in an option file: comma-separated texts as lists, numbers with their unit."""
     plain, metadata = _plain(hint)
     typed = next((one for one in metadata if isinstance(one, Typed)), Typed())
     if typed.unit:

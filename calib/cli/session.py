@@ -27,7 +27,7 @@ def new(
     tip: str | None = "",
     seed: Seed = 0,
 ) -> None:
-    """Make a session FOLDER: calibrate a robot step by step. A certificate comes at the end.
+    """Create a session FOLDER: calibrate a robot step by step. The last step writes a certificate.
 
     What is to be measured goes into FOLDER/3-measured as CSV (calib formats measurements), what is to be recorded into
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
@@ -37,7 +37,7 @@ def new(
     Args:
         dynamics_only: measure nothing: the description is taken as calibrated
         poses: poses to choose for the fit
-        validation: poses to measure and never fit; 0 for none
+        validation: poses to measure for validation only, not fitted; 0 for none
     """
     from calib.api.sessions import new_session
     from calib.procedure.robot_kinds import stage_of
@@ -57,7 +57,7 @@ def new(
 
 
 def _asked(given: Answers) -> Answers:
-    """Ask for what was not given, at a terminal."""
+    """Return the answers completed by questions at a terminal."""
     import sys
 
     from calib.procedure.session.questions import QUESTIONS, with_answer
@@ -78,7 +78,7 @@ def _asked(given: Answers) -> Answers:
 
 @command(app, listing=True)
 def formats(topic: Annotated[str | None, typer.Argument()] = None, schema: bool = False) -> None:
-    """Print what files hold: columns, keys, units.
+    """Print the content of file formats: columns, keys, units.
 
     Args:
         topic: measurements, images, targets, options, identify-options, identified, exports, constraints, mdh,
@@ -107,13 +107,13 @@ def explain(code: Annotated[str | None, typer.Argument()] = None) -> None:
 
 @command(app, "next")
 def next_step(folder: Folder, plots: bool = True) -> None:
-    """Go on in a session, then say what to do at the robot."""
+    """Continue a session, then print what to do at the robot."""
     _go_on(folder, "next", plots=plots)
 
 
 @command(app)
 def redo(folder: Folder, step: str, plots: bool = True) -> None:
-    """Make a step of a session again, and all that rests on it.
+    """Repeat a step of a session and all steps that depend on it.
 
     Args:
         step: a step's name or number, see calib status
@@ -123,7 +123,7 @@ def redo(folder: Folder, step: str, plots: bool = True) -> None:
 
 @command(app)
 def status(folder: Folder) -> None:
-    """Show how far a session is, and what is stale. With -v, what was noted as its steps were made."""
+    """Show the progress of a session, and which steps are stale. With -v, the notes of its steps."""
     from calib.procedure.session import commands
 
     say(*commands.status_lines(folder), result=True)
@@ -132,9 +132,9 @@ def status(folder: Folder) -> None:
 
 @command(app)
 def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
-    """Run many SESSIONS, one folder per robot, as far as they go. A table at the end says how they stand.
+    """Run many SESSIONS, one folder per robot, as far as possible. A table at the end shows their states.
 
-    A robot that fails does not stop the others; its folder's run.log says why. The exit code is the worst of all.
+    A robot that fails does not stop the others; see its folder's run.log. The exit code is the worst of all.
 
     Args:
         sessions: session.toml files, or the sessions' folders

@@ -1,4 +1,4 @@
-"""What several commands share: arguments, the console, progress, lists of numbers, checks of the output folder."""
+"""Shared parts of the commands: arguments, the console, progress, lists of numbers, checks of the output folder."""
 
 import os
 import re
@@ -21,7 +21,7 @@ def check_destination(
     out: Path,
     inputs: Sequence[str | Path | None] = (),
 ) -> None:
-    """Refuse, before any work is done, a folder that is not for what `verb` writes of a robot, or holds its inputs.
+    """Refuse, before any work is done, a folder that `verb` must not write to, or that contains its inputs.
 
     Args:
         robot: a serial arm or another robot, as a person names it.
@@ -64,7 +64,7 @@ def make_console(**options: Any) -> Any:
 
 
 class _Output:
-    """What a command prints: with -v all; without, no details (indented lines, tables) and at most `MAX_LINES`."""
+    """Output of a command: everything with -v, else at most `MAX_LINES` without details (indented lines, tables)."""
 
     def __init__(self, verbose: bool) -> None:
         self.verbose, self.printed, self.left_out = verbose, 0, 0
@@ -101,7 +101,7 @@ _OUTPUT: ContextVar[_Output | None] = ContextVar("output", default=None)
 
 @contextmanager
 def printing(verbose: bool) -> Iterator[None]:
-    """Let what `say` is given through, or the most important of it: all that a command prints goes this way."""
+    """Print the lines given to `say` in the block, or the most important of them."""
     output = _Output(verbose)
     token = _OUTPUT.set(output)
     try:
@@ -112,14 +112,14 @@ def printing(verbose: bool) -> Iterator[None]:
 
 
 def say(*lines: Any, console: Any = None, result: bool = False) -> None:
-    """Print lines of text as they are, and what rich renders; a `result` is what was asked for, and no detail."""
+    """Print lines of text and rich renderables; a `result` was asked for and is never left out."""
     console, output = console or make_console(), _OUTPUT.get() or _Output(verbose=True)
     for line in lines:
         output.show(line, console, result)
 
 
 def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:
-    """Print lines, and where the results lie.
+    """Print lines, and the path of the results.
 
     Raises:
         typer.Exit: with code 1 where the verdict is fail.
@@ -129,21 +129,21 @@ def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:
 
 
 def exit_failed(verdict: str) -> None:
-    """Exit with code 1 where the verdict is fail."""
+    """Exit with code 1 if the verdict is fail."""
     if verdict == "fail":
         raise typer.Exit(1)
 
 
 @contextmanager
 def progress() -> Iterator[Any]:
-    """Show on stderr what is being done, where stderr is a terminal."""
+    """Show the progress on stderr if it is a terminal."""
     console = make_console(stderr=True)
     with console.status("") as status:
         yield lambda words: status.update(str(words))
 
 
 def _now_and_then(every: float) -> Callable[[str], None]:
-    """Return a function that prints its words on stderr, at most once in so many seconds."""
+    """Return a function that prints a message on stderr, at most once in the given seconds."""
     due = time.monotonic() + every
 
     def say_if_due(words: str) -> None:
@@ -157,7 +157,7 @@ def _now_and_then(every: float) -> Callable[[str], None]:
 
 @contextmanager
 def reporting(logged: float = inf) -> Iterator[tuple[Any, Any]]:
-    """Yield two functions: for lines that stay, and for words that show while work goes on.
+    """Yield two functions: one for permanent lines, one for progress messages.
 
     Args:
         logged: seconds between such words on stderr where the output is no terminal, but a file or a job's log.
@@ -181,5 +181,5 @@ def numbers(text: str, count: int, option: str, finite: bool = True) -> list[flo
     except ValueError:
         values = []
     if len(values) != count or (finite and not all(map(isfinite, values))):
-        raise UsageError(f"{option} {text}: expected {count} finite numbers with commas between them")
+        raise UsageError(f"{option} {text}: expected {count} finite numbers separated by commas")
     return values

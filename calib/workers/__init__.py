@@ -1,4 +1,4 @@
-"""Where parallel work runs: this process, local processes, or a Dask scheduler by its address.
+"""Parallel execution of tasks: in this process, local processes, or on a Dask scheduler by address.
 
 `Workers.completed` hands results back as they come, `Workers.map` in order; ``poses`` and ``trajectories`` take the
 latter as a plain callable. Functions, tasks and results must pickle. A task whose process dies is tried again, here or
@@ -25,17 +25,17 @@ from calib.workers.crew import Crew, Stream, streamed
 
 @dataclass(frozen=True)
 class Workers:
-    """Run many tasks; made by `workers`.
+    """Runner of many tasks; created by `workers`.
 
     Attributes:
-        here: they work in this process's current folder.
+        here: whether they work in this process's current folder.
     """
 
     _stream: Stream
     here: bool = True
 
     def completed(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[tuple[int, Any]]:
-        """Yield (number of the task, its result) as tasks complete; tasks are taken as they are needed.
+        """Yield (number of the task, its result) as tasks complete; tasks are read from the iterable as needed.
 
         The result of a task lost for good is a `TaskLost`, yielded as the others are. What a task raises is raised.
         """
@@ -46,15 +46,15 @@ class Workers:
                 yield number, result if error is None else error
 
     def map(self, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
-        """Yield results in order, as the builtin does; after Ctrl-C what could still be had, then KeyboardInterrupt.
+        """Yield results in order like the builtin; after Ctrl-C the results available, then KeyboardInterrupt.
 
         Raises:
-            TaskLost: in the place of a result that is lost for good.
+            TaskLost: in place of a lost result.
         """
         return self._in_order(None, function, *items)
 
     def map_without(self, lost: list[TaskLost]) -> Callable[..., Iterator[Any]]:
-        """Return a `map` for searches that take the best of what they get: tasks lost for good are noted in `lost`.
+        """Return a `map` for searches that need only the best result: lost tasks are appended to `lost`.
 
         Where all are lost, it raises the last `TaskLost`.
         """
@@ -87,7 +87,7 @@ class Workers:
 
 @contextmanager
 def workers(where: str | int | None = None) -> Iterator[Workers]:
-    """Yield workers, and end them and what they still run when the block ends.
+    """Yield workers; end them and their running tasks when the block ends.
 
     Args:
         where: None, 1 or "1" for this process; a number of local processes; or the address of a Dask scheduler, e.g.
@@ -114,7 +114,7 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
 
 @contextmanager
 def finishing() -> Iterator[None]:
-    """Let the block come to its end in spite of one Ctrl-C, which is then spent; a second one ends it at once."""
+    """Complete the block in spite of one Ctrl-C, which is ignored; a second one ends it at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""A Dask cluster that runs tasks; the only module that knows Dask."""
+"""Tasks on a Dask cluster; the only module that imports Dask."""
 
 import asyncio
 import logging
@@ -19,7 +19,7 @@ NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
 
 
 class _Cluster:
-    """A Dask scheduler's workers: it tries lost tasks again itself, as often as it is configured to."""
+    """A Dask scheduler's workers: Dask itself repeats lost tasks as often as configured."""
 
     attempts = 1
 
@@ -32,7 +32,7 @@ class _Cluster:
         return self._threads() - len(self.under_way)
 
     def _threads(self) -> int:
-        """Return the threads of all workers, asked for once a second at most; 1 while there are none."""
+        """Return the number of threads of all workers, updated once a second at most; 1 without workers."""
         now = time.monotonic()
         if now > self.asked + 1.0:
             threads = self._said(lambda: sum(self.client.nthreads(callback_timeout=ANSWER).values()))
@@ -44,7 +44,7 @@ class _Cluster:
         return self.threads
 
     def _said(self, ask: Callable[[], Any]) -> Any:
-        """Return what `ask` gets from the scheduler; raise CalibError where the scheduler is gone."""
+        """Return the scheduler's answer to `ask`; raise CalibError if the scheduler is gone."""
         error = None
         try:
             if self.client.status == "running":
@@ -52,8 +52,8 @@ class _Cluster:
         except Exception as found:  # one of many of Dask, Tornado and asyncio
             error = found
         raise CalibError(
-            f"the Dask scheduler at {self.address} is gone, with {len(self.under_way)} tasks under way; results that "
-            "were handed back are good: start it again, and give the same command"
+            f"the Dask scheduler at {self.address} is gone, with {len(self.under_way)} tasks running; the results "
+            "returned so far are valid: restart it, and repeat the command"
         ) from error
 
     def pickled(self, call: tuple[Callable, tuple]) -> bytes:
@@ -85,13 +85,13 @@ class _Cluster:
         yield self.under_way.pop(future.key)[0], result, raised
 
     def _failed(self, error: Exception) -> Exception:
-        """Return what stands for the result where Dask, not the task, raised."""
+        """Return the exception to use as result if Dask, not the task, raised."""
         from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
         if isinstance(error, KilledWorker):
-            return Died(f"it ended {error.allowed_failures + 1} of the cluster's workers, as many as may be")
+            return Died(f"it ended {error.allowed_failures + 1} of the cluster's workers, the largest number allowed")
         self._said(lambda: None)
-        failed = CalibError(f"a Dask worker could not run its task: {error}; workers need this toolkit, same version")
+        failed = CalibError(f"a Dask worker could not run its task: {error}; install this version of the toolkit there")
         failed.__cause__ = error
         return failed
 
@@ -114,18 +114,18 @@ def _cloudpickled(value: Any) -> bytes:
 
 
 def _on_cluster(call: bytes) -> bytes:
-    """Run on a Dask worker."""
+    """Run a pickled call on a Dask worker, and return its pickled answer."""
     return run_call(call, lambda: None, _cloudpickled)
 
 
 async def _answers(address: str) -> None:
-    """Shake hands, in bounded time: a client waits for ever on a port that listens and says nothing."""
+    """Check in bounded time that a Dask scheduler answers; a client would wait forever on a silent port."""
     from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
 
     try:
         comm = await asyncio.wait_for(connect(address, timeout=ANSWER), ANSWER + 1.0)
     except TimeoutError:
-        raise OSError(f"nothing that Dask would say came in {ANSWER:g} s") from None
+        raise OSError(f"no answer from Dask within {ANSWER:g} s") from None
     await comm.close()
 
 

@@ -1,4 +1,4 @@
-"""What local processes and a cluster have in common: tasks begun, answered, tried again where their process died."""
+"""Common part of local processes and a cluster: starting tasks, collecting answers, repeating lost tasks."""
 
 import pickle
 import traceback
@@ -17,21 +17,21 @@ Stream = Callable[[Callable, Iterable[tuple], Callable[[int], bool]], Generator[
 
 
 class Died(Exception):
-    """What stands for the result of a task whose process died."""
+    """Placeholder for the result of a task whose process died."""
 
 
 class NotBegun(Exception):
-    """What stands for the result of a task whose process died before it got it."""
+    """Placeholder for the result of a task whose process died before it received the task."""
 
 
 class Crew(Protocol):
-    """What runs tasks, each a pickled function with its arguments, under a number."""
+    """Runner of numbered tasks, each a pickled function with its arguments."""
 
     attempts: int
     busy: Lock
 
     def free(self) -> int:
-        """Return how many more tasks may begin."""
+        """Return the number of tasks that can be started now."""
         ...
 
     def pickled(self, call: tuple[Callable, tuple]) -> bytes: ...
@@ -39,15 +39,15 @@ class Crew(Protocol):
     def begin(self, number: int, call: bytes) -> None: ...
 
     def ended(self) -> Iterable[Answer]:
-        """Wait for tasks to end."""
+        """Wait for tasks to end, and return their answers."""
         ...
 
     def settled(self) -> Iterable[Answer]:
-        """Return what the tasks under way hand back after Ctrl-C."""
+        """Return the answers of the running tasks after Ctrl-C."""
         ...
 
     def drop(self) -> None:
-        """Give up the tasks under way."""
+        """Cancel the running tasks."""
         ...
 
 
@@ -59,9 +59,9 @@ class _Task:
 
 
 def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator[Answer]:
-    """Yield answers as they come; a task begins when there is room for it and its number is near enough."""
+    """Yield answers as they arrive; a task starts when a worker is free and `near` accepts its number."""
     if not crew.busy.acquire(blocking=False):
-        raise RuntimeError("these workers are at work: end one `map` or `completed` before the next")
+        raise RuntimeError("these workers are busy: end one `map` or `completed` before the next")
     upcoming, begun = enumerate(tasks), 0
     under_way, again, found = dict[int, _Task](), deque[int](), deque[Answer]()
     try:
@@ -112,7 +112,7 @@ def _lost(number: int, task: _Task, error: Died) -> TaskLost:
 def run_call(
     call: bytes, hear: Callable[[], Any], dumps: Callable[[Any], bytes], hush: Callable[[], Any] = lambda: None
 ) -> bytes:
-    """Run a pickled call where a worker is; return (its result, what it raised), pickled.
+    """Run a pickled call in a worker; return (result, raised exception), pickled.
 
     Args:
         hear: called before it, to hear of Ctrl-C.

@@ -1,4 +1,4 @@
-"""Local processes that run tasks: spawned, one task each, so that who dies takes one task along."""
+"""Local processes that run tasks: spawned, one task at a time, so that a crash loses one task only."""
 
 import os
 import pickle
@@ -20,7 +20,7 @@ ATTEMPTS = 3  # processes that a task may take along before it is given up (our 
 
 
 class _Process:
-    """A spawned process that runs one task at a time: where it dies, it is known with which."""
+    """A spawned process that runs one task at a time: if it dies, the lost task is known."""
 
     def __init__(self) -> None:
         context = get_context("spawn")
@@ -53,7 +53,7 @@ class _Process:
 
 
 class Processes:
-    """Local processes, started when there are tasks for them."""
+    """Local processes, started when tasks need them."""
 
     attempts = ATTEMPTS
 
@@ -101,17 +101,17 @@ class Processes:
         code = process.process.exitcode
         how = f"signal {-code}" if code and code < 0 else f"exit code {code}"
         if process.ready:
-            return Died(f"{self.attempts} processes died of it, the last by {how}")
+            return Died(f"{self.attempts} processes died running it, the last by {how}")
         self.stillborn += 1
         if self.stillborn < ATTEMPTS * self.count or self.stopping:
             return NotBegun()
         raise CalibError(
-            f"worker processes end as they start ({how}): memory ran out, or a script that uses them lacks "
+            f"worker processes die at start ({how}): not enough memory, or the calling script lacks "
             'if __name__ == "__main__"'
         )
 
     def settled(self) -> Iterator[Answer]:
-        """Return what tasks hand back that Ctrl-C ended; where only this process got it, pass it on."""
+        """Return the answers of tasks ended by Ctrl-C; pass Ctrl-C on if only this process received it."""
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
             until = time.monotonic() + patience
@@ -143,7 +143,7 @@ class Processes:
 
 
 def _serve(pipe: connection.Connection) -> None:
-    """Run in a process: answer calls until the other end is closed. Only while a task runs, Ctrl-C is heard."""
+    """Answer calls in a worker process until the pipe is closed. Ctrl-C has an effect only during a task."""
     hear = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     hush = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
@@ -161,7 +161,7 @@ def _serve(pipe: connection.Connection) -> None:
 
 
 def _unheard(unraisable: Any) -> None:
-    """Say nothing of a Ctrl-C that came within a library's callback, which cannot pass it on: one more will."""
+    """Suppress the message on a Ctrl-C inside a library's callback, which cannot raise it; another one follows."""
     if not isinstance(unraisable.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
 

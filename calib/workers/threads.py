@@ -1,4 +1,4 @@
-"""Threads of BLAS: one for all that calib computes, whose small matrices lose by more.
+"""Threads of BLAS: one for all computations of calib, since more threads slow down small matrices.
 
 Idle threads wait in loops that take processors from others: a fit on two idle cores took twice as long, beside one busy
 process eighteen times. The API, the command, the workers and the tests all limit them here. A caller's own choice wins:
@@ -21,7 +21,7 @@ _calls = 0
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread while the block runs; restore its number after the last such block."""
+    """Limit BLAS to one thread in the block; restore the previous number after the last such block."""
     global _calls
     with _changing:
         if not _calls:
@@ -38,7 +38,7 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield a generator's values; BLAS has one thread while it works, the caller's number in between."""
+    """Yield a generator's values; BLAS has one thread inside the generator, the caller's number in between."""
     ended = object()
     with closing(steps):
         while True:
@@ -56,7 +56,7 @@ def limit_process() -> None:
 
 
 def limit_worker() -> None:
-    """Give BLAS and numba one thread in this process for good, whatever was chosen: tasks are what runs in parallel."""
+    """Give BLAS and numba one thread in this process permanently: the tasks themselves run in parallel."""
     _limit_for_good()
     if numba := sys.modules.get("numba"):
         numba.set_num_threads(1)
@@ -88,7 +88,7 @@ def _limit_for_good() -> None:
 
 
 def _set(threads: dict[Any, int]) -> None:
-    """Set the numbers of libraries from whichever thread: threadpoolctl 3.8 heeds one alone until it is cleared."""
+    """Set the thread numbers of libraries, from any thread: threadpoolctl 3.8 heeds one alone until it is cleared."""
     for library, number in threads.items():
         clear = getattr(library, "clear_controlling_thread", lambda force: None)
         clear(force=True)
@@ -98,7 +98,7 @@ def _set(threads: dict[Any, int]) -> None:
 
 @cache
 def _libraries() -> list[Any]:
-    """Return every BLAS loaded: looking for them takes milliseconds, setting their threads microseconds."""
+    """Return all loaded BLAS libraries: looking for them takes milliseconds, setting their threads microseconds."""
     from threadpoolctl import ThreadpoolController
 
     found = ThreadpoolController().select(user_api="blas").lib_controllers

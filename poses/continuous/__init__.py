@@ -1,1 +1,1 @@
-"""Searches that move joint values continuously: local ones, from several starts, and the two-stage meta-heuristic."""
+"""Searches that move joint values continuously: local search, multistart, and the two-stage meta-heuristic."""

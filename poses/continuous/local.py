@@ -18,17 +18,17 @@ from poses.space import SearchSpace, constraint_gradients, constraint_values, is
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
-"""Above so many variables the poses are searched in blocks, the others held: SLSQP's cost rises with their cube."""
+"""Above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic."""
 SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
 """The stages of a smoothed search. Our choice: at the last one the smoothing costs at most log(p)/1024 of the merit."""
-"""Iterations over which a stage has to gain something. Our choice."""
+"""Iterations within which a stage must improve. Our choice."""
 FEASIBLE = 1e-8
-"""What a constraint may be broken by in a result [its own unit]."""
+"""Largest accepted constraint violation in a result [unit of the constraint]."""
 
 
 @dataclass(frozen=True)
 class Improved:
-    """What a local search ends with.
+    """Result of a local search.
 
     Attributes:
         q: (m, n) poses [rad or m]; never worse than the start, feasible to `FEASIBLE` if the start was.
@@ -48,7 +48,7 @@ class Improved:
 def merit_of(
     space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None = None, sharpness: float = np.inf
 ) -> tuple[float, np.ndarray]:
-    """Return the merit log O of poses with those measured before, and its gradient with respect to q.
+    """Return the merit log O of poses together with those measured before, and its gradient by q.
 
     ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `poses.indices`).
 
@@ -132,7 +132,7 @@ def _objective(
 
 
 class _Ended(Exception):
-    """A stage gains nothing more, or its evaluations are used up."""
+    """Raised when a stage no longer improves the merit, or its evaluations are used up."""
 
 
 def _search(
@@ -145,7 +145,7 @@ def _search(
     sharpness: Sequence[float],
     deadline: float,
 ) -> Improved:
-    """Run the stages from one start and return the best restored set; the predicate is not looked at."""
+    """Run the stages from one start and return the best feasible set; the predicate is not checked."""
     kept = bool(_keeps(space, start).all())
     best, value = start, merit_of(space, start, index, existing)[0] if kept else -np.inf
     history, spent, now, interrupted = [value], 0, start, False
@@ -248,7 +248,7 @@ def climb(
 
 
 def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
-    """Return poses (m, n) moved onto the constraints they break, by Newton steps of least norm within the limits.
+    """Return poses (m, n) corrected to satisfy the constraints, by Newton steps of least norm within the limits.
 
     A pose that cannot be brought back in so many steps is returned where it got to.
     """
@@ -273,12 +273,12 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return whether each pose keeps the constraints that have gradients (m,)."""
+    """Return whether each pose satisfies the constraints that have gradients (m,)."""
     return np.asarray((constraint_values(space, q) <= FEASIBLE).all(axis=1))
 
 
 def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the rows of held poses after those measured before; `existing` itself without any."""
+    """Return the rows of fixed poses appended to those measured before; `existing` itself if none are fixed."""
     if not len(q):
         return existing
     rows = np.asarray(space.jacobian(q), dtype=float)

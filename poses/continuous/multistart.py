@@ -1,4 +1,4 @@
-"""Multistart: the local search from several sets of feasible candidates, on as many cores as `map` brings."""
+"""Multistart: the local search from several sets of feasible candidates, in parallel if `map` is."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +12,7 @@ from poses.space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
-    """Return `count` random sets of m out of the candidates q (N, n), each from its own child of the seed."""
+    """Return `count` random sets of m candidates q (N, n), each by its own child of the seed."""
     return [q[g.choice(len(q), m, replace=False)] for g in np.random.default_rng(seed).spawn(count)]
 
 
@@ -75,7 +75,7 @@ def _one(
 
 
 def _in_time(work: Callable[..., Improved], starts: Sequence[np.ndarray], deadline: float) -> Iterator[Improved]:
-    """Yield the searches that fit into the time, the first one in any case."""
+    """Yield the searches that fit into the time limit, and always the first one."""
     for number, start in enumerate(starts):
         if number and time.process_time() >= deadline:
             return

@@ -1,4 +1,4 @@
-"""IMHATR: the iterative meta-heuristic with a tabu rule, in two stages.
+"""IMHATR: iterative meta-heuristic with a tabu rule, in two stages.
 
 The LWR4+ study names it after its reference [8] (most likely Daney, Papegay & Madeline, IJRR 24(6), 2005: poses chosen
 one after another, a tabu list against local minima) and gives no details. This is our reconstruction, and all numbers
@@ -26,7 +26,7 @@ from poses.space import SearchSpace, is_feasible
 
 @dataclass(frozen=True)
 class TabuRule:
-    """Numbers of the tabu search, all ours.
+    """Settings of the tabu search, all our choice.
 
     Attributes:
         candidates: N_c, random poses per addition.
@@ -57,7 +57,7 @@ def tabu_search(
     seconds: float = np.inf,
     report: Callable[[int, float], None] | None = None,
 ) -> Improved:
-    """Choose m poses by IMHATR; see the head of this module.
+    """Choose m poses by IMHATR; see the module's docstring.
 
     Args:
         space: limits, constraints, predicate, Jacobian.
@@ -112,7 +112,7 @@ def _newcomer(
     listed: deque[np.ndarray],
     rule: TabuRule,
 ) -> tuple[np.ndarray, int]:
-    """Return a pose to add to `others`, improved by itself, and the evaluations spent; start and end become tabu."""
+    """Return an individually improved pose to add to `others`, and the evaluations used; start and end become tabu."""
 
     def allowed(q: np.ndarray) -> np.ndarray:
         good = is_feasible(space, q)
@@ -150,7 +150,7 @@ def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
 def _least_useful(
     space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None, spared: set[int]
 ) -> int:
-    """Return the pose whose removal leaves the largest merit, among those not spared."""
+    """Return the removable pose whose removal leaves the largest merit."""
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     before = np.zeros((0, jacobians.shape[2])) if existing is None else existing.reshape(-1, jacobians.shape[2])
     left = np.full(len(q), -np.inf)

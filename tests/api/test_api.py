@@ -171,7 +171,7 @@ def test_measurements_in_memory_get_the_checks_of_files(fitted, cell):
 def test_what_readers_return_may_stand_among_files(fitted, cell):
     both = [calib.read_poses(cell / "measured.csv", "ur5"), cell / "other.csv"]
     assert len(calib.fit_geometry("ur5", both, calib.FitSettings(model="geometry")).inputs.fit) == 2
-    with pytest.raises(UsageError, match="nothing is given"):
+    with pytest.raises(UsageError, match="unseen is empty"):
         calib.validate(fitted, [])
     with pytest.raises(UsageError, match="save: out: expected a text or a path, found None"):
         fitted.save(None)

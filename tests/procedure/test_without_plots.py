@@ -50,7 +50,7 @@ def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, mo
     with monkeypatch.context() as patch:
         patch.setattr(style, "png", interrupted)
         code, _, said = calib(*arguments)
-    assert code == 130 and "nothing was left half-written" in said and len(drawn) == 3
+    assert code == 130 and "no incomplete files were left" in said and len(drawn) == 3
     assert names(cell.folder) == {"m.csv"}
     assert calib(*arguments)[0] == 0 and "plot_position.png" in names(cell.folder / "o")
 

@@ -185,7 +185,7 @@ def test_complaints(table, message):
 def test_toml_syntax_is_complained_about_with_the_line(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text('name = "x"\n[[joint]\n')
-    with pytest.raises(RobotError, match=r"bad\.toml: is no TOML: .*line 2"):
+    with pytest.raises(RobotError, match=r"bad\.toml: is not a TOML file: .*line 2"):
         description.read(path)
     with pytest.raises(RobotError, match=r"absent\.toml: cannot be read: No such file"):
         description.read(tmp_path / "absent.toml")

@@ -1,4 +1,4 @@
-"""What makes a motion good, each with its exact gradient.
+"""Objectives of motion design, with exact gradients.
 
 Of the observation matrix W (all samples' regressors, rows of joint j divided by sigma_j) with the information matrix
 M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
@@ -101,7 +101,7 @@ class Excitation:
         return found._replace(by_regressor=seen.by_regressor(found.by_information))
 
     def seen(self, matrix: Observed) -> Value:
-        """Return the index of an observation matrix with this one's sigmas and existing information."""
+        """Return the index of another observation matrix with the same sigmas and existing information."""
         M = matrix.M
         if self.columns is None:
             value, by_m, exact = self.of_information(M)
@@ -147,7 +147,7 @@ class Excitation:
 
 @dataclass(frozen=True, eq=False)
 class TorqueSlack:
-    """The paper's slack of poorly loaded joints, by their limits: 1 - mean over joints and time of |τ_j| / τ_max.
+    """Slack of the joint torques to their limits, as in the paper: 1 - mean over joints and time of |τ_j| / τ_max.
 
     Eq. 24 asks for F = mean(τ_max - |τ|) ≤ k τ_max: slacks are *minimised*, so a goal of k = 0.9 asks for a mean torque
     of at least a tenth of the limit. The modulus is smoothed as √(τ² + (ε τ_max)²) - ε τ_max, ε = `smoothing`, which
@@ -180,7 +180,7 @@ class TorqueSlack:
 
 @dataclass(frozen=True, eq=False)
 class FrictionCoverage:
-    """How much is missing of the wanted shares of time at low and at high speed, in both directions.
+    """Shortfall from the required shares of time at low and at high speed, in both directions.
 
         F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
 
@@ -222,7 +222,7 @@ class FrictionCoverage:
 
 @dataclass(frozen=True)
 class Duration:
-    """The period [s]; worth an objective where the problem leaves it free."""
+    """The period [s], as an objective if it is a free variable."""
 
     name: str = "duration"
 
@@ -246,7 +246,7 @@ def condition_numbers(
     existing: np.ndarray | None = None,
     columns: np.ndarray | None = None,
 ) -> dict[str, float]:
-    """Return cond of the observation matrix, columns raw and normalised, by SVD (not by way of M).
+    """Return cond of the observation matrix, of raw and of normalised columns, by SVD (not via M).
 
     Args:
         regressor: (N, n, b).

@@ -50,7 +50,7 @@ def design(
         raise BadInput(f"method '{method}' is none of {', '.join(get_args(Method))}")
     began = time.perf_counter()
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
-    require(tasks, "no starts: ask for one at least, or give a guess")
+    require(tasks, "no starts: ask for at least one, or give an initial guess")
     search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
     try:
         search.run(tasks, STAGES[:2])
@@ -71,7 +71,7 @@ def design(
 
 
 class _Starts:
-    """Starts that are searched from, round by round."""
+    """Searches from several starts, in rounds."""
 
     def __init__(
         self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
@@ -83,7 +83,7 @@ class _Starts:
         self.spent, self.interrupted = 0, False
 
     def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
-        """Search from each task through some stages; return what was found."""
+        """Run the given stages of the search for each task; return the results."""
         fresh = list[SearchResult]()
         # a map in other processes may still hand back what it has
         wanted = takewhile(lambda _: not self.interrupted, tasks)
@@ -103,19 +103,19 @@ class _Starts:
         return fresh
 
     def promising(self) -> list[int | np.ndarray]:
-        """Return the variables of the best motions so far, those that break the constraints least behind."""
+        """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
         ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
         chosen = ranked[: _kept(len(ranked))]
         return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
 
 
 def _kept(starts: int) -> int:
-    """Return how many of the starts are searched to the end."""
+    """Return the number of starts to search to the end."""
     return max(1, round(KEPT * starts))
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:
-    """Return the error that names the constraint which was in the way."""
+    """Return an error that names the limiting constraint."""
     best = min(stuck, key=lambda one: one.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:
@@ -124,7 +124,7 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
             lacking, goal, value = missed
             return NothingFeasible(
                 f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {_counted(starts)}, though "
-                f"all limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a "
+                f"all limits were kept: the nearest motion has {value:.4g}; relax it, give it a weight, or take a "
                 "longer period",
                 goal.objective.name, lacking, "of the goal",
             )  # fmt: skip

@@ -13,7 +13,7 @@ from trajectories.design.search import SearchResult, Stuck, one_start
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Motions that trade objectives off.
+    """Motions on a trade-off front between objectives.
 
     Attributes:
         names: of the k objectives.
@@ -37,7 +37,7 @@ def proposed_goals(
     guesses: tuple[np.ndarray, ...] = (),
     map: Callable = map,
 ) -> list[tuple[float, SearchResult]]:
-    """Return what each objective reaches alone, with its motion: where goals start from (the study's advice)."""
+    """Return the optimum of each objective alone, with its motion, as initial goals (the study's advice)."""
     result = []
     for objective in objectives:
         alone = replace(problem, objectives=((objective, 1.0),), goals=())
@@ -57,7 +57,7 @@ def sweep(
     evaluations: int = 240,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Front:
-    """Minimise the first objective under second ≤ level (a hard goal), level after level, each from the last motion.
+    """Minimise the first objective under second ≤ level (a hard goal) for each level, from the last motion.
 
     Args:
         levels: of the second objective, in the order they are tried (best from easy to hard).
@@ -81,13 +81,13 @@ def sweep(
 
 
 def non_dominated(values: np.ndarray) -> np.ndarray:
-    """Return which rows (m, k) no other row beats: as small everywhere and smaller somewhere."""
+    """Return which rows (m, k) are not dominated (no other row is as small everywhere and smaller somewhere)."""
     better = (values[:, None] <= values[None]).all(-1) & (values[:, None] < values[None]).any(-1)
     return np.logical_not(better.any(axis=0))
 
 
 def _level(problem: ExcitationProblem, objective: Objective, y: np.ndarray) -> float:
-    """Return the objective at a guess: a goal that can be bettered."""
+    """Return the objective's value at an initial guess, as a goal to improve on."""
     x = y[: problem.basis().p]
     motion = problem.basis().motion(x)
     return float(objective.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value)

@@ -21,7 +21,7 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """F ≤ goal + weight · γ; weight None: |goal|, 0: hard."""
+    """Goal F ≤ goal + weight · γ; weight None: |goal|, 0: a hard goal."""
 
     objective: Objective
     goal: float
@@ -36,7 +36,7 @@ class AttainmentGoal:
         return abs(self.goal) if self.weight is None else self.weight
 
     def attainment(self, value: float) -> float:
-        """Return the γ at which F = value just meets the goal; 0 or infinite where the goal is hard."""
+        """Return the γ at which F = value just meets the goal; 0 or infinite for a hard goal."""
         if self.share == 0:
             return -np.inf if value <= self.goal + 1e-6 * max(abs(self.goal), 1e-3) else np.inf
         return (value - self.goal) / self.share
@@ -44,7 +44,7 @@ class AttainmentGoal:
 
 @dataclass(frozen=True, eq=False)
 class ExcitationProblem:
-    """What is to be designed.
+    """Definition of an excitation design problem.
 
     Attributes:
         family: of motions over one period.
@@ -92,7 +92,7 @@ class ExcitationProblem:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A point: its constraints, and on demand its merit and the gradients by the variables (x, factor on the period).
+    """Evaluation at a point: constraints, and on demand merit and gradients by (x, factor on the period).
 
     A step that is not taken needs no gradients, and a motion that is brought back inside its limits no merit: together
     a third of what a search computes.
@@ -117,7 +117,7 @@ class Evaluation:
 
     @cached_property
     def sampled(self) -> SampledMotion:
-        """The motion at the samples alone, which the objectives are of."""
+        """The motion at the samples only, on which the objectives depend."""
         return self.motion.part(np.arange(self.problem.samples)) if len(self.problem.extra) else self.motion
 
     @property
@@ -126,27 +126,27 @@ class Evaluation:
 
     @property
     def values(self) -> np.ndarray:
-        """(k,) of the objectives or goals, smoothed."""
+        """Smoothed values (k,) of the objectives or goals."""
         return np.array([one.value for one in self._found[0]])
 
     @property
     def exact(self) -> np.ndarray:
-        """(k,) the same, not smoothed."""
+        """Unsmoothed values (k,) of the objectives or goals."""
         return np.array([one.exact for one in self._found[0]])
 
     @property
     def total(self) -> float:
-        """The weighted sum of the smoothed objectives; 0 where there are goals."""
+        """The weighted sum of the smoothed objectives; 0 for problems with goals."""
         return 0.0 if self.problem.goals else _summed(self.problem, [one.value for one in self._found[0]])[0]
 
     @property
     def slopes(self) -> np.ndarray:
-        """(k, p) gradients of the goals, or (1, p) of the sum where there are none."""
+        """Gradients (k, p) of the goals, or (1, p) of the weighted sum without goals."""
         return self._gradient[: len(self.problem.goals) or 1]
 
     @property
     def rows(self) -> np.ndarray:
-        """(r, p) gradients of the constraints."""
+        """Gradients (r, p) of the constraints."""
         count = len(self.problem.goals) or 1
         if "_found" in self.__dict__:  # whoever asked for the merit will ask for its gradient
             return self._gradient[count:]
@@ -176,7 +176,7 @@ class Evaluation:
 
 
 def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
-    """Evaluate the constraints at y = (x, factor on the period if that is free), and all else where it is asked for.
+    """Evaluate the constraints at y = (x, factor on the period if that is free), the rest on demand.
 
     Args:
         basis: `ExcitationProblem.basis`.
@@ -200,7 +200,7 @@ def critical_times(
     constraints: Sequence[MotionConstraint] = (),
     count: int = INSTANTS,
 ) -> np.ndarray:
-    """Return the times over the family's period [s] at which a motion is near the constraints that it breaks.
+    """Return the times over the family's period [s] at which a motion is near or beyond violated constraints.
 
     Args:
         y: (x, factor on the period if that is free).
@@ -236,7 +236,7 @@ def _matrix(one: Excitation) -> tuple[int, int]:
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
-    """Return the weighted sum, condition numbers by their logarithm, and its slopes (1, k) by the values."""
+    """Return the weighted sum with log condition numbers, and its slopes (1, k) by the values."""
     logs = np.array([is_condition(one) for one, _ in problem.objectives])
     weights, sizes = np.array([weight for _, weight in problem.objectives]), np.array(values)
     sizes = np.where(logs, sizes, 1.0)
@@ -251,7 +251,7 @@ def _slope(
     shares: np.ndarray,
     seen: dict[tuple[int, int], Observed],
 ) -> np.ndarray:
-    """Return the slopes (4, N, n) of Σ shares · objectives by q, v, a, jerk: one derivative product for all."""
+    """Return the slopes (4, N, n) of Σ shares · objectives by q, v, a, jerk: by one derivative product."""
     result, by_regressor = np.zeros((4, *motion.q.shape)), None
     by_information: dict[tuple[int, int], np.ndarray] = {}
     for one, objective, share in zip(found, _terms(problem), shares):
@@ -273,7 +273,7 @@ def _slope(
 
 
 def _terms(problem: ExcitationProblem) -> list[Objective]:
-    """Return the objectives that are evaluated: those of the goals, or those of the sum."""
+    """Return the objectives to evaluate: those of the goals, or those of the weighted sum."""
     return [goal.objective for goal in problem.goals] or [one for one, _ in problem.objectives]
 
 
@@ -291,14 +291,14 @@ def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: n
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
-    """Return what is minimised: γ, or the weighted sum with condition numbers by their logarithm."""
+    """Return the merit to minimise: γ, or the weighted sum with log condition numbers."""
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
     return _summed(problem, list(values))[0]
 
 
 def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal, float] | None:
-    """Return by how much the worst hard goal is missed, as a share of it, that goal, and its value; None: none is."""
+    """Return the relative miss of the worst hard goal, that goal, and its value; None if all are met."""
     worst = None
     for goal, value in zip(problem.goals, values):
         lacking = (value - goal.goal) / max(abs(goal.goal), 1e-3)

@@ -32,7 +32,7 @@ Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
 
 class Stage(NamedTuple):
-    """Sharpness p of the spectra and ρ of the constraints, tolerance of SLSQP, and a share of the evaluations.
+    """Stage of a search: sharpness p of spectra and ρ of constraints, SLSQP's tolerance, share of evaluations.
 
     Rough: at half of the samples; coarse: in the coarse family.
     """
@@ -61,12 +61,12 @@ KEPT = 1e-7  # of a constraint's scale, by which a point that keeps it may break
 
 
 class _Spent(Exception):
-    """The evaluations are used up."""
+    """Raised when the evaluations are used up."""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search ends with.
+    """Result of a search.
 
     Attributes:
         x: variables of the family; `factor` multiplies its period.
@@ -95,7 +95,7 @@ class SearchResult:
 
 @dataclass(frozen=True, eq=False)
 class Stuck:
-    """A start that never became feasible.
+    """Result of a search that found no feasible motion.
 
     Attributes:
         x, factor: of the motion that broke the constraints least.
@@ -166,7 +166,7 @@ def one_start(
 
 
 def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
-    """Return the problem that a stage searches in, with extra times, and its basis."""
+    """Return the problem of a stage, with extra times, and its basis."""
     problem = replace(problem, extra=extra)
     if stage.rough:
         problem = replace(problem, samples=max(8, problem.samples // 2))
@@ -196,17 +196,17 @@ class StartSearch:
         self._trail: list[np.ndarray] = []
 
     def reached(self, last: np.ndarray) -> np.ndarray:
-        """Return the best point, the nearest to the limits where none keeps them, or the last where none was tried."""
+        """Return the best feasible point, else the least infeasible, else the last point."""
         return self.best if self.best is not None else self.nearest if self.nearest is not None else last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return the times of a motion that breaks limits between samples by more than `max_break`; none where not."""
+        """Return the times of a motion that breaks limits between samples by more than `max_break`; empty if none."""
         # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
         max_break = 0.02
         return critical_times(self.problem, y, max_break)
 
     def last_unbroken(self) -> np.ndarray:
-        """Return the last of the improving points that does not, found by halving; the first one where all do."""
+        """Return the last improving point within limits between samples, by bisection; the first one if none is."""
         low, high = 0, len(self._trail) - 1
         while high - low > 1:
             middle = (low + high) // 2
@@ -214,7 +214,7 @@ class StartSearch:
         return self._trail[low]
 
     def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
-        """Return the search of another problem that goes on from y, and the point where it begins."""
+        """Return the search of another problem continued from y, and its start point."""
         if problem.family is not self.problem.family:
             p = self.basis.p
             path = self.problem.family.basis(basis.times).motion(y[:p])
@@ -225,7 +225,7 @@ class StartSearch:
         return new, y
 
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
-        """Return what the search came to; y: its last point."""
+        """Return the result of the search; y: its last point."""
         p, stretch = self.basis.p, self.problem.stretch
         best = self.reached(y)
         factor = float(best[p]) if self.problem.free_period else stretch[0]
@@ -266,7 +266,7 @@ class StartSearch:
             self.times.append(time.process_time() - self.began)
 
     def inside(self, y: np.ndarray) -> np.ndarray:
-        """Return a point that keeps the constraints: repaired, or of a smaller motion where that fails."""
+        """Return a point that keeps the constraints: repaired, or of a smaller motion if that fails."""
         found = self.repaired(y)
         max_halvings = 4  # times that a motion is halved which cannot be brought back inside
         for _ in range(max_halvings):
@@ -296,7 +296,7 @@ class StartSearch:
         return self._optimised(solver, y)
 
     def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
-        """Search the smoothed problem from y (with s, of γ = e^s - 1, behind it where there are goals)."""
+        """Solve the smoothed problem from y (with goals followed by s, γ = e^s - 1)."""
         goals = self.problem.goals
         start = np.append(y, self._attainment(y)) if goals else y
         last = self.count + evaluations
@@ -328,7 +328,7 @@ class StartSearch:
         return len(self.at(np.ascontiguousarray(y)).constraints) + len(self.problem.goals)
 
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
-        """Run SciPy's SLSQP (Kraft 1988) until `last` evaluations: it solves its subproblems faster than NLopt's."""
+        """Run SciPy's SLSQP (Kraft 1988) up to `last` evaluations; its subproblems are solved faster than in NLopt."""
         self._tried = start
         rows, size = self._count(start[: len(start) - bool(self.problem.goals)]), len(start)
         objective = self._last if self.problem.goals else self._sum
@@ -372,7 +372,7 @@ class StartSearch:
         return found.x
 
     def _ends(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of the factor on the period, and of s: γ from -0.98 to 10⁵; a step may be of any length."""
+        """Return bounds of the factor on the period and of s (γ from -0.98 to 10⁵); steps are not limited."""
         lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
         p = self.basis.p
         if self.problem.free_period:

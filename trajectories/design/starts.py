@@ -1,4 +1,4 @@
-"""Where searches start: random motions inside the joint limits, about a pose that breaks the other limits least.
+"""Start motions of searches: random, inside the joint limits, about a pose that breaks the other limits least.
 
 Also where they start again: smaller motions about a pose that keeps the limits.
 """
@@ -11,7 +11,7 @@ from trajectories.design.problem import ExcitationProblem, stretched
 
 
 def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Generator) -> np.ndarray:
-    """Draw variables of a motion about a random pose that fills a random part of the joint limits.
+    """Return variables of a random motion about a random pose, within a random part of the joint limits.
 
     The centre is the best of 200 poses by the constraints that a constant pose can break; the amplitude is scaled down
     to the limits of position, velocity, acceleration and jerk.
@@ -40,7 +40,7 @@ def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Genera
 
 
 def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarray:
-    """Return a motion made smaller, to this share, about its pose that is furthest inside the limits."""
+    """Return a motion scaled down by a share about its pose furthest inside the limits."""
     basis = problem.basis()
     path = basis.motion(y[: basis.p])
     still = np.zeros(path.q.shape)

@@ -1,4 +1,4 @@
-"""The last word on feasibility: a motion evaluated anew, densely, with an allowance for what lies between the instants.
+"""Final check of feasibility: a motion evaluated anew, densely, with an allowance between the samples.
 
 Positions and derivatives come from the family's own formula, not from the optimiser's tables. Between two instants dt
 apart a function rises above both by at most max|f''| dt² / 8. For limits on d^r q / dt^r that maximum is bounded by the
@@ -21,7 +21,7 @@ from trajectories.errors import NothingFeasible
 
 @dataclass(frozen=True)
 class Margin:
-    """What is left of one limit.
+    """Margin to one limit.
 
     Attributes:
         name, label, unit: of the constraint and of its column.

@@ -92,7 +92,7 @@ def test_files_that_are_no_toml(tmp_path):
     with pytest.raises(UsageError, match="cannot be read"):
         read_options(path)
     path.write_text("kind = position")
-    with pytest.raises(UsageError, match=r"fit.toml: is no TOML.*line 1"):
+    with pytest.raises(UsageError, match=r"fit.toml: is not a TOML file.*line 1"):
         read_options(path)
 
 

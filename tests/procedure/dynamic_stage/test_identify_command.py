@@ -134,7 +134,7 @@ def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
         ("keep = ['ZZ9']", "ZZ9"),
         ("gains = [1.0, 2.0]", "gains: 2 values for 3 joints"),
         ("[gain_identification]\nunloaded = 'train.npz'\nloaded = 'train.npz'", "payload"),
-        ("not toml", "is no TOML"),
+        ("not toml", "is not a TOML file"),
     ],
 )
 def test_options_are_held_against_what_exists(robot, tmp_path, capsys, text, said):

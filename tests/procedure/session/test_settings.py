@@ -113,7 +113,7 @@ def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
         ("[poses]", "poses = 3\n[poss]", "instrument: there is no key 'poses'"),
         ("schema = 2", "schema = true", "not known"),
         ("schema = 2", "schema = 3", "newer version"),
-        ("[poses]", "[poses", "is no TOML"),
+        ("[poses]", "[poses", "is not a TOML file"),
         ("tolerance_mm = 0.0", "tolerance_mm = -1.0", "expected 0 or more"),
         ('loss = "none"', 'los = "none"', r"fit: there is no key 'los' \(did you mean 'loss'"),
     ],
