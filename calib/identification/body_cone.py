@@ -1,4 +1,4 @@
-"""Base parameters of bodies that can exist: those for which some standard parameters have pseudo-inertias P_i >= 0.
+"""Base parameters of physically consistent bodies: some standard parameters behind them have pseudo-inertias P_i >= 0.
 
     { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not identify of χ is free
 
@@ -22,7 +22,7 @@ from calib.estimation.constrained import minimise
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """Where the cone holds an optimum: normal (p,) ν and bound νᵀ β*, with the labels of bodies on the border."""
+    """Tangent plane of the cone at an optimum: normal ν (p,), bound νᵀ β*, and the labels of bodies on the border."""
 
     normal: np.ndarray
     bound: float
@@ -31,12 +31,12 @@ class _Plane:
 
 @dataclass(frozen=True, eq=False)
 class BodyCone(Frozen):
-    """What bodies and drives of a robot can make of its base parameters.
+    """Base parameters that physically consistent bodies and drives can have.
 
     Attributes:
         transform: T (b, P) of the standard parameters, ten by body, then the drives' terms.
-        labels: of the bodies.
-        positive: (P - 10 B,) terms that are not negative.
+        labels: names of the bodies.
+        positive: (P - 10 B,) which drive terms must not be negative.
     """
 
     transform: np.ndarray
@@ -44,7 +44,7 @@ class BodyCone(Frozen):
     positive: np.ndarray
 
     def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
-        """Return the plane that holds argmin ½ ‖R β - z‖² on the cone and lower <= A β <= upper; None where none does.
+        """Return the cone's tangent plane at argmin ½ ‖R β - z‖², lower <= A β <= upper; None if the cone is inactive.
 
         Args:
             factor: (p + 1, p + 1) triangle [R z; 0 ρ]; base columns first.

@@ -33,15 +33,15 @@ LEFT = 1.6  # by which relative gains are further off than noise and blocks of t
 
 @dataclass(frozen=True, eq=False)
 class DriveGains:
-    """Gains and what came with them.
+    """Drive gains with the other results of their estimation.
 
     Attributes:
         gains: (n,) torque per current [N m/A or N/A].
         covariance: (n, n).
-        names, values: of all parameters in torque units, base ones and the payload's.
+        names, values: all parameters in torque units: base parameters and the payload's.
         std: (n,) of the residual currents [A].
-        scale: what fixed the scale, in words.
-        own: joints, from 0, whose gain the motion does not identify: one, in amperes of their own.
+        scale: text on what determines the scale.
+        own: joints, from 0, whose gain the motion does not identify: set to one, torque in amperes.
     """
 
     gains: np.ndarray
@@ -58,7 +58,7 @@ class DriveGains:
 
     @property
     def told(self) -> tuple[str, ...]:
-        """What each joint's gain is: ``told``, the ``reference`` of the others, or ``not told`` by this motion."""
+        """Status of each gain: identified (``told``), ``reference`` of the others, or unidentified (``not told``)."""
         sigma = self.sigma
         rounding = 1e-9  # sigma of a gain that is set, of it: rounding
         return tuple(
@@ -72,11 +72,11 @@ class GainRecord:
     """Drive gains as files store them, by joint: torque = gain · current.
 
     Attributes:
-        values: (n,); NaN where the motion does not identify it: that joint's torque is in amperes of its own.
-        sigma: (n,); NaN of the reference and where it is not identified.
+        values: (n,); NaN where the motion does not identify the gain: that joint's torque is in amperes.
+        sigma: (n,); NaN for the reference joint and where the gain is not identified.
         told: see `DriveGains.told`.
         covariance: (n, n).
-        unit, scale: of the gains, and what fixed it.
+        unit, scale: unit of the gains, and what determines their scale.
     """
 
     values: Array
@@ -88,7 +88,7 @@ class GainRecord:
 
     @classmethod
     def of(cls, found: DriveGains, unit: str) -> GainRecord:
-        """Return the record of gains; `unit`: of the torques."""
+        """Return the record of estimated gains; `unit`: that of the torques."""
         told = np.array(found.told)
         return cls(
             np.where(told == "not told", np.nan, found.gains), np.where(told == "told", found.sigma, np.nan),
@@ -104,7 +104,7 @@ def identify_gains(
     reference: int | None = None,
     own: Sequence[int] = (),
 ) -> DriveGains:
-    """Estimate gains from triangles of [W P | i], one group per joint.
+    """Return the drive gains estimated from triangles of [W P | i], one group per joint.
 
     Args:
         currents: columns of the model with the payload, target the currents.
@@ -124,7 +124,7 @@ def identify_gains(
     given = np.array([known[names[k]] for k in fixed])
     if reference is None and (not len(fixed) or not np.any(given)):
         raise Unidentifiable(
-            "gains need a payload of known mass: without it, currents fix torques up to a scale", names
+            "gains need a payload of known mass: without it, currents identify torques only up to a scale", names
         )
     tau = np.ones(n) if inflation is None else inflation
     factors = np.array(currents.factors)
@@ -169,7 +169,7 @@ def identify_gains(
             scale = scale if reference is None else f"gain of joint {reference + 1} = 1"
             return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), scale, tuple(own))
     if reference is None:
-        raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
+        raise NotConverged("the drive gains do not converge; check that the payload loads every joint", gain)
     raise NotConverged(
         f"without gains or a payload of known mass, currents identify gains only through the coupling of joints, "
         f"relative to joint {reference + 1}; this motion does not identify them. State the gains (options: gains), "
@@ -179,7 +179,7 @@ def identify_gains(
 
 
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
-    """Estimate gains relative to one joint's, and leave at one those that the motion does not identify.
+    """Return gains relative to one joint's; those that the motion does not identify are set to one.
 
     Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
     which sees part of what the model leaves, times `LEFT`. A gain is identified where its sigma is below `max_sigma` of
@@ -224,7 +224,7 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
 
 
 def _astray(error: NotConverged, reference: int, own: Sequence[int]) -> int:
-    """Return the joint whose gain ran away furthest where gains do not settle: the motion does not identify it.
+    """Return the joint whose gain diverged most, where the gains do not converge: the motion does not identify it.
 
     Raises:
         NotConverged: the error, where no joint is left.
@@ -239,7 +239,7 @@ def _astray(error: NotConverged, reference: int, own: Sequence[int]) -> int:
 
 
 def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Return gains from [i -W] [K; χ] = P m, least squares: biased towards zero, but a start."""
+    """Return start values of the gains, least squares of [i -W] [K; χ] = P m: biased towards zero."""
     n, size, p = body.shape
     matrix = np.zeros((n, size, n + p))
     for j in range(n):

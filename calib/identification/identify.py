@@ -1,4 +1,4 @@
-"""From cases to an identified model: base parameters, friction that pays, an estimate with covariance, a prediction."""
+"""Identification of a model from cases: base parameters, selected friction, estimate with covariance, prediction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -44,21 +44,21 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Identification(Generic[Model]):
-    """What was identified.
+    """Result of an identification.
 
     Attributes:
-        dynamics: the model with numbers.
-        base: which columns were kept of the standard model, and what they stand for.
+        dynamics: the model with its parameter values.
+        base: base columns selected from the standard model, and their regrouping.
         fitted: the estimate of base parameters and friction.
-        elimination: the way to the essential ones; None where not asked for.
-        friction: which richer friction the unseen time rewarded.
-        settings: how.
+        elimination: the steps to the essential parameters; None if not requested.
+        friction: richer friction selected on held-out time.
+        settings: settings of the identification.
         rows: the training data.
-        condition: of the observation matrix of the base parameters, in its units and with columns of unit norm.
-        prior: what was known of the base parameters beforehand, where it was used.
-        ripples: gear ripple found above the identification band, by joint; not part of the estimate's covariance.
-        bias: what the simulated closed loop says of least squares, where a loop is stated.
-        unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
+        condition: of the base parameters' observation matrix, as it is and with columns of unit norm.
+        prior: prior of the base parameters; None if unused.
+        ripples: gear ripple above the identification band, by joint; not part of the estimate's covariance.
+        bias: test of least squares for bias by the simulated closed loop, where a loop is stated.
+        unlike: how recorded torques contradict an estimate that relies on the stated loop; None if they do not.
     """
 
     dynamics: Dynamics[Model]
@@ -76,12 +76,12 @@ class Identification(Generic[Model]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the estimate's parameters: base ones, then richer friction."""
+        """Names of the estimate's parameters: base parameters, then richer friction."""
         return (*self.base.names, *(one.name for one in self.friction.terms))
 
     @property
     def terms(self) -> tuple[DriveTerm | None, ...]:
-        """The drive term behind each of the estimate's parameters; None for those of bodies."""
+        """The drive term of each estimated parameter; None for parameters of bodies."""
         model = self.dynamics.model
         own = (None if k < model.inertial else model.columns[k - model.inertial] for k in self.base.kept)
         return (*own, *self.friction.terms)
@@ -146,7 +146,7 @@ def identify_model(
         CalibError: the method's failure, where there is no estimate.
     """
     settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
-    require(cases, "no recording to identify from", UsageError)
+    require(cases, "no recording to identify the model from", UsageError)
     method = method_named(settings.method)
     if method.needs_simulation:
         settings = require_simulable(settings, method.needs_controller)
@@ -217,26 +217,26 @@ def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
 def find_base(
     model: RegressorModel, cases: Sequence[Case], states: States, nominal: RegressorModel | None = None
 ) -> Base:
-    """Return base columns of a model over states and the cases' payloads, chosen on the nominal one and regrouped."""
+    """Return base columns of a model over states and the cases' payloads, selected and regrouped on the nominal one."""
     loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
     found = bases.find(model if nominal is None else nominal, states, loads)
     return found if nominal is None else bases.regroup(found, model, states, loads)
 
 
 def _known_masses(chain: Chain) -> np.ndarray | None:
-    """Return the standard parameters (10 B,) of a chain's description; None where it holds no masses."""
+    """Return the standard parameters (10 B,) from a chain's description; None where it states no masses."""
     known = chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0)
     return standard_parameters(chain) if known else None
 
 
 def _torque_limits(chain: Chain) -> np.ndarray | None:
-    """Return the joints' torque limits (n,) by the robot's description; None where one has none."""
+    """Return the joints' torque limits (n,) from the robot's description; None unless all are stated."""
     limits = np.array([joint.effort for joint in chain.joints])
     return limits if (np.isfinite(limits) & (limits > 0.0)).all() else None
 
 
 def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Return whether richer friction can be added to a model: it acts on the motors of single joints."""
+    """Return whether a model accepts richer friction, which acts on the motors of single joints."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
 
@@ -244,7 +244,7 @@ def _richer_friction(
     model: RegressorModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator,
     first: FirstFit, prior: Prior | None, settings: IdentificationSettings, progress: Progress | None,
 ) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:  # fmt: skip
-    """Return the friction terms that unseen time rewards, and the torques (N, n) that load-dependent ones feel."""
+    """Return the friction selected on held-out time, and the torques (N, n) that load-dependent terms depend on."""
     nothing: list[np.ndarray | None] = [None] * len(cases)
     if not _sees_drives(model):
         return FrictionSelection((), (), ()), nothing
@@ -263,7 +263,7 @@ def _richer_friction(
 def _with_ripple(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings, say: Progress
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
-    """Return the model with gear ripple identified from its residuals, where the settings ask for it."""
+    """Return the model with gear ripple identified from its residuals, if the settings request it."""
     model = dynamics.model
     if not _sees_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
@@ -276,7 +276,7 @@ def _with_ripple(
 def _with_payloads(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
 ) -> Dynamics[RegressorModel]:
-    """Return the model with known parameters for payloads that no training recording carries."""
+    """Return the model with the known parameters of payloads that occur in no training recording."""
     model, values = dynamics.model, np.array(dynamics.values)
     for label, stated in settings.payloads.items():
         known = settings.payload_values.get(label, stated.parameters)
@@ -288,14 +288,14 @@ def _with_payloads(
 
 
 def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) -> Decimator:
-    """Return the filter of all rows: the widest of the cases' bands; where that makes too many rows, of every second,
-    third, ... one alone.
+    """Return the filter of all rows: the widest of the cases' bands; if that gives too many rows, with every second,
+    third, ... row.
 
     Too many are more than ``settings.samples``. The band stays: long recordings have rows to spare, but what they show
     of fast motion no other row identifies.
     """
     rates = [case.motion.rate for case in cases]
-    words = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz do not go together; resample one of them"
+    words = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
     require(max(rates) <= 1.02 * min(rates), words, MeasurementError)
     total = sum(len(case.motion) for case in cases)
     widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
@@ -304,17 +304,17 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the noise (rows,) by repeats of the motion, its mean square over cases by length; None: not asked.
+    """Return the torque noise (rows,) from repeats of the motion, mean square over the cases; None if not requested.
 
     Raises:
         UsageError: for another method than WLS, or rows with torques that no variance is read for.
-        MeasurementError: for a recording without variances, or with a joint of none.
+        MeasurementError: for a recording without variances, or with a joint of variance zero.
     """
     if settings.weights == "residuals":
         return None
     if not method_named(settings.method).takes_prior or not settings.torque_rows.motors_alone:
         raise UsageError(
-            f'weights = "repeats" goes with method wls and rows motor, found {settings.method} and '
+            f'weights = "repeats" requires method wls and rows motor, found {settings.method} and '
             f"{settings.torque_rows.name}"
         )
     for case in cases:
@@ -322,20 +322,20 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
             refuse_data(
                 case.motion.file,
                 'has no variances of its torques (variance_tau and periods), which weights = "repeats" needs: average '
-                'repeats with calib recall DIR LOG --out avg.npz, or take weights = "residuals"',
+                'repeats with calib recall DIR LOG --out avg.npz, or use weights = "residuals"',
             )
         if not (case.noise > 0).all():
             silent = case.motion.joint_names[int(np.argmin(case.noise))]
             refuse_data(
                 case.motion.file,
-                f'joint {silent} has no variance over the periods: it cannot be weighed; take weights = "residuals"',
+                f'joint {silent} has no variance over the periods: it cannot be weighted; use weights = "residuals"',
             )
     squares = np.array([case.noise**2 for case in cases if case.noise is not None])
     return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
 
 
 def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
-    """Return standard deviation and inflation of the residuals (rows,), and values (b,) of a fit that always exists."""
+    """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a fit that always exists."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
     std, tau = np.ones(count), np.ones(count)
@@ -350,18 +350,18 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
-    """Say whether the parameters have a prior: it is asked for, and the method and the model take one.
+    """Return whether the parameters get a prior: requested, and supported by method and model.
 
     Raises:
-        UsageError: where the CAD is asked for, and there is none.
+        UsageError: where the CAD prior is requested, but the description states no masses.
     """
     if settings.prior == "cad" and source != "cad":
-        raise UsageError("prior = 'cad', but the robot's description holds no masses")
+        raise UsageError("prior = 'cad', but the robot's description states no masses")
     return settings.prior != "none" and method.takes_prior and model.inertial > 0
 
 
 def _essential(found: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
-    """Return the elimination, where it is asked for."""
+    """Return the elimination of parameters, or None if it is not requested."""
     if settings.essential == "none":
         return None
     data, std, inflation = found.testable()
@@ -374,18 +374,18 @@ def _essential(found: MethodEstimate, settings: IdentificationSettings) -> Elimi
 
 
 def _require_constrainable(method: Method, settings: IdentificationSettings) -> None:
-    """Refuse constraints that the method would not see."""
+    """Raise a UsageError for constraints that the method does not support."""
     if settings.constraints is not None and not method.takes_constraints:
         known = [name for name, one in METHODS.items() if one.takes_constraints]
         own = f"pc-{method.name}"
-        advice = f"take '{own}'" if own in known else f"methods that do: {', '.join(known)}"
-        raise UsageError(f"[constraints]: method '{method.name}' does not know them; {advice}")
+        advice = f"use '{own}'" if own in known else f"methods that do: {', '.join(known)}"
+        raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
 
 
 def _require_motion(cases: Sequence[Case]) -> None:
-    """Refuse cases to learn from in which the robot stands (our choice: less than a milliradian or millimetre)."""
+    """Raise an error for training cases without motion (our choice: less than a milliradian or millimetre)."""
     if all((np.ptp(case.motion.q, axis=0) < 1e-3).all() for case in cases):
-        refuse_data(cases[0].motion.file, "no joint moves: that shows gravity in one pose, and nothing else")
+        refuse_data(cases[0].motion.file, "no joint moves: only gravity in one pose is identifiable")
 
 
 def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:

@@ -1,4 +1,4 @@
-"""The identification options file: what recordings do not say of themselves, and how to identify.
+"""The identification options file: settings that recordings do not contain, and those of the identification.
 
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
@@ -112,7 +112,7 @@ from calib.identification.settings import Choices, Coupling, IdentificationSetti
 
 def _no_zero(value: Any) -> Any:
     if isinstance(value, list) and any(type(x) in (int, float) and x == 0 for x in value):
-        raise ValueError(f"expected finite numbers, none of them zero, found {shown(value)}")
+        raise ValueError(f"expected finite numbers other than zero, found {shown(value)}")
     return value
 
 
@@ -120,14 +120,14 @@ FINDINGS = (
     "masses", "speed", "lag", "clock", "sign", "order", "zero", "limit", "jump", "bodies", "loop", "description",
 )  # fmt: skip
 """Names in ``accept``, see chapters 9 and 10 of the catalogue of findings."""
-Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of them")]
-Gains = Annotated[tuple[float, ...], Expect("a list of numbers, finite and none of them zero"), Checked(_no_zero)]
+Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]
+Gains = Annotated[tuple[float, ...], Expect("a list of finite numbers other than zero"), Checked(_no_zero)]
 
 
 @strict
 @dataclass(frozen=True)
 class FileSettings:
-    """How one recording is read: reader's options, filters, payload labels, gains, a file for its reference."""
+    """Settings of one recording: reader's options, filters, payload labels, gains, and the file of its reference."""
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
@@ -148,7 +148,7 @@ class GainPair:
 @strict
 @dataclass(frozen=True)
 class TermTable:
-    """A torque term as the file states it; `joint` from 0."""
+    """A torque term of the options file; `joint` from 0."""
 
     name: Name
     shape: Annotated[str, OneOf(tuple(SHAPES))]
@@ -160,7 +160,7 @@ class TermTable:
 @checked
 @dataclass(frozen=True)
 class IdentifySettings(Choices):
-    """How to identify: the keys of the options file, see ``calib formats identify-options``.
+    """Settings of an identification: the keys of the options file, see ``calib formats identify-options``.
 
     Tables may be given as dictionaries: ``IdentifySettings(method="iv", filter={"cutoff": 20.0})``.
     """
@@ -185,12 +185,12 @@ class IdentifyOptions:
     """The content of an options file.
 
     Attributes:
-        settings: of the identification.
-        every, files: how recordings are read.
+        settings: settings of the identification.
+        every, files: settings of all recordings, and of single ones.
         slow: see the module; None: the default share.
-        cut_slow: learn nothing from rows of standing joints.
+        cut_slow: exclude rows of standing joints from training.
         gain_pair: recordings that identify the drive gains.
-        accept: findings that do not count against the model, see `FINDINGS`.
+        accept: findings that do not affect the verdict on the model, see `FINDINGS`.
         source: the file, for messages.
     """
 
@@ -204,7 +204,7 @@ class IdentifyOptions:
     source: str = ""
 
     def file_settings(self, path: str | Path) -> FileSettings:
-        """Return the settings of a recording, maybe with a cut, whose torques are those the model's rows explain."""
+        """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
         found = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
         return replace(
@@ -216,27 +216,27 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     """Read the options file at `path`; the defaults without one.
 
     Raises:
-        UsageError: for a file that is missing or no TOML, an unknown key, or a value that a key cannot have.
+        UsageError: for a missing file, invalid TOML, an unknown key, or an invalid value.
     """
     return IdentifyOptions() if path is None else parse_options(read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
-    """Return the options that a parsed TOML table holds; `source` is for messages."""
+    """Return the options in a parsed TOML table; `source` names the file in messages."""
     own = {key: table[key] for key in ("payload",) if key in table}  # bodies; in [files] their labels: not handed down
     rest = inherited({key: value for key, value in table.items() if key not in own}, FileSettings)
     return options_of(parse(IdentifySettings, rest | own, source), source)
 
 
 def options_of(read: IdentifySettings, source: str = "settings") -> IdentifyOptions:
-    """Return the options that settings come to.
+    """Return the options of an identification from the keys of an options file.
 
     Args:
         read: the keys of an options file.
-        source: names it in complaints.
+        source: name of the file in messages.
 
     Raises:
-        UsageError: for a term that cannot be, or a file's payload that is none.
+        UsageError: for an invalid term, or an unknown payload of a file.
     """
     settings = IdentificationSettings(
         **{key.name: getattr(read, key.name) for key in fields(Choices)}, sets=read.drives, torque_rows=ROWS[read.rows],

@@ -1,4 +1,4 @@
-"""An identified model in a folder: ``robot.toml`` holds the geometry, ``dynamics.json`` the numbers.
+"""Files of an identified model: ``robot.toml`` with the geometry, ``dynamics.json`` with the parameters.
 
 ``estimate.csv`` has one row per parameter that was estimated, ``covariance.csv`` their covariance (a header, then one
 row per parameter, each beginning with its name): base parameters in the order of the model's columns, then richer
@@ -59,11 +59,11 @@ from calib.robot.chain import Chain
 from calib.units import TORQUE, per_ampere, without_gains
 
 MODEL = "dynamics.json"
-NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
+NOTE = "regrouped parameters have base values, the others zero: torques are right, single parameters not always"
 
 
 def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
-    """Return the robot and the model that an identification left in `folder`.
+    """Return the robot and the identified model in `folder`.
 
     Raises:
         RobotError: where the folder holds none, or the two files do not belong together.
@@ -78,7 +78,7 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
 
 
 def read_table(folder: Path) -> dict[str, Any]:
-    """Return the content of ``dynamics.json``, for `from_table`.
+    """Return the content of ``dynamics.json`` as a table for `from_table`.
 
     Raises:
         RobotError: where the folder holds none.
@@ -86,16 +86,16 @@ def read_table(folder: Path) -> dict[str, Any]:
     with refused_as(
         RobotError,
         (OSError, UnicodeDecodeError, json.JSONDecodeError),
-        f"{folder} holds no identified model (dynamics.json): {{}}; give the folder of an identification",
+        f"{folder} contains no identified model (dynamics.json): {{}}; give the folder of an identification",
     ):
         found = json.loads((folder / MODEL).read_text(encoding="utf-8"))
     if not isinstance(found, dict):
-        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it holds no table")
+        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it contains no table")
     return found
 
 
 def refuse_currents(folder: Path, task: str) -> None:
-    """Refuse a model in amperes (of currents without gains) for a task that needs torques.
+    """Raise an error for a model in amperes (identified from currents without gains) if a task needs torques.
 
     Raises:
         UsageError: for a model whose unit is not newton metres.
@@ -112,7 +112,7 @@ def refuse_currents(folder: Path, task: str) -> None:
 
 
 def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
-    """Return names and covariance (p, p) of the estimated parameters; None where the folder has none.
+    """Return names and covariance (p, p) of the estimated parameters; None without the file.
 
     Raises:
         RobotError: where the file is damaged.
@@ -121,7 +121,7 @@ def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
 
 
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
-    """Return the model as what JSON can hold; `unit` is that of its torques."""
+    """Return the model as a table for JSON; `unit`: that of its torques."""
     model = dynamics.model
     bodies = model.inertial
     payloads = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
@@ -156,7 +156,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
 
 
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
-    """Return the model of a table that `to_table` made, on the chain it was made for."""
+    """Return the model from a table of `to_table`, on the chain of that model."""
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)

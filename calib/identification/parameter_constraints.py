@@ -1,4 +1,4 @@
-"""What parameters must satisfy, by the names of files, and an estimate held to it: the PC methods' common part.
+"""Constraints on parameters by name, and constrained estimates: the common part of the PC methods.
 
 A row is lower <= aᵀ β <= upper over the columns that are estimated. A standard parameter, or a weighted sum of several,
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
@@ -45,7 +45,7 @@ def _in_order(value: Any) -> Any:
 @strict
 @dataclass(frozen=True)
 class WeightedSum:
-    """A weighted sum of parameters, and what it must be: `equal`, or not below `least`, not above `most`."""
+    """A constraint on a weighted sum of parameters: `equal`, or at least `least` and at most `most`."""
 
     weights: Mapping[str, float]
     least: float | None = None
@@ -55,28 +55,28 @@ class WeightedSum:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lower and upper bound; infinite where there is none."""
+        """Lower and upper bound; infinite if not stated."""
         low, high = (self.least, self.most) if self.equal is None else (self.equal, self.equal)
         return -np.inf if low is None else low, np.inf if high is None else high
 
 
 Bounds = Annotated[
     tuple[Annotated[float, Real(infinite=True)], Annotated[float, Real(infinite=True)]],
-    Expect("two numbers, [lower, upper]; -inf and inf leave one out"), Checked(_in_order),
+    Expect("two numbers, [lower, upper]; -inf or inf for no bound"), Checked(_in_order),
 ]  # fmt: skip
 
 
 @strict
 @dataclass(frozen=True)
 class ConstraintSettings:
-    """Table [constraints] of the options file; without it the PC methods take its defaults.
+    """Table [constraints] of the options file; without it the PC methods use its defaults.
 
     Attributes:
-        signs: drives' inertia and friction are not negative.
-        inertia: number of random postures in which M(q) is positive definite; 0: none.
-        bodies: the parameters are those of bodies that can exist, in place of `inertia`.
-        bounds: name of a parameter → [lower, upper]; both alike fix it.
-        sum: weighted sums of parameters.
+        signs: inertia and friction of drives must not be negative.
+        inertia: number of random postures in which M(q) must be positive definite; 0: none.
+        bodies: bodies must be physically consistent; replaces `inertia`.
+        bounds: name of a parameter → [lower, upper]; equal bounds fix it.
+        sum: constraints on weighted sums of parameters.
     """
 
     signs: Flag = True
@@ -88,16 +88,16 @@ class ConstraintSettings:
 
 @dataclass(frozen=True, eq=False)
 class Constraints(Frozen):
-    """What p columns must satisfy.
+    """Constraints on p columns.
 
     Attributes:
-        names: c, of the rows, as a user reads them.
-        matrix, lower, upper: (c, p), (c,), (c,).
+        names: c names of the constraints, for users.
+        matrix, lower, upper: (c, p), (c,), (c,), linear constraints lower <= matrix β <= upper.
         inertia: (K, n, n, p), M(q_k; β) = inertia[k] β.
-        cone: of bodies that can exist; None where that is not asked.
-        plane: name of the row that stands for the cone (`touched`); empty where none does.
-        least: of the smallest eigenvalue of S M(q) S, see `raised`.
-        likely: indices of the postures that held the estimate of a problem much like the next.
+        cone: of physically consistent bodies; None if not requested.
+        plane: name of the row that replaces the cone (`touched`); empty without one.
+        least: lower bound of the smallest eigenvalue of S M(q) S, see `raised`.
+        likely: indices of the postures whose constraint was binding in a similar problem.
     """
 
     names: tuple[str, ...]
@@ -114,14 +114,14 @@ class Constraints(Frozen):
         """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.constrained.within`.
 
         Raises:
-            NotConverged: with the last β, where no robot of definite inertia satisfies the others.
+            NotConverged: with the last β, if no positive definite inertia satisfies the other constraints.
         """
         if self.cone is not None:
             return self.touched(factor).solve(factor)
         p = len(factor) - 1
         free = np.linalg.solve(factor[:p, :p], factor[:p, p])
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
-        with _unsatisfied(f"no estimate satisfies {self} with {postures}: take bounds back, or record other motion"):
+        with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
             wanted = _definite(self.inertia, free, self.least, self.likely)
             return within(factor, self.matrix, self.lower, self.upper, wanted)
 
@@ -129,7 +129,7 @@ class Constraints(Frozen):
         return "; ".join(self.names) or "them"
 
     def raised(self) -> Constraints | None:
-        """Return these with M(q) three times as far from singular, None where it already is by `MAX_EIGENVALUE`.
+        """Return these constraints with M(q) three times as far from singular; None beyond `MAX_EIGENVALUE`.
 
         A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
         """
@@ -137,14 +137,14 @@ class Constraints(Frozen):
         return replace(self, least=least) if len(self.inertia) and least <= MAX_EIGENVALUE else None
 
     def touched(self, factor: np.ndarray) -> Constraints:
-        """Return these constraints with the cone of bodies replaced by the plane that holds the optimum of `factor`.
+        """Return these constraints with the cone of bodies replaced by its tangent plane at the optimum of `factor`.
 
         Raises:
-            NotConverged: where no bodies that can exist satisfy the others.
+            NotConverged: where no physically consistent bodies satisfy the other constraints.
         """
         if self.cone is None:
             return self
-        with _unsatisfied(f"no bodies that can exist satisfy {self}: take bounds back"):
+        with _unsatisfied(f"no bodies that can exist satisfy {self}: remove bounds"):
             plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
         if plane is None:
             return replace(self, cone=None)
@@ -157,7 +157,7 @@ class Constraints(Frozen):
 
 @contextmanager
 def _unsatisfied(words: str) -> Iterator[None]:
-    """Add `words`, the reason, to a `NotConverged` raised inside."""
+    """Prefix a `NotConverged` raised inside with `words`, the reason."""
     try:
         yield
     except NotConverged as error:
@@ -166,15 +166,15 @@ def _unsatisfied(words: str) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Binding:
-    """A constraint that holds an estimate.
+    """A constraint that is binding at an estimate.
 
     Attributes:
-        name: of the constraint.
-        multiplier: μ, slope of ½ ‖R β - z‖² against the bound; of an equality with either sign.
-        free: aᵀ β of the data alone, with its standard deviation; NaN for M(q).
-        sigma: see `free`.
-        bound: where it is held.
-        equality: whether it was asked to be there.
+        name: name of the constraint.
+        multiplier: μ, slope of ½ ‖R β - z‖² against the bound; of either sign for an equality.
+        free: aᵀ β of the unconstrained estimate; NaN for M(q).
+        sigma: standard deviation of `free`.
+        bound: value of the binding bound.
+        equality: whether it is an equality constraint.
     """
 
     name: str
@@ -185,7 +185,7 @@ class Binding:
     equality: bool
 
     def findings(self, plane: str) -> list[Finding]:
-        """Return what a user should know of it; `plane`: name of the one that stands for bodies that can exist."""
+        """Return the findings on this constraint; `plane`: name of the one that replaces the cone of bodies."""
         sigmas = abs(self.free - self.bound) / max(self.sigma, 1e-300)
         max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is named (our choice)
         if self.name == plane:
@@ -201,11 +201,11 @@ class Held:
     """A constrained estimate with the unconstrained one.
 
     Attributes:
-        constraints: that were asked, bodies that can exist as a plane.
+        constraints: the requested constraints, the cone of bodies as a plane.
         solution: the optimum with its multipliers.
-        binding: those that hold it.
+        binding: constraints that are binding.
         tight: indices of the postures in which M(q) is on its bound.
-        free: the free estimate.
+        free: the unconstrained estimate.
     """
 
     constraints: Constraints
@@ -220,7 +220,7 @@ class Held:
         return len(self.tight)
 
     def findings(self) -> list[Finding]:
-        """Return what a user should know of constraints that hold the estimate."""
+        """Return the findings on binding constraints."""
         found = [one for each in self.binding for one in each.findings(self.constraints.plane)]
         if self.postures:
             found.append(finding("held-definite", postures=self.postures))
@@ -236,14 +236,14 @@ def make_constraints(
     names: Sequence[str],
     terms: Sequence[DriveTerm | None],
 ) -> Constraints:
-    """Return what the settings ask of the columns of an estimate.
+    """Return the constraints on an estimate's columns that the settings request.
 
     Args:
-        names: (p,) of the columns: those of the base, then richer friction.
-        terms: (p,) the drive term behind each column; None for parameters of bodies.
+        names: (p,) names of the columns: base columns, then richer friction.
+        terms: (p,) drive term of each column; None for parameters of bodies.
 
     Raises:
-        UsageError: for a name that is none, a bound without effect on the torques, bounds that contradict each other.
+        UsageError: for an unknown name, a bound without effect on the torques, or contradicting bounds.
     """
     asked: list[tuple[str, Mapping[str, float], float, float]]
     asked = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
@@ -251,7 +251,7 @@ def make_constraints(
         place, (low, high) = f"[[constraints.sum]] number {number}", one.limits
         named = one.name or " + ".join(f"{weight:g} {name}" for name, weight in one.weights.items())
         twice = one.equal is not None and (one.least, one.most) != (None, None)
-        require(not twice, f"{place}: 'equal' goes without 'least' and 'most'", UsageError)
+        require(not twice, f"{place}: 'equal' excludes 'least' and 'most'", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
             refuse_option(f"{place} ({named})", "expected equal, or least <= most")
         asked.append((named, one.weights, low, high))
@@ -265,8 +265,7 @@ def make_constraints(
     if against:
         named = "; ".join(words[k] for k in against)
         refuse_option(
-            "[constraints] contradict each other",
-            f"{named}: no estimate satisfies them together; take one of them back",
+            "[constraints] contradict each other", f"{named}: no estimate satisfies them together; remove one of them"
         )
     cone = cone_of(model, base) if settings.bodies and model.inertial else None
     inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
@@ -276,7 +275,7 @@ def make_constraints(
 def hold(
     fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated: bool
 ) -> tuple[LinearFit, Held]:
-    """Return a fit under constraints, its covariance with those that bind taken as equalities, and what binds.
+    """Return a fit under constraints, its covariance with binding ones as equalities, and the binding constraints.
 
     Args:
         fit: the free estimate.
@@ -303,7 +302,7 @@ def hold(
 
 
 def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> Held:
-    """Return the constraints that bind; multipliers come as `within` orders them."""
+    """Return the binding constraints from multipliers in the order of `within`."""
     same = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~same)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~same)
@@ -332,10 +331,10 @@ def _words(name: str, low: float, high: float) -> str:
 
 
 def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.ndarray:
-    """Return a (p,) of a weighted sum of columns and standard parameters.
+    """Return the row a (p,) of a weighted sum of columns and standard parameters.
 
     Raises:
-        UsageError: where the torques do not depend on the sum alone.
+        UsageError: where the torques do not identify the sum.
     """
     row, standard = np.zeros(len(names)), np.zeros(len(base.standard))
     for name, weight in weights.items():
@@ -345,21 +344,21 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
             standard[base.standard.index(name)] += weight
         else:
             similar = suggestion(name, (*names, *base.standard))
-            words = f"'{name}' is no parameter of this model{similar}; it estimates {', '.join(names)}"
+            words = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
             refuse_option("[constraints]", words)
     own = standard[base.kept]  # T of the kept columns is the identity
     if np.abs(base.transform.T @ own - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
     row[: base.b] += own
-    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} add to nothing", UsageError)
+    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
     return row
 
 
 def _without_effect(weights: Mapping[str, float], base: Base) -> str:
-    """Say why a sum of standard parameters cannot be constrained."""
+    """Return the reason why a sum of standard parameters cannot be constrained."""
     silent = [name for name in weights if name in base.without_effect]
     if silent:
-        return f"{', '.join(silent)} has no effect on the torques of this robot: leave the bound out"
+        return f"{', '.join(silent)} has no effect on the torques of this robot: remove the bound"
     lines = bases.expressions(base)
     parts = [line for line in lines if any(name in line.replace("=", " ").split() for name in weights)]
     sums = "; ".join(parts[:4])
@@ -367,7 +366,7 @@ def _without_effect(weights: Mapping[str, float], base: Base) -> str:
 
 
 def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p: int) -> np.ndarray:
-    """Return the tensor (K, n, n, p) of inertia matrices over random postures, each column that of an acceleration."""
+    """Return the tensor (K, n, n, p) of M(q_k) over random postures, linear in the parameters: M(q_k) = tensor[k] β."""
     if not settings.inertia or not model.inertial or model.rows != model.n:
         return np.zeros((0, model.n, model.n, p))
     q = bases.random_samples(model, settings.inertia).q

@@ -156,7 +156,7 @@ def test_the_controller_may_be_read_from_the_log(robot, tmp_path, capsys):
     assert code == 0 and min(read["controller_explains_percent"]) > 80.0
     np.testing.assert_allclose(read["controller"]["kp"], KP, rtol=0.1)
     np.testing.assert_allclose(read["controller"]["kd"], KD, rtol=0.3)
-    assert "controller read from train.csv" in capsys.readouterr().out
+    assert "controller identified from train.csv" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["csv", pytest.param("npz", marks=pytest.mark.slow)])
@@ -183,15 +183,15 @@ def test_wrong_gains_are_noticed(robot, tmp_path, capsys):
 
 
 REFUSED = [
-    ({"form": ""}, GAINS, "holds no reference"),
-    ({"factor": 180.0 / np.pi}, GAINS, "looks like deg"),
-    ({"factor": 3.0}, GAINS, "is this the reference of this recording"),
+    ({"form": ""}, GAINS, "has no reference positions"),
+    ({"factor": 180.0 / np.pi}, GAINS, "probably in deg"),
+    ({"factor": 3.0}, GAINS, "check that the reference belongs to this recording"),
     ({}, GAINS.replace("rate = 1000", "rate = 100"), "is below 250 Hz"),
     ({}, 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "2 values for 3 joints"),
     ({}, 'controller = "pd"\nkp = [1]\n', "needs kp and kd"),
     ({}, 'controller = "pid"\n', "one of pd, cascade, identify"),
     ({}, GAINS + "reset = 1.0\n", "belongs to controller 'cascade'"),
-    ({}, "kp = [1]\n", "there is no 'controller'"),
+    ({}, "kp = [1]\n", "'controller' is missing"),
     ({}, GAINS + 'reference = "nowhere.csv"\n', "cannot be read"),
     ({}, GAINS + 'reference = "short.csv"\n', "do not span"),
     ({}, GAINS + 'feedforward = "recording"\n', "no column tau_ff"),

@@ -44,7 +44,7 @@ def test_the_estimate_is_that_of_a_chain(method):
 
 def test_what_only_a_chain_has_is_asked_for():
     model, cases = Other(planted.model()), [planted.case("a", 0)]
-    with pytest.raises(UsageError, match="holds no masses"):
+    with pytest.raises(UsageError, match="states no masses"):
         identify_model(model, cases, IdentificationSettings(prior="cad"))
     loop = IdentificationSettings(method="didim", loop=LoopSettings("pd", (100.0,), (10.0,)))
     with pytest.raises(CalibError, match="can be simulated"):

@@ -1,4 +1,4 @@
-"""Whether a recording holds the designed motion, what it holds otherwise, and whether its torques fit nominal masses.
+"""Checks of a recording: does it contain the designed motion, or which other one, and do its torques fit the masses?
 
 Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions. What quick
 looks at torques share stands here, too: a few samples of a recording, and how much columns explain of its torques.
@@ -30,7 +30,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 class DesignedMotion(Protocol):
-    """A periodic motion of n joints: its period [s], and position, velocity and acceleration at times (N,)."""
+    """A periodic motion of n joints: its period [s], and a function of times (N,) that returns q, v and a."""
 
     @property
     def period(self) -> float: ...
@@ -43,11 +43,11 @@ class LocatedMotion:
     """A designed motion found in a recording.
 
     Attributes:
-        start, stop: the whole repetitions with a short rim [s], in the recording's time.
-        periods: how many.
+        start, stop: of the complete repetitions with a short margin [s], in the recording's time.
+        periods: number of complete repetitions.
         tracking: (n,) rms of recorded minus designed positions [rad or m].
-        likeness: least share of the motion's variance that a recorded period explains.
-        loosest: index of the joint that tracks worst, measured by its own travel.
+        likeness: smallest share of the motion's variance that a recorded period explains.
+        loosest: index of the joint with the largest tracking error relative to its travel.
     """
 
     start: float
@@ -59,7 +59,7 @@ class LocatedMotion:
 
 
 def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None:
-    """Find the repetitions of a designed motion in a recording; None where there are none."""
+    """Return the repetitions of a designed motion in a recording; None if it contains none."""
     grid, q = _on_grid(recording)
     reference = _one_period(motion)
     found = _found(q, reference)
@@ -77,7 +77,7 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
 
 
 def another_motion(recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]) -> Change | None:
-    """Find what a recording without the designed motion holds instead; None where nothing that is tried explains it.
+    """Return what a recording contains instead of the designed motion; None if no tested change explains it.
 
     Args:
         recording: of n joints.
@@ -114,7 +114,7 @@ def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _coarse(t: np.ndarray, max_gap: float = 60.0) -> np.ndarray:
-    """Return times every `STEP` over those of samples (N,) [s]; of longer gaps than `max_gap` the rest is left out.
+    """Return times every `STEP` over the sample times (N,) [s]; of a gap, only its first `max_gap` seconds are covered.
 
     `max_gap`: between samples that the grid bridges [s]; a log may go on after weeks.
     """
@@ -128,7 +128,7 @@ def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
-    """Return one period's positions every `STEP` or so, without the closing one, played at a share of the speed."""
+    """Return the positions of one period about every `STEP`, without the last, at `speed` times the designed speed."""
     count = round(motion.period / speed / STEP)
     return motion.orders(np.arange(count) * motion.period / count)[0]
 
@@ -142,13 +142,13 @@ def _found(q: np.ndarray, reference: np.ndarray, min_likeness: float = 0.9) -> R
 
 
 def _unlike(data: Pair) -> np.ndarray:
-    """Return the share (1,) of a motion's variance that no recorded period explains; 1 where it is not there."""
+    """Return the share (1,) of a motion's variance that no recorded period explains; 1 if the motion does not occur."""
     found = _found(*data)
     return np.array([1.0 if found is None else max(1.0 - min(found.likeness), 1e-9)])
 
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which recorded column (n,) moves most like each joint, and with which sign (n,), at any shift."""
+    """Return the recorded column (n,) and sign (n,) that correlate best with each joint's motion, over all shifts."""
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
     for j in range(n):
@@ -165,7 +165,7 @@ def share_of_nominal(
     t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
     static: bool = False,
 ) -> np.ndarray:  # fmt: skip
-    """Compare recorded torques with those of the nominal masses, friction left free.
+    """Return recorded gravity torques over those of the nominal masses (n,), with friction estimated.
 
     Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
     rigid-body torque is more than `min_torque` of its limit and the partial correlation of both torques is above
@@ -208,7 +208,7 @@ def share_of_nominal(
 
 
 def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndarray:
-    """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window.
+    """Return values (N, n) of the coarse grid, or their derivatives, smoothed by cubics over a moving window.
 
     `half_width`: half width of the window for derivatives, in steps of the coarse grid.
     """
@@ -220,10 +220,10 @@ class MotionSamples:
     """N samples of a motion of n joints.
 
     Attributes:
-        index: (N,) which of the motion's.
+        index: (N,) indices of the samples in the motion.
         q, v, a: (N, n).
         effort: torques of the whole motion, smoothed; velocity: of the whole motion.
-        bodies: of the robot.
+        bodies: rigid bodies of the robot.
     """
 
     index: np.ndarray
@@ -236,23 +236,23 @@ class MotionSamples:
 
     @property
     def torque(self) -> np.ndarray:
-        """(N, n)."""
+        """Torques (N, n), smoothed."""
         return self.effort[self.index]
 
     @cached_property
     def inertial(self) -> np.ndarray:
-        """(N, n, 10 B) columns of the bodies."""
+        """Regressor of the bodies (N, n, 10 B)."""
         return regressor(self.bodies, self.q, self.v, self.a).reshape(*self.q.shape, -1)
 
     @cached_property
     def at_rest(self) -> np.ndarray:
-        """(N, n, 10 B) columns of the bodies where they stand: of gravity alone."""
+        """Regressor of the bodies at rest (N, n, 10 B): gravity alone."""
         still = np.zeros_like(self.v)
         return regressor(self.bodies, self.q, still, still).reshape(*self.q.shape, -1)
 
     @cached_property
     def drives(self) -> np.ndarray:
-        """(N, n, 4 n) columns of Ia, Fv, Fc, off of each joint."""
+        """Regressor of the drives (N, n, 4 n): Ia, Fv, Fc and off of each joint."""
         m, n = self.q.shape
         found, joints = np.zeros((m, n, n, 4)), np.arange(n)
         found[:, joints, joints] = drive_columns(self.v, self.a)
@@ -260,7 +260,7 @@ class MotionSamples:
 
 
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
-    """Return some `count` samples of a recording of the motors' torques; None where too few are left."""
+    """Return about `count` samples of a recording of motor torques; None if too few are usable."""
     motion, n = case.motion, case.motion.n
     # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
     edge_time = 0.3
@@ -277,12 +277,12 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
 
 
 def drive_columns(v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return a, v, sign(v) smoothed, and ones, for velocities and accelerations (...): (..., 4)."""
+    """Return the drive columns (..., 4) of velocities and accelerations (...): a, v, smoothed sign(v), and 1."""
     return np.stack([a, v, np.tanh(v / CREEP), np.ones_like(v)], axis=-1)
 
 
 def basis(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (N, k) of what columns (N, p) span."""
+    """Return an orthonormal basis (N, k) of the column space of (N, p)."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 1e-9 * size.max()] / size[size > 1e-9 * size.max()]
     values, vectors = np.linalg.eigh(columns.T @ columns)
@@ -291,7 +291,7 @@ def basis(columns: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
-    """Return the moving average (N, n) over an odd number of samples, three at least."""
+    """Return the moving average (N, n) over an odd number of samples, at least three."""
     half = max(1, width // 2)
     padded = np.pad(values, ((half + 1, half), (0, 0)), mode="edge")
     total = np.cumsum(padded, axis=0)

@@ -1,4 +1,4 @@
-"""Can recordings be of this robot? Its own masses, its limits, signs, order and zeros of its joints, and its clock.
+"""Checks whether a recording belongs to a robot: masses, limits, joints' signs, order and zeros, and the clock.
 
 Numbers only; what they mean for a verdict is said in `calib.procedure.dynamic_stage.plausibility`. Everything is looked
 at on a few samples. All thresholds are our choice; on the real recordings at hand (Panda, KR300, LWR4+, TX40, TIAGo, 22
@@ -39,19 +39,19 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True)
 class ClockRatio:
-    """Inertias over masses, both beside those of rods between the joints, and the ratio's relative sigma."""
+    """Ratio of inertias to masses, relative to the ratio of rods between the joints, and its relative sigma."""
 
     ratio: float
     relative_sigma: float
 
     @property
     def clock(self) -> float:
-        """By how many times the stamps are too large."""
+        """Factor by which the time stamps are too large."""
         return float(np.sqrt(self.ratio))
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
-    """Return how large inertias are compared with masses; None where neither motion nor arm identify both.
+    """Return the ratio of inertias to masses; None where the motion or the arm does not identify both.
 
     Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
     gravity beside any torque of motion; drives free in both.
@@ -70,7 +70,7 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
 
 
 def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: int = 3) -> tuple[float, float]:
-    """Return α of τ = α common + free x and its sigma, joints weighed by what is left of them.
+    """Return α of τ = α common + free x and its sigma, each joint weighted by its residual.
 
     `rounds`: of weighing joints by what is left of them.
     """
@@ -93,7 +93,7 @@ def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: in
 
 
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
-    """Return joints whose torques have the opposite sign, or that count from the joint before; None without such.
+    """Return the joints with reversed torques, or with positions relative to another joint's; None if all are right.
 
     One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
     negative, since no drive brakes backwards. The robot's own masses need not be known. What is left are shares of the
@@ -119,7 +119,7 @@ def wrong_joints(samples: MotionSamples) -> Explanation | None:
 
 
 def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function that says what a model leaves of each joint's torque (n,), its variance being 1, by signs."""
+    """Return a function of the torques' signs (n,) to the unexplained share of each joint's torque variance (n,)."""
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
@@ -142,7 +142,7 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints, or the right angles at one's zero, that explain most more; None without such.
+    """Return the exchange of two joints, or shift of one's zero, that explains the torques best; None if none helps.
 
     The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
     """
@@ -169,13 +169,13 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
 
 
 def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
-    """Return samples with the joints' columns recombined by a matrix (n, n)."""
+    """Return samples with the joints' positions, velocities and accelerations multiplied by a matrix (n, n)."""
     q, v, a = (np.ascontiguousarray(x @ matrix.T) for x in (samples.q, samples.v, samples.a))
     return replace(samples, q=q, v=v, a=a)
 
 
 def _left(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
-    """Return what is left of each joint's torque (n,), as a share of its variance.
+    """Return the unexplained share of each joint's torque variance (n,).
 
     Each torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive and
     those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
@@ -196,22 +196,22 @@ FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are 
 
 @dataclass(frozen=True)
 class RecordingSizes:
-    """A recording beside the robot it is said to be of.
+    """Comparison of a recording with its stated robot.
 
     Attributes:
-        name: of the case.
-        masses: (n,) recorded torque of gravity over that of the robot's own masses; NaN where a joint says nothing.
-        limits: (n,) torques over the joints' limits, without the largest per cent of them; NaN where none is known.
-        speed: (n,) measured velocities over the slopes of the positions; NaN where there are none, or no travel, or
-            where the ones do not follow the others.
-        speed_sigma: (n,) its sigma.
-        follows: (n,) correlation of the measured velocities' integrals with the positions; NaN as `speed`.
-        counted: whether the samples are dated by the measured velocities.
-        rate: of the samples, by their dates [Hz].
-        lag: of the torques; None where the recording is too short to estimate it.
-        clock: inertias beside masses; None where the motion does not identify it.
-        other: change of the columns with which the masses explain more; None where none does, or is looked for.
-        jumps: of positions, in words.
+        name: name of the case.
+        masses: (n,) recorded gravity torque over that of the nominal masses; NaN where a joint does not identify it.
+        limits: (n,) torques over the joints' limits, without the largest 1 % of them; NaN where no limit is known.
+        speed: (n,) measured velocities over the slopes of the positions; NaN without velocities or travel, or
+            where the two are not correlated.
+        speed_sigma: (n,) sigma of `speed`.
+        follows: (n,) correlation of the measured velocities' integrals with the positions; NaN without travel.
+        counted: whether the samples' times are computed from the measured velocities.
+        rate: sampling rate, by the samples' times [Hz].
+        lag: lag of the torques; None where the recording is too short to estimate it.
+        clock: ratio of inertias to masses; None where the motion does not identify it.
+        other: change of the columns with which the masses explain more; None if no change does, or none was tested.
+        jumps: text on jumps of the positions.
     """
 
     name: str
@@ -231,7 +231,7 @@ class RecordingSizes:
 def compare_sizes(
     case: Case, chain: Chain, gravity: Sequence[float] | None = None, newtons: bool = True
 ) -> RecordingSizes:
-    """Hold a recording of the motors' torques against its robot.
+    """Compare a recording of the motors' torques with its robot.
 
     Args:
         case: a recording.
@@ -263,7 +263,7 @@ def compare_sizes(
 
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
-    """Return which joints have torques of the wrong sign, or count from another joint; arguments as `compare_sizes`."""
+    """Return joints with reversed torques, or positions relative to another joint's; see `compare_sizes`."""
     few = take_samples(case, _under(chain, gravity), MAX_SAMPLES)
     return None if few is None else wrong_joints(few)
 
@@ -271,7 +271,7 @@ def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -
 def _speed_ratio(
     t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n,) measured velocities over the slopes of the positions (N, n), the sigmas, and how alike they are.
+    """Return (n,) ratios of measured velocities to slopes of the positions (N, n), their sigmas, and the correlations.
 
     That is ∫v dt on q, both without their trend: integrals compare where slopes are noise; each segment (N,) by itself,
     since nobody knows the speed in a gap. Of a short motion little is left beside its trend, while an error of the

@@ -1,4 +1,4 @@
-"""By how much do torques come later than the positions of their row? A clock is everybody's; a joint may be late alone.
+"""Lag of the recorded torques behind the positions of the same row: common to all joints, or of a single joint.
 
 One model of all joints is fitted at every lag that is tried: bodies shared by the joints, drives of each, and least
 squares weighed by what is left of each joint. Bodies of each joint's own bend after a late torque: they find 148 ms
@@ -24,15 +24,15 @@ ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and t
 
 @dataclass(frozen=True)
 class Lag:
-    """By how much torques come later than the positions of their row [s], and what that explains.
+    """Lag of the torques behind the positions of the same row [s], and the improvement by correcting it.
 
     Attributes:
-        sigma: of `seconds` [s].
-        before, after: rms share of the joints' torques that bodies and friction leave: as recorded, shifted.
-        factor: what is left as recorded over what is left shifted, joints weighed by what is left of them.
-        own: (n,) lags of the joints, each for itself [s].
-        gains: (n,) what is left of a joint at the common lag over what is left at its own, the others at theirs.
-        joint: the one, from 0, with a lag of its own as no other has, in both halves of the recording; None without.
+        sigma: standard deviation of `seconds` [s].
+        before, after: rms share of the joints' torques unexplained by bodies and friction: as recorded, shifted.
+        factor: residual as recorded over residual after shifting, each joint weighted by its residual.
+        own: (n,) lags of the joints, each estimated separately [s].
+        gains: (n,) residual of a joint at the common lag over that at its separate lag, the others at theirs.
+        joint: the only joint, from 0, whose lag differs, in both halves of the recording; None if no joint does.
     """
 
     seconds: float
@@ -46,7 +46,7 @@ class Lag:
 
     @property
     def certain(self) -> bool:
-        """Whether all torques come late, surely, and by enough."""
+        """Whether the lag of all torques is significant and large enough to report."""
         least = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
         # and what is left without it over what is left with it: of another robot any lag may be the best
         min_gain = 1.05
@@ -72,7 +72,7 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
 
 
 def _alone(whole: Lag, halves: Sequence[Lag], max_lag_difference: float = 0.5) -> int | None:
-    """Return the joint with a lag of its own as no other has, in the whole and alike in its halves; None without.
+    """Return the only joint whose lag differs, in the whole recording and in both halves; None if no joint does.
 
     `max_lag_difference`: share of that lag by which those of both halves may differ from it.
     """
@@ -93,7 +93,7 @@ def _part(samples: MotionSamples, part: slice) -> MotionSamples:
 
 
 def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:
-    """Return the lag of least squares, its sigma by the joints' votes.
+    """Return the least-squares lag, with a sigma from the spread between joints.
 
     `rounds`: of weighing joints by what is left of them.
 
@@ -129,32 +129,32 @@ def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: flo
 
 
 class _Fit:
-    """Least squares of the joints' torques at any lags: projections at every lag, so that sums of them are cheap."""
+    """Least squares of the joints' torques at any lags: projections at every lag are computed once."""
 
     def __init__(self, columns: np.ndarray, torque: np.ndarray, weight: np.ndarray) -> None:
-        """Project torques (n, shifts, m), weighed (n,), on columns (n, m, p) of all joints."""
+        """Project torques (n, shifts, m), weighted (n,), onto the columns (n, m, p) of all joints."""
         n, m, p = columns.shape
         self.weight, self.torque = weight, torque * weight[:, None, None]
         self.basis = basis((columns * weight[:, None, None]).reshape(n * m, p)).reshape(n, m, -1)
         self.parts = np.matmul(self.torque, self.basis)  # (n, shifts, k)
         self.power = (self.torque**2).sum(axis=2)
         self.common = self.power.sum(axis=0) - (self.parts.sum(axis=0) ** 2).sum(axis=1)
-        """(shifts,) what is left where all joints have one lag."""
+        """(shifts,) squared residual where all joints have the same lag."""
 
     def left(self, places: np.ndarray) -> np.ndarray:
-        """Return (n, m) what is left of the weighed torques at the joints' lags (n,)."""
+        """Return the residuals (n, m) of the weighted torques at the joints' lags (n,)."""
         rows = np.arange(len(places))
         return self.torque[rows, places] - self.basis @ self.parts[rows, places].sum(axis=0)
 
     def along(self, places: np.ndarray, joint: int) -> np.ndarray:
-        """Return (shifts,) what is left in all where one joint's lag varies and the others keep theirs (n,)."""
+        """Return the squared residual of all joints (shifts,) over one joint's lag; the other lags (n,) stay fixed."""
         others = np.flatnonzero(np.arange(len(places)) != joint)
         fixed = self.parts[others, places[others]].sum(axis=0)
         explained = ((fixed + self.parts[joint]) ** 2).sum(axis=1)
         return np.asarray(self.power[others, places[others]].sum() + self.power[joint] - explained)
 
     def own(self, places: np.ndarray) -> np.ndarray:
-        """Return (n,) the lags of least squares of the joints, each for itself, from the given ones on."""
+        """Return the separate least-squares lags of the joints (n,), starting from the given ones."""
         places = places.copy()
         max_sweeps = 30  # over the joints' own lags
         for _ in range(max_sweeps):
@@ -166,12 +166,12 @@ class _Fit:
         return places
 
     def gain(self, places: np.ndarray, joint: int, common: int) -> float:
-        """Return what is left with a joint at the common lag over what is left at its own (n,), by its own torque."""
+        """Return the residual of a joint at the common lag over that at its separate one; `places` (n,): all lags."""
         along, own = self.along(places, joint), float((self.left(places)[joint] ** 2).sum())
         return float(np.sqrt(1.0 + max(along[common] - along[places[joint]], 0.0) / max(own, 1e-300)))
 
     def sigma(self, at: int) -> float:
-        """Return the sigma of the common lag at place `at` [s]: each joint's vote is one draw."""
+        """Return the sigma of the common lag at index `at` [s], each joint counted as one independent sample."""
         inner = int(np.clip(at, 1, self.torque.shape[1] - 2))
         slope = (self.torque[:, inner + 1] - self.torque[:, inner - 1]) / (2.0 * STEP)
         slope = slope - self.basis @ np.einsum("jm,jmk->k", slope, self.basis)
@@ -181,7 +181,7 @@ class _Fit:
 
 
 def _turning(samples: MotionSamples, rate: float, free_time: float = 0.03) -> list[np.ndarray]:
-    """Return columns (m, n, n) of friction that turns over early, and late.
+    """Return friction columns (m, n, n) whose sign changes early, and late.
 
     `free_time`: by which friction may turn over early or late by itself [s].
     """
@@ -194,7 +194,7 @@ def _turning(samples: MotionSamples, rate: float, free_time: float = 0.03) -> li
 
 
 def _least(left: np.ndarray, at: int) -> float:
-    """Return where the parabola about the least place has its least, in places from it."""
+    """Return the minimum of a parabola through three points about index `at`, as an offset in indices."""
     if not 0 < at < len(left) - 1:
         return 0.0
     bend = left[at - 1] - 2.0 * left[at] + left[at + 1]

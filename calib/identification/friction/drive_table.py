@@ -1,4 +1,4 @@
-"""Drives as simulators and URDFs know them: one motor inertia, one viscous and one Coulomb coefficient per joint."""
+"""Drives as simulators and URDFs state them: one motor inertia, one viscous and one Coulomb coefficient per joint."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ PLAIN = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
 
 @dataclass(frozen=True, eq=False)
 class Drives:
-    """What of the drive terms fits a table, and what does not.
+    """Drive terms that fit a table, and those that do not.
 
     Attributes:
         values: (n, 4) armature [kg m² or kg], damping [N m s/rad or N s/m], friction, offset [N m or N].
-        left: names of terms that no such table holds: richer friction.
-        couplings: (c, 4) the same of motors that turn with two joints (`calib.dynamics.drives.coupled`).
-        pairs: (c,) their joints, from 0, and the weight of the second: 1 the sum, -1 the difference.
+        left: names of terms that do not fit the table: richer friction.
+        couplings: (c, 4) the same values for motors that turn with two joints (`calib.dynamics.drives.coupled`).
+        pairs: (c,) their joints, from 0, and the weight of the second: 1 for the sum, -1 for the difference.
         sigma: (n + c, 4) of all values; None where no covariance is known.
     """
 
@@ -30,7 +30,7 @@ class Drives:
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:
-    """Return an identified model without the terms that no such table holds."""
+    """Return an identified model without the terms that do not fit the table."""
     left, first = drive_table(dynamics).left, dynamics.model.inertial
     values = np.array(dynamics.values)
     values[[first + k for k, one in enumerate(dynamics.model.columns) if one.name in left]] = 0.0
@@ -38,7 +38,7 @@ def without_left(dynamics: Dynamics) -> Dynamics:
 
 
 def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Drives:
-    """Return the drive terms of an identified model by joint, those of motor and link side added.
+    """Return the drive parameters of an identified model by joint, motor side plus link side.
 
     Args:
         dynamics: the model.

@@ -1,4 +1,4 @@
-"""A ladder of friction, a forward selection, joint by joint, as far as unseen time rewards it.
+"""Forward selection of friction terms, step by step and joint by joint, by the errors on held-out time.
 
     standard → + coupling → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
 
@@ -42,16 +42,16 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class FrictionTrial:
-    """One step of the ladder, tried.
+    """Result of one tested step of the friction selection.
 
     Attributes:
         model: e.g. ``standard`` or ``+ load``.
-        parameters: of the model, all joints.
-        cross_validated_percent: relative error on unseen time, total over all rows [%].
+        parameters: number of parameters of the model, all joints.
+        cross_validated_percent: relative error on held-out time, over all rows [%].
         joints_percent: the same for each row [%].
-        kept_at_joints: joints, from 1, where it stays.
-        note: in words.
-        terms: names of those that stay.
+        kept_at_joints: joints, from 1, at which the step is kept.
+        note: remark on the step, as text.
+        terms: names of the terms that are kept.
     """
 
     model: str
@@ -64,16 +64,16 @@ class FrictionTrial:
 
     @stored
     def kept(self) -> bool:
-        """Whether it is part of the model."""
+        """Whether the step is part of the model."""
         return bool(self.kept_at_joints) or self.model == "standard"
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionSelection:
-    """Where forward selection ended: the terms taken, their ridge groups, and the steps tried.
+    """Result of forward selection: the selected terms, their ridge groups, and the tested steps.
 
     Attributes:
-        off: names of terms that the final fit's ridges hold at zero; their rows of ``covariance.csv`` hold the ridges'
+        off: names of terms that the final fit's ridges set to zero; their rows of ``covariance.csv`` state the ridges'
             floor, so that the model's other σ are those without them.
     """
 
@@ -83,7 +83,7 @@ class FrictionSelection:
     off: tuple[str, ...] = ()
 
     def fitted(self, sigma: np.ndarray) -> FrictionSelection:
-        """Return the selection after the final fit, by its terms' σ (k,): what that switched off is not kept."""
+        """Return the selection after the final fit, from its terms' σ (k,): terms switched off are no longer kept."""
         min_sigma = 1e-9  # σ of a term below which its ridge holds it at zero
         off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < min_sigma)
         joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
@@ -102,20 +102,20 @@ class FrictionSelection:
 
 @dataclass(frozen=True, eq=False)
 class FrictionCandidates:
-    """What forward selection of friction starts from.
+    """Input of the forward selection of friction.
 
     Attributes:
         cases: training recordings.
         rows: their rows in the base columns and standard drive terms, blocks numbered.
-        loads: transmitted torques of each case (N, n), by a first fit.
-        decimator: of the rows.
-        std, inflation: (rows,) of the first fit's residuals.
+        loads: torques transmitted by the gears of each case (N, n), from a first fit.
+        decimator: filter of the rows.
+        std, inflation: (rows,) standard deviation and variance inflation of the first fit's residuals.
         v0: (n,) smoothing of the Coulomb sign.
-        linear: (n,) prismatic joints.
-        apart: rows in a unit of their own, which no total holds.
-        prior: what is known of the base parameters; None for nothing.
-        torque_rows: which torques the rows are; those of the motors among them.
-        coupled: pairs of joints, from 0, whose coupling is part of the model already.
+        linear: (n,) which joints are prismatic.
+        apart: rows with a different unit, excluded from totals.
+        prior: prior of the base parameters; None without one.
+        torque_rows: kind of torques in the rows, motor torques included.
+        coupled: pairs of joints, from 0, whose coupling is already in the model.
     """
 
     cases: Sequence[Case]
@@ -139,7 +139,7 @@ class FrictionCandidates:
 def select_friction(
     candidates: FrictionCandidates, wanted: str = "auto", progress: Progress | None = None
 ) -> FrictionSelection:
-    """Return the friction terms that unseen time rewards, or those of a step by name.
+    """Return the friction terms that reduce the error on held-out time, or those of a named step.
 
     Args:
         wanted: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
@@ -183,10 +183,10 @@ def select_friction(
 
 @dataclass(frozen=True, eq=False)
 class _Bench:
-    """What judges terms: columns are numbered as in the validation, `every` offered term's behind the base's.
+    """Test of friction terms by cross-validation; the columns of all candidate terms, `every`, follow the base columns.
 
     Attributes:
-        forced: whether terms stay whatever they bring.
+        forced: whether terms are kept without a test.
     """
 
     candidates: FrictionCandidates
@@ -198,7 +198,7 @@ class _Bench:
         return self.every[column - self.validation.data.parameters]  # counted from behind
 
     def errors(self, taken: Sequence[int], folds: int | None = None) -> np.ndarray:
-        """Return the squared errors (blocks, rows) of a model with these columns behind the base's."""
+        """Return the squared errors (blocks, rows) of a model with the base columns and these columns."""
         return self.validation.errors(self._with_base(taken), folds)
 
     def _with_base(self, taken: Sequence[int]) -> np.ndarray:
@@ -207,7 +207,7 @@ class _Bench:
     def tried(
         self, taken: list[int], columns: list[int], error: np.ndarray
     ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
-        """Return the columns that stay, the errors with them, and their joints."""
+        """Return the columns that pass the test, the errors of the model with them, and their joints."""
         joints = {k: _joints(self.term(k)) for k in columns}
         everyone, side = tuple(sorted(set(joints.values()))), self.term(columns[0]).side
         if self.forced:
@@ -245,7 +245,7 @@ class _Bench:
         self, name: str, taken: Sequence[int], error: np.ndarray, at: tuple[int, ...], note: str = "",
         terms: tuple[str, ...] = (),
     ) -> FrictionTrial:  # fmt: skip
-        """Return the record of a model with these columns, its squared errors, and the joints where a step stays."""
+        """Return the result of a step from its columns, its squared errors, and the joints at which it is kept."""
         squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, self.validation.rows)
         size = squares[: self.validation.blocks].sum(axis=0)  # Σ τ² per row over the judged blocks
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -266,20 +266,20 @@ def _flat(at: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Say whether a joint's squared errors, one half of the time predicting the other, did not grow by `MIN_GAIN`."""
+    """Return whether a joint's rms error, each half of the time predicted by the other, grew by `MIN_GAIN` at most."""
     return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether a joint's squared errors in held-out regimes (k,) did not grow, in the geometric mean."""
+    """Return whether the geometric mean of a joint's squared errors in held-out regimes (k,) did not increase."""
     used = (before > 0.0) & (after > 0.0)
     return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
 
 
 def _pays(before: np.ndarray, after: np.ndarray, min_blocks_won: float = 0.6) -> bool:
-    """Say whether a joint's squared errors per block fell enough, and on enough blocks.
+    """Return whether a joint's squared errors per block decreased enough, and on enough blocks.
 
-    `min_blocks_won`: and on this share of the blocks.
+    `min_blocks_won`: smallest share of blocks with a smaller error.
     """
     used = before > 0.0
     if not used.any():
@@ -289,7 +289,7 @@ def _pays(before: np.ndarray, after: np.ndarray, min_blocks_won: float = 0.6) ->
 
 
 def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
-    """Return a step's terms of all joints."""
+    """Return the candidate terms of a step for all joints."""
     found: list[DriveTerm] = []
     if name == "coupling":
         return _couplings(candidates)
@@ -303,7 +303,7 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
 
 
 def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> list[DriveTerm]:
-    """Return the terms of couplings of neighbours that explain what the standard model leaves of both torques.
+    """Return coupling terms of neighbouring joints that explain both residual torques of the standard model.
 
     A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
 
@@ -339,7 +339,7 @@ def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> l
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return some `coupling_rows` rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
+    """Return about `coupling_rows` training rows, (M, n, b) and (M, n), and their motion q, v, a, (n, M) each."""
     parts = []
     for part, case in zip(candidates.rows, candidates.cases):
         own = kept(case.motion.segment, candidates.decimator)
@@ -354,7 +354,7 @@ def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, li
 def _cross_validation(
     candidates: FrictionCandidates, offered: dict[str, list[DriveTerm]], every: list[DriveTerm]
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
-    """Return the validation with all offered columns behind the base's, and where each step's stand."""
+    """Return the cross-validation of base and all candidate columns, and the column indices of each step."""
     rows = [
         part.extend(every, observe_terms(every, case, candidates.decimator, load, candidates.torque_rows))
         for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads)

@@ -1,4 +1,4 @@
-"""Friction takes energy out of a robot, at every joint: a model in which it does not belongs to no possible robot."""
+"""Passivity of friction: every joint's friction dissipates energy, or the model is physically inconsistent."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ MIN_ENERGY_SHARE = -0.01  # of the energy that a joint moves: noise and other co
 
 
 def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
-    """Return the energy that each joint's friction takes, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
+    """Return the energy dissipated by each joint's friction, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
 
     Joints that do not move have zero: noise moves none.
     """
@@ -39,7 +39,7 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
 
 
 def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarray:
-    """Return the rows A (c, p) of A x >= 0 under which friction of p columns brakes and motors' inertia is positive.
+    """Return the rows A (c, p) of A x >= 0: friction of the p columns dissipates and motor inertia is positive.
 
     With and without load apart: the load's share grows without end. Beyond the speeds seen friction is linear
     (`calib.dynamics.shapes`) but for Stribeck's peak, which fades: ten times the fastest stands for all.
@@ -71,12 +71,12 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
 
 
 def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
-    """Return which joints friction drives, (n,) bool."""
+    """Return for each joint whether its friction adds energy (n,) bool."""
     return np.asarray(_dissipated(dynamics, cases) < MIN_ENERGY_SHARE)
 
 
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
-    """Return the joints, from 0, that friction drives: their torque's sign is reversed, or it is another joint's.
+    """Return the joints, from 0, whose friction adds energy: their torque is reversed, or another joint's.
 
     Raises:
         MeasurementError: where these are most of the joints that move.

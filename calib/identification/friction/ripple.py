@@ -1,4 +1,4 @@
-"""Gear ripple: torque that repeats with a gear's position, found in what a model leaves above the motion's band.
+"""Gear ripple: torque periodic in a gear's position, identified from a model's residuals above the motion's band.
 
     tau_j += Σ_i Σ_k Σ_m g_m(k v_i) (s_ikm sin k q_i + c_ikm cos k q_i),
 
@@ -41,7 +41,7 @@ Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
 
 @dataclass(frozen=True)
 class GearWave:
-    """A wave of the ripple: its order per turn of a gear, which is named by its joint, from 1."""
+    """A wave of the ripple: its gear, named by its joint from 1, and its order per turn of that gear."""
 
     gear: int
     order_per_turn: float
@@ -49,7 +49,7 @@ class GearWave:
 
 @dataclass(frozen=True)
 class RippleWaves:
-    """Ripple of a joint, from 1, and the share of the residual's high-frequency power that it explains, held out."""
+    """Ripple of a joint, from 1, and its explained share of the residual's high-frequency power on held-out time."""
 
     joint: int
     waves: tuple[GearWave, ...]
@@ -62,9 +62,9 @@ class Ripple:
 
     Attributes:
         joint: from 0.
-        waves: (joint whose gear makes it, order per turn of it).
+        waves: for each wave, the joint whose gear causes it, and the order per turn.
         terms, values: (k,) drive terms and their parameters.
-        share: part of the fast residual's power on left-out blocks that it explains.
+        share: explained part of the fast residual's power on held-out blocks.
     """
 
     joint: int
@@ -75,13 +75,13 @@ class Ripple:
 
     @property
     def found(self) -> RippleWaves:
-        """Its waves and what they explain, as a record."""
+        """The waves and the share that they explain, as a record."""
         return RippleWaves(self.joint + 1, tuple(GearWave(j + 1, order) for j, order in self.waves), self.share)
 
 
 @dataclass(frozen=True, eq=False)
 class GearTravel:
-    """Where the gears have been: q, v (N, n), the number of the time block (N,), and the joints that travel."""
+    """Gear positions in the recordings: q, v (N, n), the time block of each sample (N,), and the joints that move."""
 
     q: np.ndarray
     v: np.ndarray
@@ -118,7 +118,7 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
 
 
 def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
-    """Return joint → motor turns per turn of its gear, of the joints that travel: the most coherent family.
+    """Return joint → motor turns per gear turn for the joints that move enough: the most coherent family of orders.
 
     Args:
         residuals: (N, n) fast parts.
@@ -135,7 +135,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
 
 
 def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
-    """Return the ripple in a joint's torque that left-out blocks confirm, or None.
+    """Return the ripple in a joint's torque if held-out blocks confirm it, or None.
 
     Args:
         residual: (N,) torque not explained, without its slow part, at the samples of `track`.
@@ -164,7 +164,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
 
 
 def _family(turns: int) -> tuple[tuple[int, ...], ...]:
-    """Return the orders per turn at which a gear shows, in the sets that are offered together."""
+    """Return the orders per turn of a gear's ripple, in sets that are tested together."""
     n = turns
     return tuple(
         one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= MAX_ORDER
@@ -174,7 +174,7 @@ def _family(turns: int) -> tuple[tuple[int, ...], ...]:
 def _terms(
     joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None
 ) -> tuple[DriveTerm, ...]:
-    """Return the terms of the ripple in a joint's torque, wave after wave; without a track they reach everywhere."""
+    """Return the terms of the ripple in a joint's torque, wave by wave; without a track, valid at all positions."""
     edges = (0.0, *nodes, np.inf)
     found = []
     for source, order in waves:
@@ -191,7 +191,7 @@ def _terms(
 
 
 class _WaveCrossValidation:
-    """A joint's residual and the columns offered for it: how much of it they explain on blocks left out.
+    """A joint's residual and its candidate columns, to test the share that they explain on held-out blocks.
 
     Columns of a wave are made once.
     """
@@ -209,7 +209,7 @@ class _WaveCrossValidation:
         return np.hstack([self._made[wave, nodes] for wave in waves])
 
     def judge(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
-        """Return the share of the power on left-out blocks that the waves explain, and the ridge with which."""
+        """Return the explained share of the power on held-out blocks, and the best ridge."""
         matrix, residual = self.columns(waves, nodes), self.residual
         squares = [matrix[own].T @ matrix[own] for own in self._parts]
         crosses = [matrix[own].T @ residual[own] for own in self._parts]
@@ -225,7 +225,7 @@ class _WaveCrossValidation:
         return float(result[best]), RIDGES[best]
 
     def fit(self, waves: Sequence[Wave], nodes: tuple[float, ...], ridge: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the waves leave (N,), and their columns' values (k,)."""
+        """Return the residual after fitting the waves (N,), and their parameters (k,)."""
         matrix = self.columns(waves, nodes)
         square = matrix.T @ matrix
         unit = float(np.trace(square)) / len(square)
@@ -241,7 +241,7 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
 
 
 def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:
-    """Return S(k) of all whole orders k of a gear from 0 on, (cells / 2 + 1,); see the module."""
+    """Return the coherence S(k) of a gear's integer orders k = 0, 1, ..., (cells / 2 + 1,); see the module."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
     speed_bins = 4  # of the speed, per direction
@@ -261,7 +261,7 @@ def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarra
 
 
 def _lobes(power: np.ndarray) -> np.ndarray:
-    """Return S at N, 2 N and 2 N + 2 together, for every N of `TURNS`."""
+    """Return the sum of the coherence S at N, 2 N and 2 N + 2, for every N of `TURNS`."""
     turns = np.array(TURNS)
     seen = np.maximum(power, 0.0)
     return seen[turns] + seen[2 * turns] + seen[2 * turns + 2]
@@ -270,7 +270,7 @@ def _lobes(power: np.ndarray) -> np.ndarray:
 def _climb(
     bench: _WaveCrossValidation, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
 ) -> tuple[tuple[Wave, ...], float, float]:
-    """Return the waves taken one set after the other as long as left-out blocks gain, their share, and the ridge."""
+    """Return the waves of a forward selection by held-out blocks, their explained share, and the ridge."""
     taken: tuple[Wave, ...] = ()
     best, ridge = 0.0, RIDGES[-1]
     rest = bench.residual
@@ -287,7 +287,7 @@ def _climb(
 
 
 def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
-    """Return the most coherent order of the joint's gear, and the most coherent pair of orders that differ by two."""
+    """Return the most coherent order of the joint's gear, and the most coherent pair of orders with difference two."""
     power = coherence(track, joint, rest)
     order = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER + 1]))
     lower = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]))
@@ -303,9 +303,9 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
 
 
 def _blocks(cases: Sequence[Case], blocks: int = 8, skipped_start: float = 0.5) -> list[np.ndarray]:
-    """Number contiguous blocks of all cases, about `blocks` in all; -1 at the start of a recording.
+    """Return the block number of each sample, contiguous, about `blocks` in all; -1 at the start of a recording.
 
-    `skipped_start`: [s] left out at the beginning, where robots start.
+    `skipped_start`: excluded at the beginning, where the robot starts [s].
     """
     sizes = [len(case.motion) for case in cases]
     own = [max(1 if len(cases) > 1 else 2, round(blocks * size / sum(sizes))) for size in sizes]

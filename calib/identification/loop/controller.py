@@ -1,4 +1,4 @@
-"""A joint controller from its log: an ARX model from position error to torque, read as a PID in the band that matters.
+"""A joint controller identified from its log: an ARX model from position error to torque, converted to a PID.
 
     tau_k = Σ a_i tau_{k-i} + Σ b_i e_{k-i} + c,    C(ω) = B(e^{jωT}) / A(e^{jωT}) ≈ kp + kd jω + ki / (jω)
 
@@ -24,11 +24,11 @@ ORDERS = (0, 1)  # of a PD; more for a controller with memory, at the price of n
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedController:
-    """What a log says about a controller.
+    """A controller identified from a log.
 
     Attributes:
-        controller: PD or PID with the gains found.
-        explained: (n,) 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%] of the low-passed torque, by the PID's feedback.
+        controller: PD or PID with the identified gains.
+        explained: (n,) share of the low-passed torque by the PID's feedback, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%].
     """
 
     controller: Controller
@@ -39,7 +39,7 @@ def identify_controller(
     reference: Reference, measured: np.ndarray, tau: np.ndarray, rate: float, band: float = BAND,
     orders: tuple[int, int] = ORDERS, integral: bool = False,
 ) -> IdentifiedController:  # fmt: skip
-    """Return the controller behind a log.
+    """Return the controller identified from a log.
 
     Args:
         reference: at any multiple of the log's rate; its first instant is the log's.
@@ -74,13 +74,13 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
-    """Return the control periods (count,) of a log's samples, whole where they are to a thousandth."""
+    """Return the control periods (count,) of a log's samples, whole numbers if they are within 0.1 %."""
     every = 1.0 / (rate * reference.period)
     return np.arange(count) * (round(every) if abs(every / max(round(every), 1) - 1.0) < 1e-3 else every)
 
 
 def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
-    """Return functions of the reference that errors depend on (count, k): friction, inertia, gravity, low-passed."""
+    """Return the instruments (count, k), functions of the reference: friction, inertia and gravity, low-passed."""
     q, v, a = reference.at(_ticks(reference, rate, count))
     jerk = np.gradient(a, 1.0 / rate, axis=0)
     slow = np.tanh(v / (0.01 * np.abs(v).max(axis=0, initial=1e-9)))
@@ -92,9 +92,9 @@ def _instruments(reference: Reference, count: int, rate: float, band: float) -> 
 def _joint(
     error: np.ndarray, tau: np.ndarray, basis: np.ndarray, orders: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a, b of one joint by two-stage least squares with an orthonormal basis of instruments."""
+    """Return the ARX coefficients a, b of one joint by two-stage least squares with an orthonormal instrument basis."""
     if not np.ptp(error) > 0.0:
-        raise MeasurementError("the position error is zero throughout: a log of the reference, not of the encoder?")
+        raise MeasurementError("the position error is zero throughout: log encoder positions, not the reference")
     na, nb = orders
     first, count = max(orders), len(error)
     own = basis[first:]
@@ -107,7 +107,7 @@ def _joint(
 
 
 def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integral: bool) -> np.ndarray:
-    """Return kp, kd, ki that fit C(ω) best, relatively, from a fortieth of the band up to half of it."""
+    """Return kp, kd, ki with the best relative fit to C(ω) from 1/40 to 1/2 of the band."""
     omega = 2.0 * np.pi * np.geomspace(band / 40.0, band / 2.0, 60)
     shift = np.exp(-1j * omega / rate)
     response = np.polyval(errors[::-1], shift) / (1.0 - shift * np.polyval(past[::-1], shift))
@@ -120,7 +120,7 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
-    """Return the share of the low-passed torque that the gains explain [%]."""
+    """Return the share of the low-passed torque explained by the gains (n,) [%]."""
     own = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
     edge = border(rate, band)
     rest, whole = (x[edge:-edge] - x[edge:-edge].mean() for x in (tau - own, tau))

@@ -1,4 +1,4 @@
-"""Recordings in the loop they came from: reference and controller of every stretch, ready to be simulated.
+"""Closed loops of recordings: reference and controller of every part without gaps, ready for simulation.
 
 A stretch is a part of a recording without gaps. The simulation runs along the whole of it and is compared some way
 inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot to forget that it started on the
@@ -29,15 +29,15 @@ DEGREES = 180.0 / np.pi
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """The closed loop that a recording came from.
+    """The closed loop in which a recording was made.
 
     Attributes:
-        controller: given, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
-            bandwidth still serves.
-        reference: at the controller's rate, in the recording's time, and spanning it.
-        every: control periods per recorded sample, whole or not.
-        design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
-            J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
+        controller: stated, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
+            true bandwidth suffices.
+        reference: at the controller's rate, in the recording's time, over its whole duration.
+        every: control periods per recorded sample, not necessarily an integer.
+        design: (n,) inertia for which the gains are stated [kg m²]; the simulated robot then gets gains times
+            J(x_k) / design, so that its bandwidth is constant (Gautier & Janot). None: gains as stated.
     """
 
     controller: Controller
@@ -48,13 +48,13 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoops:
-    """Stretches of recordings, each with its loop.
+    """Parts of recordings without gaps, each with its closed loop.
 
     Attributes:
-        pairs: each stretch and its loop.
-        controller: of all.
-        identified: how the controller was read from the logs; None where it was stated.
-        notes: what a user should know.
+        pairs: each part and its loop.
+        controller: of all parts.
+        identified: result of identifying the controller from the logs; None where it was stated.
+        notes: remarks for the user.
     """
 
     pairs: tuple[tuple[Case, Loop], ...]
@@ -66,7 +66,7 @@ class ClosedLoops:
 def close_loops(
     bodies: Bodies, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
 ) -> ClosedLoops:
-    """Return the loops of recordings whose motions hold `q_ref`.
+    """Return the closed loops of recordings whose motions contain `q_ref`.
 
     Args:
         bodies: the model's.
@@ -86,7 +86,7 @@ def close_loops(
         if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
     ]
     if not stretches:
-        refuse_data(cases[0].motion.file, "no stretch without gaps is long enough to be simulated")
+        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
     controller, identified, notes = _controller(loop, max((s[1:3] for s in stretches), key=lambda s: len(s[0].motion)))
     design = loop.per_joint("design", bodies.n) if loop.design else None
     pairs = []
@@ -99,7 +99,7 @@ def close_loops(
 
 
 def take(case: Case, part: slice) -> Case:
-    """Return the samples of a case at `part`."""
+    """Return the part of a case in the slice `part`."""
     rows = {name: value[part] for name in ROWS if (value := getattr(case.motion, name)) is not None}
     return replace(
         case, motion=replace(case.motion, **rows), target=case.target[part], present=case.present[part]
@@ -107,13 +107,13 @@ def take(case: Case, part: slice) -> Case:
 
 
 def _check_reference(motion: Motion) -> None:
-    """Refuse a motion without a reference, or with one that is not its own (or is in degrees)."""
+    """Raise an error for a motion without a reference, or with another motion's or one in degrees."""
     if motion.q_ref is None:
         refuse_data(
             motion.file,
-            "holds no reference (columns q_ref1 …, also q_des, q_cmd; or [recording] names = { q_ref = '…' }), and the "
-            "simulation of the closed loop needs the positions that were asked for: log them, or state a file, "
-            "[loop] reference = '…'; without them use wls or irls",
+            "has no reference positions (columns q_ref1 …, q_des, q_cmd, or [recording] names = { q_ref = '…' }); the "
+            "simulation of the closed loop needs them. Log them, or state a file, "
+            "[loop] reference = '…'; without a reference use wls or irls",
         )
     finite = np.isfinite(motion.q_ref).all(axis=0)
     if not finite.all():
@@ -126,9 +126,9 @@ def _check_reference(motion: Motion) -> None:
 
 
 def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
-    """Refuse a reference `asked` (N,) that one joint does not follow; say where it looks like another unit.
+    """Raise an error for a joint that does not follow its reference `asked` (N,), naming a likely unit error.
 
-    `max_difference`: of a joint's motion: a reference that is further off is another one (our choice).
+    `max_difference`: largest deviation, over a joint's motion, from its own reference (our choice).
     """
     q = motion.q[:, joint]
     spread, size = np.std(q), np.std(asked)
@@ -140,19 +140,19 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
         refuse_data(
             motion.file,
-            f"the reference of {name} is {size / spread:.3g} times its position: it looks like deg; if so, say so (a "
+            f"the reference of {name} is {size / spread:.3g} times its position, probably in deg; if so, state it (a "
             f"header 'q_ref{joint + 1} [deg]', or [recording] units = {{ q_ref = 'deg' }})",
         )
     refuse_data(
         motion.file,
-        f"{name} is {away:.2g} times its own travel (rms) away from its reference, "
-        + (f"which is {size / spread:.3g} times as large" if alike else "and does not move with it")
-        + ": is this the reference of this recording, joint by joint and from the same instant?",
+        f"{name} deviates from its reference by {away:.2g} times its travel (rms); the reference "
+        + (f"is {size / spread:.3g} times as large" if alike else "is not correlated with it")
+        + "; check that the reference belongs to this recording, has the same joints and starts at the same time",
     )
 
 
 def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: float = 4.0) -> tuple[Reference, float]:
-    """Return the reference of a motion without gaps at the control rate, and control periods per sample.
+    """Return the reference of a motion without gaps, resampled at the control rate, and the control periods per sample.
 
     The logged positions are low-passed at `cutoff_factor` f_q and joined by a cubic spline, whose slopes are v and a.
 
@@ -171,12 +171,12 @@ def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: fl
 
 
 def _differenced(reference: Reference) -> Reference:
-    """Return the reference with the velocities of a controller that knows positions alone, half a period late."""
+    """Return the reference with velocities from backward differences of its positions, half a period late."""
     return replace(reference, v=np.vstack([reference.v[:1], np.diff(reference.q, axis=0) / reference.period]))
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
-    """Return how many control periods a sample lasts, whole or not; without a rate, as few as make `min_rate`.
+    """Return the control periods per sample, not always whole; without `rate`, the fewest that reach `min_rate`.
 
     Raises:
         UsageError: where the control rate is below the motion's.
@@ -189,14 +189,14 @@ def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
     max_rounding = 0.001
     if rate < (1.0 - max_rounding) * motion.rate:
         raise UsageError(
-            f"[loop] rate: {rate:g} Hz is below {motion.rate:.6g} Hz, the rate of {motion.file}: a controller that is "
-            "slower than its log? Is it in Hz?"
+            f"[loop] rate: {rate:g} Hz is below {motion.rate:.6g} Hz, the rate of {motion.file}: no controller is "
+            "slower than its log; check the unit (Hz)"
         )
     return every if abs(rate / motion.rate - every) <= max_rounding * every else rate / motion.rate
 
 
 def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
-    """Return the samples of a stretch that are compared.
+    """Return the slice of samples to compare, without settling time and filter borders.
 
     `settling_time`: [s] our choice.
     """
@@ -207,7 +207,7 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
 def _controller(
     loop: LoopSettings, longest: tuple[Case, Reference]
 ) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
-    """Return the controller, stated or read from the longest stretch, and what to say of it."""
+    """Return the controller, stated or identified from the longest part, with its identification and remarks."""
     case, reference = longest
     n = case.motion.n
     if loop.controller != "identify":
@@ -226,7 +226,7 @@ def _controller(
             "gains, or lower [loop] band",
             found,
         )
-    note = f"controller read from {case.name} up to {band:.3g} Hz, kp/kd and the torque's share it explains: {shown}"
+    note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {shown}"
     return loop.completed(found.controller, n), found, (note,)
 
 
@@ -234,7 +234,7 @@ def _fed_forward(
     controller: Controller, loop: LoopSettings, cad: np.ndarray | None, bodies: Bodies, motion: Motion,
     reference: Reference, every: float,
 ) -> Controller:  # fmt: skip
-    """Return the controller with the torques it adds along the reference."""
+    """Return the controller with its feedforward torques along the reference."""
     if loop.feedforward == "none":
         return controller
     if loop.feedforward == "recording":
@@ -243,13 +243,13 @@ def _fed_forward(
         grid = np.arange(len(motion))
         return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
     if cad is None:
-        raise UsageError("[loop] feedforward = 'cad': the robot's description holds no masses")
+        raise UsageError("[loop] feedforward = 'cad': the robot's description states no masses")
     inertial = frozen(np.concatenate([cad, np.zeros(10 * bodies.count - len(cad))]))
     return controller.with_feedforward(feed_forward(Plant(bodies, (), inertial), reference))
 
 
 def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
-    """Return the case with the simulated motion at the instants of the recorded one, filtered like that one.
+    """Return the case with the simulated motion at the recorded times, filtered like the recorded motion.
 
     The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
     what tells W from Z is noise.
@@ -261,7 +261,7 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
-    """Return the places of a case's instants among the simulated ones `t` [s]."""
+    """Return the indices of the simulated samples, at times `t` [s], at the times of a case."""
     step = loop.reference.period * loop.every
     since = case.motion.t - loop.reference.t[0]
     index = np.rint(since / step).astype(int)
@@ -275,7 +275,7 @@ def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
 
 
 def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) -> np.ndarray:
-    """Return simulated positions (N, n), or their slopes (N, n, ...), through the low-pass of the recorded ones.
+    """Return simulated positions (N, n), or their slopes (N, n, ...), low-passed like the recorded ones.
 
     Args:
         cutoff: (n,) of another of its filters [Hz].

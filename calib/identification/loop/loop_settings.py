@@ -1,4 +1,4 @@
-"""The closed loop that recordings came from, as the options file states it: table [loop].
+"""Settings of the closed loop in which recordings were made: table [loop] of the options file.
 
 Instrumental variables (method iv) simulate that loop; with another method and a [loop], the same simulation tests
 whether least squares is biased. Gains are what the joints feel, torque per position error on the joint side::
@@ -67,7 +67,7 @@ Bounds = Annotated[tuple[Annotated[float, Real(above=0, infinite=True, words=GAI
 @strict
 @dataclass(frozen=True)
 class LoopSettings:
-    """What is known of the loop; the module says what each key means. Tuples hold one value, or one per joint."""
+    """Settings of the loop; the module documents each key. Tuples contain one value, or one per joint."""
 
     controller: Annotated[str, OneOf(CONTROLLERS)]
     kp: Gains = ()
@@ -93,7 +93,7 @@ class LoopSettings:
     integral: Flag = False
 
     def check_lengths(self, n: int) -> None:
-        """Refuse a list that has another length than the n joints.
+        """Raise an error for a list whose length is neither 1 nor n.
 
         Raises:
             UsageError: with the key.
@@ -103,24 +103,24 @@ class LoopSettings:
                 self.per_joint(key, n)
 
     def completed(self, controller: Controller, n: int) -> Controller:
-        """Return the controller with what surrounds its gains: saturation, delay, filter."""
+        """Return the controller with saturation, delay and filter of the settings added to its gains."""
         return Controller(
             controller.kp, controller.kd, controller.ki, np.full(n, self.share), self.per_joint("limit", n),
             self.per_joint("windup", n), delay=self.delay, cutoff=self.velocity_cutoff,
         )  # fmt: skip
 
     def per_joint(self, key: str, n: int) -> np.ndarray:
-        """Return (n,) values of a key that holds one or n."""
+        """Return the values (n,) of a key that has one value or n."""
         found = getattr(self, key)
         if len(found) not in (1, n):
             raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
         return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()
 
     def stated_controller(self, n: int) -> Controller:
-        """Return the controller with the gains stated, for n joints.
+        """Return the controller with the stated gains, for n joints.
 
         Raises:
-            UsageError: where a list has another length than the joints.
+            UsageError: where the length of a list is not the number of joints.
         """
         if self.controller == "cascade":
             first, second, third = (self.per_joint(key, n) for key in ("position", "velocity", "reset"))
@@ -131,14 +131,14 @@ class LoopSettings:
 
 
 def check_loop(table: Any) -> Any:
-    """Return the parsed table [loop] as it is, its gains held against its controller.
+    """Return the parsed table [loop] unchanged after a check that its gains fit its controller.
 
     Raises:
-        ValueError: for no controller, gains that belong to another one, or gains that are missing.
+        ValueError: for a missing controller, gains of another controller, or missing gains.
     """
     kind = table.get("controller") if isinstance(table, Mapping) else ""
     if kind is None:
-        raise ValueError(f"there is no 'controller'; expected one of {', '.join(CONTROLLERS)}")
+        raise ValueError(f"'controller' is missing; expected one of {', '.join(CONTROLLERS)}")
     if not isinstance(kind, str) or kind not in OWNED:
         return table
     for other, keys in OWNED.items():
@@ -147,7 +147,7 @@ def check_loop(table: Any) -> Any:
             raise ValueError(f"'{wrong[0]}' belongs to controller '{other}', found controller '{kind}'")
     for key in NEEDED[kind]:
         if key not in table:
-            raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; there is no '{key}'")
+            raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; '{key}' is missing")
     if kind == "identify" and table.get("share", 1.0) != 1.0:
-        raise ValueError("share: a controller that is identified sees the whole velocity of the reference")
+        raise ValueError("share: not supported with controller = 'identify', which assumes share = 1")
     return table

@@ -1,4 +1,4 @@
-"""What the model would do for a controller: tracking with its torques fed forward, on recorded motion.
+"""Benefit of the model as feedforward in a controller: simulated tracking errors on recorded motion.
 
 Nobody has the real robot here, so the simulated one is made to need the torque that was measured: it is the identified
 model, and what that model left unexplained along the recording is replayed on it as a disturbance,
@@ -46,16 +46,16 @@ FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what i
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """How far the simulated robot strays from a recorded motion; a record.
+    """Tracking errors of the simulated robot on a recorded motion, as a record.
 
     Attributes:
-        name: of the recording.
-        seconds: that were replayed.
-        controller: the feedback; `stated`: whether it is not the default.
-        terms_left_out: of the model, which the simulated robot does not have; what they explain is in the disturbance.
-        inertia_added: (n,) that the simulated robot needed besides [kg m² or kg].
-        rms: what is fed forward → (n,) rms of q - q_r [rad or m].
-        unseen: whether the model has not been fitted to this motion.
+        name: name of the recording.
+        seconds: duration of the replayed part.
+        controller: the feedback; `stated`: whether the user stated it.
+        terms_left_out: terms of the model that cannot be simulated; their torque is part of the disturbance.
+        inertia_added: (n,) inertia added to make the simulated robot consistent [kg m² or kg].
+        rms: kind of feedforward → (n,) rms of q - q_r [rad or m].
+        unseen: whether this motion was not used in the fit.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Replay:
 
     @stored
     def feedback_over_model(self) -> float:
-        """Error of feedback alone over that with the model fed forward; joints weigh by their own errors' ratio."""
+        """Tracking error of feedback alone over that with the model fed forward, geometric mean over the joints."""
         return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
 
 
@@ -77,7 +77,7 @@ def replay(
     chain: Chain, dynamics: Dynamics, case: Case, predicted: np.ndarray, controller: Controller | None = None,
     rate: float | None = None,
 ) -> Replay:  # fmt: skip
-    """Simulate a recording's motion under feedback, with nothing, CAD and the model fed forward.
+    """Return the tracking errors on a recorded motion with nothing, CAD and the model fed forward.
 
     Args:
         chain: whose inertias are the CAD's, where it has any.
@@ -90,7 +90,7 @@ def replay(
         CalibError: where the rows are not the motors', or the loop is unstable.
     """
     model, n = dynamics.model, chain.n
-    require(model.torque_rows.with_motors, f"rows '{model.torque_rows.name}' do not hold all of the motors' torque")
+    require(model.torque_rows.with_motors, f"rows '{model.torque_rows.name}' do not contain the whole motor torque")
     part = _stretch(case)
     motion = case.motion
     robot, left_out = _robot(dynamics, case)
@@ -118,7 +118,7 @@ def replay(
 
 
 def _stretch(case: Case, max_seconds: float = 20.0) -> slice:
-    """Return the longest part without gaps, cut to `max_seconds`.
+    """Return the slice of the longest part without gaps, cut to `max_seconds`.
 
     `max_seconds`: [s] of a recording that are replayed.
     """
@@ -127,7 +127,7 @@ def _stretch(case: Case, max_seconds: float = 20.0) -> slice:
 
 
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
-    """Return the model as a robot, with what the case carries, and the names of terms that cannot be simulated."""
+    """Return the model as a robot with the case's payloads, and the names of terms that cannot be simulated."""
     model = dynamics.model
     bodies = model.inertial
     simulated = [one.form.of_velocity or one.shape == "acceleration" for one in model.columns]
@@ -139,7 +139,7 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
 
 
 def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
-    """Return the recorded motion at the control rate, and control periods per sample."""
+    """Return the recorded motion as a reference at the control rate, and the control periods per sample."""
     motion = part.motion
     every = periods_per_sample(motion, rate)
     samples = np.arange(len(motion))
@@ -149,7 +149,7 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 
 
 def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) -> tuple[Plant, np.ndarray]:
-    """Return the robot with as much inertia (n,) of its motors added as makes it possible, and that.
+    """Return the robot with motor inertia added until M(q) is positive definite, and that inertia (n,).
 
     The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `min_eigenvalue`.
 
@@ -171,7 +171,7 @@ def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) 
 
 
 def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
-    """Return a term whose sign the simulator can integrate at this control period."""
+    """Return a drive term whose sign function is smooth enough to integrate at this control period."""
     if "v0" not in one.form.settings:
         return one
     # of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `min_eigenvalue` is 0.11

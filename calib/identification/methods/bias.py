@@ -1,4 +1,4 @@
-"""Is least squares biased? The loop a recording came from, simulated, says so, and offers the estimate that is not.
+"""Test of least squares for bias by simulating the recording's closed loop, and an unbiased estimate.
 
 `disagreement` compares estimates that take a loop for granted with those that do not, on the same rows.
 
@@ -24,12 +24,12 @@ MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, h
 
 @dataclass(frozen=True, eq=False)
 class LoopTest:
-    """What instruments from simulation came to.
+    """Result of instrumental variables from simulation.
 
     Attributes:
-        found: their estimate of the standard model, with the test of least squares; None where there is none.
-        loops: what was simulated.
-        failure: why there is no estimate.
+        found: their estimate of the standard model, with the test of least squares; None if they failed.
+        loops: the simulated closed loops.
+        failure: reason for a missing estimate.
     """
 
     found: Instrumental | None = None
@@ -37,7 +37,7 @@ class LoopTest:
     failure: str = ""
 
     def findings(self, taken: bool) -> list[Finding]:
-        """Return what a user should know who took this estimate, or (`taken` False) one of least squares."""
+        """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
         if self.failure:
             return [finding("loop-test-failed", why=self.failure)]
         if self.found is None:
@@ -47,7 +47,7 @@ class LoopTest:
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
-    """Return what instruments from simulation say of an estimate's problem; nothing without a loop.
+    """Return the result of instruments from simulation on an estimate's problem; an empty one without a loop.
 
     An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
@@ -77,13 +77,13 @@ def _distance(found: Instrumental) -> list[Finding]:
 
 
 def _gains(found: Instrumental) -> list[Finding]:
-    """Name the joints whose gains are not those of the recording: all that the simulated robot did was to follow."""
+    """Return a finding on joints whose stated gains are not those of the recording, though the simulation follows."""
     joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
     return [finding("loop-gains-off", joints=joints)] if joints else []
 
 
 def _biased(found: Instrumental) -> list[Finding]:
-    """Say what the test means; nothing of a loop that explains less than the model does, or of a bias too small."""
+    """Return a finding on a bias of least squares; none if the loop fits worse than the model, or for a small bias."""
     shift, min_shift = found.shift, 1.0  # standard deviations of a shift that is worth a word (our choice)
     if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
         return []
@@ -92,7 +92,7 @@ def _biased(found: Instrumental) -> list[Finding]:
 
 
 def _blurred(test: LoopTest) -> list[Finding]:
-    """Say where W is no longer its true value plus noise, which instruments take for granted."""
+    """Return a finding on joints where W is not its true value plus noise, as instruments assume."""
     if test.found is None or test.loops is None or not test.found.estimator.measured:
         return []
     noise, max_blur = test.loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
@@ -110,10 +110,10 @@ class LoopDisagreement:
     """Comparison of an estimate that relies on the stated loop with one that does not.
 
     Attributes:
-        method, beside: of the two.
-        parameter, sigmas: the one that differs most, and by how many standard deviations of both together.
-        left, beside_left: by torque row, share of the torque in the band that each leaves unexplained [%].
-        factor: by torque row, the method's torque over the other's.
+        method, beside: methods of the two estimates.
+        parameter, sigmas: the parameter with the largest difference, and that in combined standard deviations.
+        left, beside_left: by torque row, unexplained share of the torque in the band, for each estimate [%].
+        factor: by torque row, torque by the first estimate over that by the other.
     """
 
     method: str
@@ -126,12 +126,12 @@ class LoopDisagreement:
 
 
 def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
-    """Return where an output-error estimate is refuted by recorded torques; None where it is not, or is another's.
+    """Return how recorded torques contradict an output-error estimate; None if they do not, or for another method.
 
     Args:
         problem: of both.
         found: the estimate.
-        test: what instruments say; without any, least squares takes their place.
+        test: result of instruments; least squares replaces it if absent.
     """
     if not (found.found and found.alone and found.loops is not None):
         return None
@@ -158,7 +158,7 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
 
 
 def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
-    """Return, for each torque row, the regression slope of the torques W own on W other."""
+    """Return the regression slope of the torques W own on W other, for each torque row."""
     factors = problem.pooled.factors[:, :, :-1]
     mine, theirs = factors @ own, factors @ other
     return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))

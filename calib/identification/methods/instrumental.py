@@ -1,4 +1,4 @@
-"""IDIM-IV: instruments from a closed-loop simulation with the last estimate, until both come to rest.
+"""IDIM-IV: instruments from a closed-loop simulation with the last estimate, repeated until both converge.
 
     simulate with x_k → Z = W(q_s, v_s, a_s), filtered and thinned like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
 
@@ -43,13 +43,13 @@ MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated
 
 @dataclass(frozen=True)
 class _RoundEstimator:
-    """What a round makes of the triangles of [Z W y].
+    """Estimator of one iteration, from the triangles of [Z W y].
 
     Attributes:
-        name: what options and files call it.
-        fit: of triangles, (g,) std of the groups and inflation.
-        triangle: [R z; 0 ρ] that it minimises, of triangles and (g,) std: where constraints enter.
-        measured: whether the measured motion, W, is in the estimate.
+        name: name in options and files.
+        fit: function of triangles, standard deviations of the groups (g,), and inflation to the estimate.
+        triangle: function of triangles and (g,) std to the minimised [R z; 0 ρ], to which constraints apply.
+        measured: whether the estimate uses the measured motion, W.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Round:
         change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see
             `calib.estimation.instrumental_variables.settled`.
         residual: standard deviation of the weighted residuals.
-        retreats: halvings before it, until the parameters could be simulated.
+        retreats: number of step halvings until the parameters could be simulated.
     """
 
     change: float
@@ -85,17 +85,17 @@ class Instrumental:
         fit: the estimate.
         ordinary: weighted least squares of the same rows, to compare.
         plant: the simulated robot with the estimate.
-        rounds: what happened.
-        strength: how well the instruments stand for W.
+        rounds: history of the iterations.
+        strength: strength of the instruments, their correlation with W.
         verdict: whether least squares is biased (Durbin, Wu, Hausman).
-        std, inflation: of the rows, (rows,), and of all together.
+        std, inflation: standard deviation of each torque row (rows,), variance inflation of all rows together.
         distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
             controller is not the robot's.
-        stray: (n,) how many times as far from its reference the recorded robot is as the simulated one: the factor
-            that stated gains are off by. NaN where noise hides it.
-        constrained: what constraints made of the estimate, where there are any; `fit` has its values and covariance.
+        stray: (n,) tracking error of the recorded robot over that of the simulated one: the error factor of the
+            stated gains. NaN where noise hides it.
+        constrained: the constrained estimate, if constraints are set; `fit` has its values and covariance.
         problem: triangles of [Z W y], one group per torque row.
-        estimator: what each round made of them.
+        estimator: estimator used in each iteration.
     """
 
     fit: LinearFit
@@ -114,26 +114,26 @@ class Instrumental:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters that were estimated, as of `Base.names`."""
+        """Names of the estimated parameters, as in `Base.names`."""
         return self.fit.estimate.names
 
     @property
     def direct(self) -> np.ndarray:
-        """(n,) 100 ‖y - Z x‖ / ‖y‖ [%]: the torque of the simulated robot against the recorded, joint by joint."""
+        """Relative error of the simulated motion's torque (n,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
         return self.simulated_error(self.fit.estimate.values)
 
     def simulated_error(self, values: np.ndarray) -> np.ndarray:
-        """Return (n,) 100 ‖y - Z x‖ / ‖y‖ [%] of any values (p,), free of the noise of measured positions."""
+        """Return the relative torque errors (n,) on the simulated motion, of values (p,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
         return self.problem.data.relative_errors(np.concatenate([values, np.zeros(len(self.names))]))
 
     @property
     def own(self) -> np.ndarray:
-        """(n,) 100 ‖y - W x‖ / ‖y‖ [%]: the same of the measured motion."""
+        """Relative error of the measured motion's torque (n,): 100 ‖y - W x‖ / ‖y‖ [%]."""
         return self.problem.data.relative_errors(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
 
     @property
     def off(self) -> np.ndarray:
-        """Joints, from 0, of which the loop's gains are off: the recorded robot strays another way than simulated."""
+        """Joints, from 0, with wrong stated gains: the recorded tracking error differs from the simulated one."""
         estimate, simulated = self.fit.estimate, self.problem.data.factors[:, :, : len(self.names)]
         sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
@@ -143,14 +143,14 @@ class Instrumental:
 
     @property
     def explains(self) -> bool:
-        """Whether the simulated loop explains the recording as well as the model does its measured motion."""
+        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
         # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
         max_loop_error = 2.0
         return not len(self.off) and bool(np.all(self.direct < max_loop_error * self.own))
 
     @property
     def shift(self) -> np.ndarray:
-        """(p,) distance of least squares from this estimate, in standard deviations.
+        """Difference of least squares from this estimate (p,), in standard deviations.
 
         The test finds any bias that the data can detect; this says whether it matters.
         """
@@ -159,7 +159,7 @@ class Instrumental:
 
     @property
     def valid(self) -> bool:
-        """Whether the instruments may be trusted: full rank, not weak, and the simulated robot follows the real one."""
+        """Whether the instruments are valid: full rank, not weak, and the simulated robot follows the recorded one."""
         return not self.strength.weak and bool(np.all(self.distance < 10.0))
 
 
@@ -175,7 +175,7 @@ def identify_instrumental(
     constraints: Constraints | None = None,
     limit: int = MAX_ROUNDS,
 ) -> Instrumental:
-    """Estimate base parameters with instruments from simulation.
+    """Return the estimate of the base parameters with instruments from simulation.
 
     Args:
         model: of motor torques.
@@ -222,14 +222,14 @@ def identify_instrumental(
     kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
     raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
-        "rounds; estimate fewer (essential ones), or look at the controller's gains",
+        "iterations; estimate fewer (essential ones), or check the controller's gains",
         before,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Fixed:
-    """What stays the same from round to round."""
+    """Data and settings that are the same in all iterations."""
 
     model: IdentificationModel
     base: Base
@@ -240,20 +240,20 @@ class _Fixed:
     constraints: Constraints | None
 
     def after(self, found: _Found) -> _Fixed:
-        """Return the task of the next round, which most likely is held in the same postures."""
+        """Return the task of the next iteration, with the postures in which constraints are likely to bind."""
         if self.constraints is None or found.bound is None:
             return self
         return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
 
     def plant(self, old: Plant, found: _Found) -> Plant:
-        """Return the robot of a round's estimate."""
+        """Return the simulated robot with the estimate of an iteration."""
         values = self.base.to_standard(found.fit.estimate.values)
         return old.with_parameters(np.concatenate([values, np.zeros(len(old.parameters) - len(values))]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """One round's rows and instruments, triangles of what it took of them, estimate, and the residuals' inflation."""
+    """Data of one iteration: rows, instruments, their triangles, the estimate, and its residuals' inflation."""
 
     observed: Sequence[ObservationRows]
     simulated: Sequence[np.ndarray]
@@ -264,7 +264,7 @@ class _Found:
 
 
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
-    """Return the estimate with the instruments of these runs; its sigmas with the inflation `tau` of the last."""
+    """Return the estimate with instruments from these runs; `tau`: variance inflation, from the last iteration."""
     columns = task.base.kept
     moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
     simulated = [observe(task.model, columns, case, task.decimator).matrix for case in moved]
@@ -279,7 +279,7 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
 def _with_signs(
     task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, moved: Case
 ) -> ObservationRows:
-    """Return rows with Coulomb signs that are drowned in noise replaced (the module says by what).
+    """Return rows in which Coulomb signs dominated by noise are replaced (see the module).
 
     Args:
         simulated: (M, rows, p) of `moved`, the case as it was simulated.
@@ -300,7 +300,7 @@ def _with_signs(
 
 
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
-    """Return (p,) which columns are Coulomb signs of a joint whose measured speed is noisier than their smoothing."""
+    """Return which columns (p,) are Coulomb signs of a joint whose speed noise exceeds their smoothing."""
     noise, found = case.motion.velocity_noise(), np.zeros(len(columns), dtype=bool)
     for place, k in enumerate(columns - model.inertial):
         if k < 0 or model.columns[k].shape != "sign":
@@ -314,7 +314,7 @@ def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) 
 def _result(
     task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
 ) -> Instrumental:  # fmt: skip
-    """Return the result of the last round: σ with the inflation of its residuals, and the tests."""
+    """Return the result of the last iteration: σ with the variance inflation of its residuals, and the tests."""
     problem = found.problem if task.estimator.measured else _stack(found.observed, found.simulated)
     fit, bound = _held_fit(task, problem, std, found.tau)
     verdict = instrumental_variables.exogeneity(problem, std, found.tau)
@@ -326,19 +326,19 @@ def _result(
 
 
 def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
-    """Return a robot of inertia diag(J) and nothing else; its last n terms hold J."""
+    """Return a robot whose only inertia is diag(J); its last n terms are J."""
     if inertia is None:
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
         if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
-            raise UsageError("no regular inertia follows from these gains; state it, (n,) [kg m²]")
+            raise UsageError("these gains give no positive inertia to start from; state it, (n,) [kg m²]")
     n = model.bodies.n
     extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
     return Plant(model.bodies, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
 
 
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Simulate every loop without noise."""
+    """Return a simulated run of every loop, without noise."""
     result: Runs = []
     for case, loop in cases:
         robot, controller = _loaded(plant, case), loop.controller
@@ -349,7 +349,7 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 
 
 def _loaded(plant: Plant, case: Case) -> Plant:
-    """Return the plant without the payloads that the case does not carry."""
+    """Return the plant with only the payloads of the case."""
     there = IdentificationModel(plant.bodies).carried_columns(case.carried)
     return plant.with_parameters(plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
@@ -357,7 +357,7 @@ def _loaded(plant: Plant, case: Case) -> Plant:
 def _simulate_new(
     task: _Fixed, found: _Found, old: Plant, std: np.ndarray, tau: float
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
-    """Simulate the new parameters; where that fails those further from a singular inertia, if constraints hold them.
+    """Return the runs with the new parameters; after a failure, with parameters further from a singular inertia.
 
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
@@ -378,13 +378,13 @@ def _simulate_new(
                 task, found = further, replace(found, fit=fit, bound=held)
                 continue
         retreats += 1
-    raise CannotSimulate(f"the estimate cannot be simulated, nor anything near: {problem}", task.plant(old, found))
+    raise CannotSimulate(f"the estimate and smaller steps cannot be simulated: {problem}", task.plant(old, found))
 
 
 def _stack(
     observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True
 ) -> Instruments:  # fmt: skip
-    """Return the triangles of [Z W y], one group per torque row; of [Z 0 y], at a quarter of the cost, or less."""
+    """Return the triangles of [Z W y], one group per torque row; without `measured`, the cheaper ones of [Z 0 y]."""
     first, count = observed[0], observed[0].target.shape[1]
     problem = instrumental_variables.unseen(first.names, first.units, count)
     for rows, z in zip(observed, simulated, strict=True):
@@ -397,19 +397,19 @@ def _stack(
 
 
 def _simulated(problem: Instruments) -> Triangles:
-    """Return the triangles of [Z y]."""
+    """Return the triangles of [Z y], selected from those of [Z W y]."""
     return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
 
 
 def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
-    """Return how many rows count as one, the mean over torque rows of the residuals' integrated autocorrelation."""
+    """Return the variance inflation of the rows: mean over torque rows of the residuals' integrated autocorrelation."""
     series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
     longest = max(series, key=len)
     return max(1.0, float(np.mean([inflation(longest[:, row]) for row in range(longest.shape[1])])))
 
 
 def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
-    """Return a round's estimate, under the constraints where there are any."""
+    """Return the estimate of an iteration, with the constraints if any are set."""
     fit, own = task.estimator.fit(problem, std, tau), task.estimator
     if task.constraints is None:
         return fit, None
@@ -425,7 +425,7 @@ def _change(before: LinearFit | None, now: LinearFit) -> float:
 
 
 def _distance(runs: Runs) -> np.ndarray:
-    """Return how far the simulated robot is from the recorded one (n,) [%], over all recordings."""
+    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
     away, size = np.zeros((2, runs[0][0][0].motion.n))
     for (case, loop), run in runs:
         motion = case.motion
@@ -435,7 +435,7 @@ def _distance(runs: Runs) -> np.ndarray:
 
 
 def _stray(runs: Runs) -> np.ndarray:
-    """Return (n,) the slope of q_ref - q on q_ref - q_s, which noise in q does not bias; see `Instrumental`."""
+    """Return the regression slopes (n,) of q_ref - q on q_ref - q_s, unbiased by noise in q; see `Instrumental`."""
     pairs = []
     for (case, loop), run in runs:
         motion, used = case.motion, simulated_samples(case, run.t, loop)

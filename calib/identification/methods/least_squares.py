@@ -1,4 +1,4 @@
-"""The methods of the least-squares family: ordinary, weighted, robust and total, on the rows as they were observed."""
+"""Least-squares methods: ordinary, weighted, robust and total, on the observed rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -32,15 +32,15 @@ class _LeastSquares(Method):
     """A method that solves the rows directly.
 
     Attributes:
-        solve: the problem, (rows,) standard deviations and inflation to the fit.
-        weighted: whether rows are weighed with their standard deviations.
+        solve: function of the problem, standard deviations (rows,) and inflation (rows,) to the fit.
+        weighted: whether rows are weighted with their standard deviations.
     """
 
     solve: _Solve
     weighted: bool = True
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's columns, with a covariance that knows of residuals correlated in time.
+        """Return the estimate of the problem's columns, with a covariance for autocorrelated residuals.
 
         A prior of base parameters and the ridges of richer friction take part where the method takes them.
         """
@@ -59,7 +59,7 @@ class _LeastSquares(Method):
 
 
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
-    """Return the scaled TLS fit: columns that move have noise of `COLUMN_NOISE` of their size, y that of its residuals.
+    """Return the scaled TLS fit: moving columns have noise of `COLUMN_NOISE` times their rms, y that of its residuals.
 
     The common level is the smallest singular value's; the ratio of the noises, which no single recording identifies, is
     our choice.
@@ -78,7 +78,7 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
 
 
 def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rows,) standard deviations and inflation of a problem whose data determine every parameter."""
+    """Return the residuals' std and inflation (rows,) of a problem whose data identify every parameter."""
     pooled, noise = problem.pooled, problem.noise
     std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
     return std, residual_inflation(problem.rows, wls(pooled, std).estimate.values)
@@ -87,9 +87,9 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
 def _regularised(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
-    """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
+    """Return WLS with ridges of richer friction chosen by evidence, and with a prior of the base columns.
 
-    Beside it the covariance (p, p) of both, infinite where nothing is known, and the rows (k, p) that say it, whitened.
+    Also returned: the covariance (p, p) of both, infinite without prior or ridge, and their whitened rows (k, p).
     The prior counts `tempering` times.
     """
     pooled, group = problem.pooled, problem.groups
@@ -110,7 +110,7 @@ def _regularised(
 
 
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fit with a prior, the prior's rows (k, p), and std and inflation (rows,) of its residuals.
+    """Return the fit with a prior, the prior's rows (k, p), and its residuals' std and inflation (rows,).
 
     The prior counts `Prior.tempering` times more for the values than for their covariance; drives' inertia is positive
     and friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
@@ -131,7 +131,7 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
 
 
 def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the estimate (p,) whose friction brakes, but for joints at which that costs too much."""
+    """Return the estimate (p,) with dissipative friction, except at joints where that fits much worse."""
     fastest = np.max([np.abs(case.motion.v).max(axis=0) for case in problem.cases], axis=0)
     terms, pooled = problem.terms, problem.pooled
     factor = retriangulate(np.vstack([combine(pooled, std), np.pad(known, ((0, 0), (0, 1)))]))
@@ -150,7 +150,7 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
 
 
 def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
-    """Return (n,) which joints friction drives, by an estimate without bounds."""
+    """Return at which joints (n,) friction adds energy, by an estimate without bounds."""
     model, own = problem.model, problem.base.b
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
         return np.zeros(0, dtype=bool)
@@ -174,10 +174,10 @@ class _ConstrainedLeastSquares(Method):
     free: _LeastSquares
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate under the problem's constraints; its covariance takes those that bind as equalities.
+        """Return the estimate under the problem's constraints; for its covariance binding ones are equalities.
 
         Raises:
-            UsageError: for constraints that cannot be.
+            UsageError: for constraints that contradict each other.
         """
         constraints = problem.constrained
         return attempted(self.name, problem, lambda: self._estimate(problem, constraints))
@@ -198,12 +198,12 @@ class _ConstrainedLeastSquares(Method):
 def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
-    """Return IRLS over whole samples; one is worth what its most correlated row is, as S mixes the rows."""
+    """Return the IRLS fit over whole samples, with the variance inflation of the most correlated row."""
     return irls(samples_of(problem), inflation=float(np.max(tau)), solve=solve)
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
-    """Return the rows of all recordings, those of one instant together."""
+    """Return the rows of all recordings, grouped by sample."""
     rows = problem.rows
     parts = ([getattr(part, key) for part in rows] for key in ("matrix", "target", "present"))
     matrix, target, present = (np.concatenate(part) for part in parts)
@@ -211,25 +211,25 @@ def samples_of(problem: IdentificationProblem) -> Samples:
 
 
 OLS = _LeastSquares(
-    "ols", "the torques of all joints are equally noisy, q, v and a exact",
+    "ols", "the torques of all joints are equally noisy; q, v and a are exact",
     lambda problem, std, tau: ols(problem.pooled, tau), weighted=False,
-    description="least squares, all rows alike", source="Gauss; Atkeson, An & Hollerbach 1986",
+    description="least squares, equal weights", source="Gauss; Atkeson, An & Hollerbach 1986",
 )  # fmt: skip
 WLS = _LeastSquares(
-    "wls", "each joint's torque is as noisy as its own residuals say, q, v and a exact",
+    "wls", "each joint's torque noise is that of its residuals; q, v and a are exact",
     lambda problem, std, tau: wls(problem.pooled, std, tau), takes_prior=True,
-    description="least squares, each joint by its residuals", source="Gautier & Poignet 2001",
+    description="least squares, each joint weighted by its residuals", source="Gautier & Poignet 2001",
 )  # fmt: skip
 IRLS = _LeastSquares(
-    "irls", "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
+    "irls", "torque noise is correlated across joints, outlier samples are rejected; q, v, a are exact",
     lambda problem, std, tau: _reweighted(problem, tau).fit,
-    description="least squares, weighted across joints, odd samples gated out", source="Han, Wu, Liu & Xiong 2020",
+    description="least squares, weighted across joints, outliers rejected", source="Han, Wu, Liu & Xiong 2020",
     tunes=("gate of 3 sigma",), version=2,
 )  # fmt: skip
 TLS = _LeastSquares(
     "tls",
-    f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
-    "residuals, all up to one estimated factor, independently from row to row; offsets and signs are exact",
+    f"columns of W are noisy too, by {COLUMN_NOISE:.0%} of their rms, each joint's torque by its "
+    "residuals, both up to a common estimated factor, independently in each row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
     description="total least squares with scaled columns", version=2,
     source="Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",

@@ -1,4 +1,4 @@
-"""What every method of identification is: a problem goes in, an estimate with its status comes out.
+"""Interface of identification methods: from a problem to an estimate with its status.
 
 A failure is a status, not an exception: studies compare methods over conditions in which some of them fail. The error
 that says what to do about it is in the estimate, for whoever wants it raised (`MethodEstimate.fit`).
@@ -31,7 +31,7 @@ from calib.identification.rows import Case, ObservationRows, pool, triangulate
 
 
 class EstimateStatus(Enum):
-    """How an estimation ended."""
+    """Outcome of an estimation."""
 
     FOUND = "found"
     CANNOT_BE_SIMULATED = "cannot be simulated"
@@ -50,22 +50,22 @@ _STATUS = (
 
 @dataclass(frozen=True, eq=False)
 class IdentificationProblem:
-    """What there is to estimate from.
+    """The data and settings of an estimation.
 
     Attributes:
         model: linear in its parameters, with standard friction.
         base: its base columns.
-        cases: recordings, with their motion at the full rate.
+        cases: recordings with their motion at the full rate.
         decimator: the parallel filter of all rows.
-        rows: observation matrix and torques of each case, p columns: the base columns, then richer friction.
-        terms: (p,) the drive term behind each column; None for parameters of bodies.
+        rows: observation matrix and torques of each case; p columns, base columns first, then richer friction.
+        terms: (p,) drive term of each column; None for parameters of bodies.
         groups: (p,) ridge group of each column of richer friction; -1 for base columns.
-        noise: (rows,) of the torques, up to a common factor; None: from their residuals.
-        prior: of the base parameters; None where nothing is known beforehand.
-        loop: the closed loop that the recordings came from; None where none is stated.
-        cad: standard parameters of the bodies by the robot's description, for a loop that feeds them forward.
-        constraints: what the options ask of the estimate of a method that takes constraints; None: the defaults.
-        start: (p,) values that methods which simulate start from; None: least squares, where that can be simulated.
+        noise: (rows,) standard deviation of the torques, up to a common factor; None: from their residuals.
+        prior: prior of the base parameters; None without one.
+        loop: the closed loop in which the recordings were made; None if not stated.
+        cad: standard parameters of the bodies from the robot's description, for a loop that feeds them forward.
+        constraints: constraints of the options, for methods that support them; None: the defaults.
+        start: (p,) start values of methods that simulate; None: least squares, where that can be simulated.
     """
 
     model: RegressorModel
@@ -92,7 +92,7 @@ class IdentificationProblem:
 
     @cached_property
     def constrained(self) -> Constraints:
-        """What the columns must satisfy.
+        """Constraints on the columns.
 
         Raises:
             UsageError: see `make_constraints`.
@@ -103,36 +103,36 @@ class IdentificationProblem:
 
     @property
     def nonnegative(self) -> np.ndarray:
-        """(p,) bool: inertia and friction of drives, of which no robot has less than none."""
+        """Columns that must not be negative (p,) bool: inertia and friction of drives."""
         return np.array([one is not None and one.nonnegative for one in self.terms], dtype=bool)
 
     @property
     def exact(self) -> np.ndarray:
-        """(p,) bool: columns free of the noise of positions."""
+        """Columns without noise from measured positions (p,) bool."""
         return np.array([one is not None and one.form.exact for one in self.terms], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
 class MethodEstimate:
-    """What a method made of a problem.
+    """Result of a method on a problem.
 
     Attributes:
-        method: its name.
-        status: how it ended.
-        solution: values with covariance, and what they rest on; None unless found.
+        method: name of the method.
+        status: outcome of the estimation.
+        solution: values with covariance, and details of the fit; None unless found.
         pooled: triangles of all rows, one group per row.
-        std: (rows,) standard deviation that each row is weighed with: that of its residuals, unless stated.
-        inflation: (rows,) how many rows count as one, from the residuals' autocorrelation.
-        weighted: whether the rows were weighed with `std` (all but OLS).
-        beforehand: (k, p) rows L that a prior and ridges add to the whitened ones; None where there are none.
-        iterations: rounds of simulation and estimation; 1 for a method that needs none.
-        simulations: runs of the closed loop.
-        seconds: that it took.
-        failure: why there is no solution, and what to do.
-        instrumental: what the simulated closed loop says besides, where the method simulates.
-        loops: what was simulated.
-        held: what constraints made of it, where the method takes them.
-        alone: whether values and covariance say all there is, since least squares of `pooled` is another estimate.
+        std: (rows,) standard deviation by which each row is weighted: that of its residuals, unless stated.
+        inflation: (rows,) variance inflation: number of rows that count as one, from the residuals' autocorrelation.
+        weighted: whether the rows were weighted with `std` (all but OLS).
+        beforehand: (k, p) rows L that a prior and ridges add to the whitened ones; None without these.
+        iterations: of simulation and estimation; 1 for a method that does not iterate.
+        simulations: number of closed-loop simulations.
+        seconds: computing time.
+        failure: reason for a missing solution, and advice.
+        instrumental: further results of the simulated closed loop, for a method that simulates.
+        loops: the simulated closed loops.
+        held: the constrained estimate, for a method with constraints.
+        alone: whether only values and covariance describe it, because least squares of `pooled` differs.
     """
 
     method: str
@@ -172,7 +172,7 @@ class MethodEstimate:
         return self.fit.estimate
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
-        """Return triangles on which least squares gives this estimate, (g,) std and (g,) inflation: to test with."""
+        """Return triangles on which least squares gives this estimate, with std and inflation (g,), for tests."""
         if self.alone:
             return _standing_for(self.estimate), np.ones(1), np.ones(1)
         if self.instrumental is None:
@@ -190,7 +190,7 @@ class MethodEstimate:
 
 
 def _standing_for(estimate: Estimate) -> Triangles:
-    """Return triangles of one group on which least squares gives an estimate, its covariance and degrees of freedom."""
+    """Return triangles of one group that give, by least squares, an estimate, its covariance and degrees of freedom."""
     p = len(estimate.values)
     factor = np.zeros((1, p + 1, p + 1))
     factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
@@ -202,22 +202,22 @@ def _standing_for(estimate: Estimate) -> Triangles:
 
 @dataclass(frozen=True)
 class Method(ABC):
-    """A way from a problem to an estimate.
+    """A method that returns an estimate for a problem.
 
     The steps around a method (prior, richer friction, stated noise, elimination) ask it what it accepts.
 
     Attributes:
-        name: what options and files call it.
-        assumes: what its estimate rests on, for the user.
+        name: name in options and files.
+        assumes: assumptions of the estimate, for the user.
         description: one line.
-        source: whose it is.
-        tunes: what of it is chosen beforehand and not estimated from the data; () for nothing.
-        version: raised whenever it gives another estimate, or another count of rounds, of the same data: what studies
-            have kept of it from before then does not count, and is run again.
-        takes_prior: whether a prior, the ridges of richer friction and a stated noise of the rows have a place in it.
-        needs_controller: whether it simulates the closed loop that a recording came from.
+        source: authors and year.
+        tunes: settings chosen beforehand, not estimated from the data; () for none.
+        version: raised whenever the same data give another estimate or number of iterations: results that studies
+            have stored before are discarded and computed again.
+        takes_prior: whether it uses a prior, ridges of richer friction, and a stated noise of the rows.
+        needs_controller: whether it simulates the closed loop of a recording.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
-        takes_constraints: whether its estimate satisfies what the options' [constraints] ask.
+        takes_constraints: whether its estimate satisfies the options' [constraints].
     """
 
     name: str
@@ -233,7 +233,7 @@ class Method(ABC):
 
     @abstractmethod
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's p columns, or the status that says why there is none."""
+        """Return the estimate of the problem's p columns, or a status with the reason of failure."""
 
     def __str__(self) -> str:
         needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""
@@ -244,7 +244,7 @@ class Method(ABC):
 def attempted(
     method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate], loops: ClosedLoops | None = None
 ) -> MethodEstimate:
-    """Return what `run` makes of a problem, with the time it took; its failure as a status."""
+    """Return the result of `run` on a problem with its computing time; a failure is returned as a status."""
     began = time.perf_counter()
     try:
         found = run()

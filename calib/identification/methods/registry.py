@@ -1,4 +1,4 @@
-"""All methods by the names that options and files call them, in the order of lists."""
+"""All methods by their names in options and files, in the order of lists."""
 
 from collections.abc import Mapping
 
@@ -17,7 +17,7 @@ VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()
 
 
 def method_named(name: str) -> Method:
-    """Return the method that options and files call by this name.
+    """Return the method of this name in options and files.
 
     Raises:
         UsageError: for a name that is none of `METHODS`.

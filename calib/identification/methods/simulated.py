@@ -1,4 +1,4 @@
-"""Methods that simulate the closed loop a recording came from: instrumental variables, and DIDIM."""
+"""Methods that simulate the closed loop of a recording: instrumental variables, and DIDIM."""
 
 from dataclasses import dataclass, field, replace
 
@@ -13,11 +13,11 @@ from calib.identification.methods.method import IdentificationProblem, Method, M
 
 @dataclass(frozen=True)
 class _Simulated(Method):
-    """A method that simulates.
+    """A method that simulates the closed loop.
 
     Attributes:
-        instruments: what it makes of the simulated motion, see `calib.identification.methods.instrumental.ROUNDS`;
-            "": what the loop's settings say.
+        instruments: its use of the simulated motion, see `calib.identification.methods.instrumental.ROUNDS`;
+            "": by the loop's settings.
     """
 
     needs_controller: bool = field(default=True, kw_only=True)
@@ -26,7 +26,7 @@ class _Simulated(Method):
     instruments: str = ""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the base columns, with weights and inflation from WLS.
+        """Return the estimate of the base columns, with row weights and variance inflation from WLS.
 
         Raises:
             UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
@@ -40,10 +40,10 @@ class _Simulated(Method):
         return replace(found, seconds=plain.seconds + found.seconds)
 
     def beside(self, problem: IdentificationProblem, plain: MethodEstimate) -> MethodEstimate:
-        """Return the estimate, given the least-squares estimate `plain`."""
+        """Return the estimate, starting from the least-squares estimate `plain`."""
         model, loop = problem.model, problem.loop
         if loop is None or not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-            raise UsageError("instruments from simulation are for motor torques alone")
+            raise UsageError("instruments from simulation support motor torques only")
         loops = close_loops(model.bodies, problem.cases, problem.decimator, loop, problem.cad)
         return attempted(self.name, problem, lambda: self._estimate(problem, plain, model, loop, loops), loops)
 

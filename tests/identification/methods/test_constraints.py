@@ -88,7 +88,7 @@ def test_a_robot_that_cannot_be_is_made_one_that_can(problem):
     [
         ({"bounds": {"XX1": (0.0, 1.0)}}, "XX1 has no effect on the torques"),
         ({"bounds": {"M2": (0.0, 1.0)}}, "(no effect|only in sums with others)"),
-        ({"bounds": {"Fz1": (0.0, 1.0)}}, "'Fz1' is no parameter of this model"),
+        ({"bounds": {"Fz1": (0.0, 1.0)}}, "'Fz1' is not a parameter of this model"),
         (
             {"bounds": {"Fv1": (5.0, 6.0)}, "sum": (WeightedSum({"Fv1": 2.0}, most=3.0, name="twice Fv1"),)},
             "contradict each other: 5 <= Fv1 <= 6; twice Fv1 <= 3",
@@ -173,7 +173,7 @@ def test_the_options_file_says_them_and_other_methods_refuse_them():
     settings = parse_options(tomllib.loads(text)).settings
     found = identify(planted.arm(), [planted.case("a", 0)], settings)
     assert found.fitted.held is not None and "1 Fv1 + -1 Fv2 = 0" in found.fitted.held.constraints.names
-    with pytest.raises(UsageError, match="method 'wls' does not know them; take 'pc-wls'"):
+    with pytest.raises(UsageError, match="method 'wls' does not support them; use 'pc-wls'"):
         identify(planted.arm(), [planted.case("a", 0)], replace(settings, method="wls"))
     with pytest.raises(UsageError, match="lower bound 2 is above the upper 1"):
         parse_options({"constraints": {"bounds": {"Fv1": [2.0, 1.0]}}})

@@ -98,7 +98,7 @@ def test_identified_gains_are_kept(robot, tmp_path):
         ("[[coupling]]\njoints = [2, 9]", "joints 1 to 3"),
         ("[[coupling]]\njoints = [2, 2]", "coupled with itself"),
         ("[[term]]\nname = 'K'\nshape = 'sine'\njoint = 9\nsettings = [1.0, inf]", "joints 1 to 3"),
-        ("gains = [0]", "none of them zero"),
+        ("gains = [0]", "finite numbers other than zero"),
         ("gains = [inf]", "finite"),
     ],
 )

@@ -152,7 +152,7 @@ def test_waypoints_of_the_tool(room, capsys):
         (np.where(WAYPOINTS == 1.0, np.nan, WAYPOINTS), "row 2, column 'q2': found an empty or NaN cell"),
         (WAYPOINTS * 2, "beyond"),
         (["--drives", "drives.toml"], "take one of them away"),
-        (["--model", "."], "holds no identified model"),
+        (["--model", "."], "contains no identified model"),
         (["--payload", "tool"], "no payload 'tool'"),
         (["--rate", "0"], "rate: expected"),
         (["--line", "--shorten", "10"], "leave nothing to change"),
