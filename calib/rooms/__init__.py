@@ -1,1 +1,1 @@
-"""Rooms that can be shut: parts of the toolkit that the core does without (`calib.extensions`)."""
+"""Optional packages of the toolkit: the core works without them (`calib.extensions`)."""

@@ -1,4 +1,4 @@
-"""Images of a board: boards to print, corners found in images and bags, lenses estimated from them."""
+"""Camera calibration with a board: boards to print, corner detection in images and bags, lens estimation."""
 
 OFFERS = {
     "commands": "commands:app",

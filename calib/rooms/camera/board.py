@@ -37,7 +37,7 @@ DICTIONARIES = (
 @strict
 @dataclass(frozen=True)
 class Board:
-    """A board; see the module."""
+    """Type, size and markers of a printed board; see the module."""
 
     kind: Annotated[str, OneOf(KINDS)] = "charuco"
     columns: Annotated[int, Whole(2)] = 9
@@ -48,27 +48,27 @@ class Board:
 
     def __post_init__(self) -> None:
         if max(self.columns, self.rows) > 100:
-            raise ValueError(f"{self.columns} x {self.rows} squares: more than 100 in a row cannot be distinguished")
+            raise ValueError(f"{self.columns} x {self.rows} squares: the limit is 100 per row")
         if self.kind == "charuco" and not 0.3 * self.square <= self.marker <= 0.9 * self.square:
             raise ValueError(
-                f"marker = {self.marker:g}: of a charuco board the markers lie in the white squares, so that marker "
-                f"has to be between 0.3 and 0.9 of square = {self.square:g}"
+                f"marker = {self.marker:g}: the markers of a charuco board lie in its white squares: marker "
+                f"must be between 0.3 and 0.9 of square = {self.square:g}"
             )
         if self.kind == "apriltag" and not 0.05 * self.square <= self.marker <= 2.0 * self.square:
             raise ValueError(
-                f"marker = {self.marker:g}: of an apriltag grid this is the gap between two tags; 0.05 to 2 times "
+                f"marker = {self.marker:g}: the gap between two tags of an apriltag grid must be 0.05 to 2 times "
                 f"square = {self.square:g}"
             )
         words = f"{self.columns} x {self.rows} squares look the same upside down; an even and an odd number do not"
         require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, words, ValueError)
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
-            raise ValueError("a chessboard needs 4 squares each way at least")
+            raise ValueError("a chessboard needs at least 4 squares in each direction")
         if self.dictionary in DICTIONARIES and self.tags > (count := _dictionary_size(self.dictionary)):
             raise ValueError(f"{self.tags} markers are needed, the dictionary {self.dictionary} has {count}")
 
     @property
     def tags(self) -> int:
-        """How many markers it has."""
+        """Number of markers on the board."""
         count = self.columns * self.rows
         return {"charuco": count // 2, "apriltag": count, "chessboard": 0}[self.kind]
 
@@ -82,12 +82,12 @@ class Board:
 
     @property
     def words(self) -> str:
-        """The board in a few words."""
+        """Short description of the board."""
         what = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
         return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
 
     def checked(self) -> Board:
-        """Return this board after the checks that a board read from a file gets.
+        """Return this board after the checks of a board file.
 
         Raises:
             ValueError: where a value cannot be.
@@ -96,7 +96,7 @@ class Board:
 
 
 class _Refused(UsageError, ValueError):
-    """A board that cannot be."""
+    """Error for an impossible board."""
 
 
 def corners(board: Board) -> np.ndarray:
@@ -111,13 +111,13 @@ def corners(board: Board) -> np.ndarray:
 
 
 def _dictionary_size(name: str) -> int:
-    """Return how many markers a dictionary has."""
+    """Return the number of markers in a dictionary."""
     known = {"apriltag_16h5": 30, "apriltag_25h9": 35, "apriltag_36h10": 2320, "apriltag_36h11": 587}
     return known[name] if name in known else int(name.rsplit("_", 1)[1])
 
 
 def read_board(path: str | Path) -> Board:
-    """Read ``board.toml``, or the one in a folder.
+    """Return the board of a ``board.toml`` file, or of the one in a folder.
 
     Raises:
         UsageError: for a key or a value that cannot be.
@@ -127,7 +127,7 @@ def read_board(path: str | Path) -> Board:
 
 
 def write_board(board: Board, path: str | Path) -> Path:
-    """Write ``board.toml``."""
+    """Write a board as ``board.toml``."""
     comment = {"apriltag": "the gap between two tags [m]", "charuco": "side of a marker [m]"}.get(board.kind, "unused")
     lines = [
         f'kind = "{board.kind}"',

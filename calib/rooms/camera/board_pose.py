@@ -1,4 +1,4 @@
-"""Where a flat board stands before a camera whose lens is known: one pose per image, by its corners alone.
+"""Pose of a flat board relative to a camera with known lens (PnP): one pose per image, from its corners.
 
 A homography between table and rays (direct linear transformation; Zhang 2000, sec. 3.1) starts Gauss–Newton on the
 reprojection error. Seen from afar a plane has a second pose of nearly the same picture, tilted the other way about the
@@ -21,7 +21,7 @@ MIN_CORNERS = 6
 
 @dataclass(frozen=True, eq=False)
 class BoardPoses:
-    """What PnP finds in m images.
+    """Board poses and reprojection errors of m images, from PnP.
 
     Attributes:
         poses: (m, 4, 4) of the board in the camera's frame.
@@ -35,7 +35,7 @@ class BoardPoses:
 
 
 def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
-    """Return the board's pose in each image.
+    """Return the board's pose in the camera's frame for each image.
 
     Args:
         lens: of the camera.
@@ -72,7 +72,7 @@ def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:
 
 
 def _tilted_back(poses: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Return poses (m, 4, 4) with the boards' normals mirrored about the lines of sight to their middles."""
+    """Return poses (m, 4, 4) with the boards' normals mirrored about the line of sight to their centre."""
     middle = poses[:, :3, :3] @ table.mean(axis=0) + poses[:, :3, 3]
     sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     normal = poses[:, :3, 2]
@@ -84,7 +84,7 @@ def _tilted_back(poses: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 
 def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray) -> BoardPoses:
-    """Minimise the reprojection error of every image at once, by damped Gauss–Newton; see `board_poses`."""
+    """Return poses refined by damped Gauss–Newton on the reprojection error of each image; see `board_poses`."""
     seen = ~np.isnan(pixel[:, :, 0])
     damping = np.full(len(poses), 1e-6)
     cost, gradient, information = _normal(lens, table, pixel, seen, poses)

@@ -1,4 +1,4 @@
-"""What has to be found before a fit of images: the lens, whether the arm holds camera or board, and first placements.
+"""Initial values for a fit of images: lens, mounting (camera or board on the arm), and placements.
 
 Every image gives the board's pose by its corners alone (`calib.rooms.camera.board_pose`); the arm's poses beside them
 place camera and board in closed form (`calib.rooms.camera.robust_placement`). Both ways of mounting are tried.
@@ -32,7 +32,7 @@ LOST = 0.2  # median misfit over the distance to the board beyond which nothing 
 
 @dataclass(frozen=True, eq=False)
 class CameraPlacement:
-    """Where camera and board are, estimated from one block of images.
+    """Placement of camera and board, estimated from one block of images.
 
     Attributes:
         rows: (k,) the rows that were looked at.
@@ -48,7 +48,7 @@ class CameraPlacement:
 
 
 def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasurements] = ()) -> Pixels:
-    """Return a block of images with lens and mounting, and refuse one that cannot be this arm's.
+    """Return a block of images with lens and mounting; refuse images that contradict the arm's motion.
 
     Args:
         chain: the nominal arm.
@@ -68,7 +68,7 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
         from calib.rooms.camera.intrinsics import estimate_lens  # loads OpenCV
 
         if not block.size[0]:
-            raise MeasurementError("neither the images' size nor a lens (camera.yaml) is known", block.file)
+            raise MeasurementError("image size unknown: no lens (camera.yaml) and no image was given", block.file)
         block = replace(block, lens=estimate_lens(block.board, block.pixel, block.size, block.model, block.file))
     arm = forward(chain, block.q)
     found = place_camera(block, arm)
@@ -83,14 +83,14 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
 
 
 def _lens_of(block: Pixels) -> Lens:
-    """Return the lens of images that have one: their own, or what `complete_camera` has found."""
+    """Return the lens of a block of images, if it has one: their own, or what `complete_camera` has found."""
     if block.lens is None:
-        raise MeasurementError("the lens of these images is not known", block.file)
+        raise MeasurementError("the lens of these images is unknown", block.file)
     return block.lens
 
 
 def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.ndarray:
-    """Return the board's poses (k, 4, 4) in the camera's frame at some rows, each from its own image.
+    """Return the board's poses (k, 4, 4) in the camera's frame at some rows, each from its image alone.
 
     `max_at_once`: images whose corners are looked at together.
     """
@@ -99,7 +99,7 @@ def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.nd
 
 
 def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: float = 1.1774) -> Pixels:
-    """Return the block without outliers among the corners; its notes name them.
+    """Return the block without outlier corners; its notes name the removed ones.
 
     A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
 
@@ -124,12 +124,12 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: floa
         return block
     max_named = 3
     named = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), max_named)
-    words = f"{len(gone)} of {before.sum()} corners are outliers in their image and are left out: {named}"
+    words = f"{len(gone)} of {before.sum()} corners are outliers in their image, excluded: {named}"
     return replace(block, notes=(*block.notes, words))
 
 
 def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return the rows of images that contradict the others, and the sentence that names them.
+    """Return the rows of images that contradict the others, and a sentence that names these images.
 
     Raises:
         MeasurementError: where they are many.
@@ -146,25 +146,25 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
         return strange, ""
     turned = far(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= most
     cause = (
-        "turned by 180° they would fit: did a program rotate them?"
+        "would match if turned by 180°: did a program rotate them?"
         if turned.mean() > 0.5
-        else "are their joint values those of other images, or was camera or board moved?"
+        else "wrong joint values, or was camera or board moved?"
     )
     words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from where all others do: {cause}"
     words += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
     max_strange = 0.3  # share of images that may contradict the others, and are left out; more are refused
     if len(strange) > max_strange * len(block):
         raise MeasurementError(f"{len(strange)} of {len(block)} images {words}", block.file)
-    return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} left out, they {words}"
+    return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} excluded: they {words}"
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
-    """Return poses (m, 4, 4) of the moving one of camera and board in the fixed one, from board poses in the camera."""
+    """Return poses (m, 4, 4) of the moving body (camera or board) in the fixed one, from board poses in the camera."""
     return invert(poses) if mounting == IN_HAND else poses
 
 
 def pnp_poses(block: Pixels) -> Poses:
-    """Return images as measured poses, each from its corners alone (PnP), as a fit of poses would take them."""
+    """Return the images as measured poses for a fit of poses, each pose from its image's corners (PnP)."""
     seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
     return Poses(
         block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), station=block.station,
@@ -173,7 +173,7 @@ def pnp_poses(block: Pixels) -> Poses:
 
 
 def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
-    """Place the camera and the board of a block of images, in whichever mounting explains them.
+    """Return the placement of camera and board for a block of images, in the mounting with the smaller error.
 
     Args:
         block: with its lens.
@@ -189,8 +189,8 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
     min_images = 3  # images that place a camera at all
     if len(good) < min_images:
         raise MeasurementError(
-            f"{len(good)} images with a board place no camera: {min_images} at least, from different sides; a "
-            "calibration takes some 20 to 40",
+            f"{len(good)} images with a board do not determine the camera: at least {min_images} from different sides, "
+            "20 to 40 for a calibration",
             block.file,
         )
     rows, poses = rows[good], found.poses[good]
@@ -205,7 +205,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
         if other < min_contrast * one:
             raise MeasurementError(
                 f"whether the arm carries the camera or the board cannot be determined ({1e3 * one:.1f} against "
-                f"{1e3 * other:.1f} mm): say so in the options, [camera] mounting = 'in hand' or 'to hand'",
+                f"{1e3 * other:.1f} mm): state in the options [camera] mounting = 'in hand' or 'to hand'",
                 block.file,
             )
     return CameraPlacement(rows, poses, mounting, tried[mounting])
@@ -214,7 +214,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
 def _check_pairing(
     block: Pixels, arm: np.ndarray, poses: np.ndarray, mountings: Sequence[str], placed: Placement, lever: float
 ) -> None:
-    """Refuse images that belong to other rows of joints, or to none."""
+    """Refuse images whose joint values are those of other images or unrelated."""
     if placed.error <= 0.01 * lever or len(arm) < 6:
         return
     max_left = 0.25  # of the misfit is left with the rows shifted: they were
@@ -225,23 +225,23 @@ def _check_pairing(
         if again.error < max_left * placed.error:
             rows = counted(abs(shift), "row")
             raise MeasurementError(
-                f"images and joint values are shifted by {rows}: as they stand the board is off by "
-                f"{1e3 * placed.error:.0f} mm in the median, with each image beside the joints {rows} "
+                f"images and joint values are shifted by {rows}: the median board error is "
+                f"{1e3 * placed.error:.0f} mm as recorded; paired with the joints {rows} "
                 f"{'further down' if shift > 0 else 'further up'} by {1e3 * again.error:.1f} mm; correct the column "
                 "'image'",
                 block.file,
             )
     if placed.error > LOST * lever:
         raise MeasurementError(
-            f"images and joint values do not belong together: wherever camera and board are placed, the board is off "
-            f"by {1e3 * placed.error:.0f} mm in the median. Were the joints logged at these images, in this order and "
-            "unit, on this robot? Did the board (or the camera) stay where it was?",
+            f"images and joint values do not match: with camera and board placed best, the median board error is "
+            f"{1e3 * placed.error:.0f} mm. Were the joints logged at these images, in this order and "
+            "unit, on this robot? Was the board (or the camera) moved?",
             block.file,
         )
 
 
 def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_scale_error: float = 0.04) -> None:
-    """Refuse a board of another size than stated: the arm's motion gives the size of a square to a few per cent.
+    """Refuse a board whose square size contradicts the arm's motion, which gives it to a few per cent.
 
     Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
 
@@ -266,14 +266,14 @@ def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_sc
     if rank == 7 and abs(factor - 1.0) > max(max_scale_error, 6.0 * sigma) and sigma < 0.1:
         stated = 1e3 * block.board.square
         raise MeasurementError(
-            f"the robot's motion says that a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}), "
-            f"board.toml says {stated:.2f}: measure the print and put its size in (was it printed at 100 %?)",
+            f"a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}) by the robot's motion, "
+            f"{stated:.2f} in board.toml: measure the print and correct board.toml (was it printed at 100 %?)",
             block.file,
         )
 
 
 def optics_of(measured: Sequence[Pixels]) -> Optics:
-    """Return the cameras and boards of all images; of several blocks by one camera the first says its lens.
+    """Return the cameras and boards of all images; of several blocks by one camera, the first provides the lens.
 
     Raises:
         MeasurementError: for images whose camera is not known, or one camera with images of two sizes.
@@ -281,7 +281,7 @@ def optics_of(measured: Sequence[Pixels]) -> Optics:
     lenses, boards, free = {}, {}, set[str]()
     for block in measured:
         if block.lens is None or not block.mounting:
-            refuse_data(block.file, "lens and mounting of the camera are not known (see complete_camera)")
+            refuse_data(block.file, "lens and mounting of the camera are unknown (see complete_camera)")
         lens = lenses.setdefault(block.camera, block.lens)
         if lens.size != block.lens.size or lens.model != block.lens.model:
             refuse_data(
@@ -299,7 +299,7 @@ def optics_of(measured: Sequence[Pixels]) -> Optics:
 def _guess_frames(
     block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return station and tool (4, 4) of a block of images from the arm's poses (m, 4, 4); one of them may be known."""
+    """Return station and tool (4, 4) for a block of images from the arm's poses (m, 4, 4); one of both may be given."""
     found = place_camera(block, arm)
     if station is None and tool is None:
         return found.placed.station, found.placed.tool

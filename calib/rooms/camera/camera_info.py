@@ -1,4 +1,4 @@
-"""ROS ``camera_info`` YAML (camera_calibration_parsers): a lens read and written.
+"""Reading and writing a lens as ROS ``camera_info`` YAML (camera_calibration_parsers).
 
 ``image_width``, ``image_height``, ``camera_matrix: {data: [9]}``, ``distortion_model`` (``plumb_bob``,
 ``rational_polynomial``, ``equidistant``) and ``distortion_coefficients: {data: [...]}``; the flat keys of the message
@@ -20,7 +20,7 @@ MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant
 
 
 def read_lens(path: str | Path) -> Lens:
-    """Read a lens.
+    """Return the lens of a ``camera_info`` file.
 
     Raises:
         MeasurementError: naming the key that is missing or cannot be.
@@ -33,14 +33,14 @@ def read_lens(path: str | Path) -> Lens:
     except (OSError, UnicodeDecodeError, YAMLError) as error:
         raise MeasurementError(f"cannot be read as YAML ({str(error).splitlines()[0]})", path) from error
     if not isinstance(found, dict):
-        raise MeasurementError("holds no camera_info: expected image_width, camera_matrix, distortion_model", path)
+        raise MeasurementError("is not a camera_info file: expected image_width, camera_matrix, distortion_model", path)
     size = (_whole(found, ("image_width", "width"), path), _whole(found, ("image_height", "height"), path))
     matrix = _numbers(found, ("camera_matrix", "K", "k"), path)
     if len(matrix) != 9 or matrix[8] != 1.0 or abs(matrix[1]) > 1e-6 * abs(matrix[0]):
         raise MeasurementError(f"camera_matrix: expected [fx 0 cx 0 fy cy 0 0 1], found {matrix.tolist()}", path)
     bend = _numbers(found, ("distortion_coefficients", "D", "d"), path)
     name = str(found.get("distortion_model") or "plumb_bob").lower()
-    words = f"distortion_model '{name}'{suggestion(name, MODELS)} is none of {', '.join(MODELS)}"
+    words = f"distortion_model '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
     require(name in MODELS, words, MeasurementError, path)
     allowed = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}.get(name, (4,))
     if len(bend) not in allowed:

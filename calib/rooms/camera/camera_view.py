@@ -1,4 +1,4 @@
-"""Pose selection with a camera: which poses see the board, and what an image there would identify.
+"""Pose selection with a camera: visibility of the board, and observation Jacobian of images.
 
 ``[camera]`` of the constraints file states the camera (`calib formats constraints`).
 """
@@ -35,7 +35,7 @@ from poses.space import PoseConstraint
 CORNER, DISPLACEMENT, TURN = 0.05, 2e-5, 2e-5  # noise that a pose is judged by [px], [m], [rad]; our choice
 ASSUMED = (
     f"σ is predicted for corners of {CORNER:g} px and an arm that repeats to {1e3 * DISPLACEMENT:g} mm and "
-    f"{1e3 * TURN:g} mrad per axis; what no model holds comes on top"
+    f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
 )
 TRIES = 60
 
@@ -62,7 +62,7 @@ class CameraView:
 
     @property
     def lens(self) -> Lens:
-        """Of the camera."""
+        """Lens of the camera."""
         return self.cell.optics.lenses[0]
 
     def poses(self, q: np.ndarray) -> np.ndarray:
@@ -88,35 +88,35 @@ class CameraView:
 
     @property
     def stand(self) -> np.ndarray:
-        """(3,) where the camera or the board's middle stands, in the arm's base [m]."""
+        """Position (3,) of the fixed camera or of the fixed board's centre in the arm's base [m]."""
         placed = invert(self.cell.stations[0])
         middle = 0.5 * np.array(self.board.extent) if self.mounting == IN_HAND else np.zeros(2)
         return (placed @ [*middle, 0.0, 1.0])[:3]
 
     def constraint(self) -> PoseConstraint:
-        """Return it as pose selection takes it."""
+        """Return the visibility constraint for pose selection."""
         return PoseConstraint("board in view of the camera", self)
 
     @property
     def assumed(self) -> str:
-        """The assumptions of a predicted accuracy, as a sentence."""
+        """Sentence on the assumptions of a predicted accuracy."""
         return ASSUMED
 
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
-        """Return the observation Jacobian of images in the columns that postures which see the board can identify."""
+        """Return the observation Jacobian of images in columns identifiable with the board in view."""
         table = layout(self.cell)
         columns = np.concatenate([table.arm_index, table.frame_index])
         q = self.draw(100, lambda each: np.all(self(each) <= 1e-8, axis=1), lower, upper, seed)
         if len(q) < 20:
             raise UsageError(
-                f"the camera sees the board at hardly any posture ({len(q)} of 100 were found): look at [camera], "
-                "carried and stands, tilt and range"
+                f"the camera sees the board at hardly any posture ({len(q)} of 100 were found): check [camera], "
+                "carried, stands, tilt and range"
             )
         split = base_columns(self.cell, self.block(q), columns)
         return ImageObservation(self.cell, True, columns[split.kept], view=self)
 
     def block(self, q: np.ndarray) -> list[Block]:
-        """Return images of the board at joint values (m, n) as a fit takes them, without what they show."""
+        """Return a block of images at joint values (m, n) for a fit, without measured corners."""
         pixel = np.zeros((len(q), len(corners(self.board)), 2))
         block = Pixels(
             q, self.cell.chain.joint_names, pixel, self.board, self.lens, mounting=self.mounting,
@@ -128,7 +128,7 @@ class CameraView:
         self, count: int, feasible: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray,
         seed: int | np.random.Generator,
     ) -> np.ndarray:  # fmt: skip
-        """Return up to `count` postures (·, n) that see the board: views are drawn, and the arm put there.
+        """Return up to `count` random postures (·, n) with the board in view: views are drawn, and the arm put there.
 
         Postures drawn at random see a board once in a thousand.
         """
@@ -145,7 +145,7 @@ class CameraView:
         return result[:count]
 
     def _views(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Return random poses (count, 4, 4) of the board before the camera."""
+        """Return random poses (count, 4, 4) of the board in front of the camera."""
         about, lean = rng.uniform(-np.pi, np.pi, count), self.tilt * np.sqrt(rng.uniform(0.0, 1.0, count))
         axis = np.column_stack([np.cos(about), np.sin(about), np.zeros(count)])
         roll = Rotation.from_rotvec(np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0]))
@@ -185,7 +185,7 @@ class ImageObservation(Observation):
 
 
 def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> CameraView:
-    """Return the view that a constraints file states.
+    """Return the camera view described by a constraints file.
 
     Args:
         stated: its table.

@@ -1,4 +1,4 @@
-"""A camera as the instrument: board, images."""
+"""Commands for a camera as the instrument: board, images."""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,17 +26,17 @@ def board(
 ) -> None:
     """Make a board to print at true scale; a ruler checks the print.
 
-    ChArUco is the one to take: seen in part it still counts, and its corners are found to hundredths of a pixel; the
+    Take ChArUco: it may be seen in part, and its corners are found to hundredths of a pixel; the
     corners of tags ten times worse. Print at 100 %, glue it onto something flat, measure a square, correct board.toml.
 
     Args:
         out: folder for board.toml, board.pdf and board.svg
         kind: charuco, chessboard or apriltag (a grid)
-        columns: squares (tags) across; by default 9, of a chessboard 10
-        rows: squares (tags) down
-        square: side of a square (tag), in mm
-        marker: side of a marker; of apriltag the gap between tags
-        dictionary: of the markers: 4x4_50 to 7x7_1000, apriltag_36h11
+        columns: squares (tags) per row; default 9, chessboard 10
+        rows: squares (tags) per column
+        square: side of a square (or tag) [mm]
+        marker: side of a marker; for apriltag the gap between tags
+        dictionary: marker dictionary: 4x4_50 to 7x7_1000, apriltag_36h11
         paper: a4, a3, a2, a1 or a0; by default the smallest that fits
     """
     from calib.rooms.camera.pictures import boards
@@ -53,17 +53,17 @@ def images(
     image_topic: str | None = None,
     joint_topic: str | None = None,
 ) -> None:
-    """Find the board in images or a bag. What is useless is named; a bag's images become a folder.
+    """Find the board in images or a bag. Unusable images are named; a bag's images become a folder.
 
-    A folder that was looked at holds corners.csv, and goes where a CSV file of measured poses goes: calib fit ROBOT
+    The folder then contains corners.csv, and goes where a CSV file of measured poses goes: calib fit ROBOT
     FOLDER. See calib formats images.
 
     Args:
         source: a folder of images with board.toml, or a ROS bag / MCAP file
-        board: board.toml, of a bag
-        out: folder to write images' corners and joints into, of a bag
-        image_topic: of a bag with several cameras
-        joint_topic: of a bag with several robots
+        board: board.toml for a bag
+        out: output folder for corners and joints of a bag
+        image_topic: image topic of a bag with several cameras
+        joint_topic: joint topic of a bag with several robots
     """
     from calib.errors import UsageError
     from calib.rooms.camera.pictures import boards
@@ -74,7 +74,7 @@ def images(
         elif not source.exists():
             raise UsageError(f"{source}: no such file or folder")
         elif board is None or out is None:
-            raise UsageError(f"{source} has no board.toml; of a bag --board and --out are needed")
+            raise UsageError(f"{source} has no board.toml; for a bag give --board and --out")
         else:
             lines = boards.from_bag(source, board, out, image_topic, joint_topic, show)
     for line in lines:

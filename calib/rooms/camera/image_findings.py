@@ -1,4 +1,4 @@
-"""Findings on the images of a fit: reprojection error, errors of the arm in it, coverage, scale of the board."""
+"""Findings on the images of a fit: reprojection error, the arm's share of it, image coverage, board scale."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ MAX_NOISE = 4.0  # corner noise over its stated sigma from which on it is remark
 
 
 def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
-    """Return where the images of a fit show corners; nothing where there are none."""
+    """Return the image coverage by corners of a fit's images; empty without images."""
     result = []
     for piece in found.pieces:
         block, part = found.blocks[piece.block].measured, piece.part
@@ -37,7 +37,7 @@ def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float | None:
-    """Return the rms distance of corners seen from corners predicted [px]; None without images."""
+    """Return the rms distance between detected and predicted corners [px]; None without images."""
     squares = [
         np.sum(part.value**2, axis=0)
         for block in prepare(cell, blocks, torques)
@@ -48,7 +48,7 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques
 
 
 def image_words(block: Pixels) -> str:
-    """Return a sentence on images that have just arrived: corners, mounting, lens, coverage."""
+    """Return a summary sentence of newly read images: corners, mounting, lens, coverage."""
     lens = block.lens
     focal = "" if lens is None else f", focal length {lens.values[0]:.0f} px {'given' if block.known else 'found'}"
     seen = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
@@ -57,7 +57,7 @@ def image_words(block: Pixels) -> str:
 
 
 def image_notes(found: GeometricFit) -> list[Finding]:
-    """Return findings on a fit's images; nothing where there are none."""
+    """Return findings on a fit's images; empty without images."""
     result: list[Finding] = []
     others = [Path(block.measured.file).name for block in found.blocks if not isinstance(block.measured, Pixels)]
     for piece in found.pieces:
@@ -78,13 +78,13 @@ def image_notes(found: GeometricFit) -> list[Finding]:
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
-    """Return how many corners (N, 2) [px] lie in each cell of an image, (rows, columns) of `GRID`; or their weight."""
+    """Return the number (or weight) of corners (N, 2) [px] in each cell of an image, (rows, columns) of `GRID`."""
     bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
     return np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)[0].T
 
 
 def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
-    """Return how much of the image the corners cover, with advice where that is little."""
+    """Return a sentence on the share of the image covered by corners, with advice if it is small."""
     share = float(np.mean(coverage(pixels, size) > 0))
-    few = ": bring the board nearer and into the image's corners, else the lens is not identifiable there"
+    few = ": the lens is not identifiable elsewhere; bring the board closer and into the image's corners"
     return f"corners lie in {share:.0%} of the image{few if share < 0.6 else ''}"

@@ -1,4 +1,4 @@
-"""The lens estimated from images of a board, and whether it is identifiable from them.
+"""Estimation of a lens from images of a board, with a check that it is identifiable.
 
 Zhang's (2000) problem, min over lens and one pose per image of the reprojection error, by variable projection (Golub &
 Pereyra 1973; Kaufman 1975): for a lens every image has its own best pose, and what a QR of its rows leaves beyond those
@@ -24,7 +24,7 @@ WRONG = 50.0  # reprojection error of no lens [px]
 def estimate_lens(
     board: Board, pixel: np.ndarray, size: tuple[int, int], model: str = "pinhole", file: str = ""
 ) -> Lens:
-    """Return the lens that images (m, K, 2) [px] of a flat board determine.
+    """Return the lens estimated from images (m, K, 2) [px] of a flat board.
 
     Args:
         board: what was seen.
@@ -105,7 +105,7 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
 
 
 def _squares(rows: np.ndarray) -> float:
-    """Return the sum of the squared residuals, the last column; infinite for a lens that projects nowhere."""
+    """Return the sum of squares of the residuals (last column); infinite for a lens without valid projection."""
     return float(np.nan_to_num(rows[:, FITTED] @ rows[:, FITTED], nan=np.inf))
 
 
@@ -122,7 +122,7 @@ def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
 
 
 def _focal_sigma(lens: Lens, matrix: np.ndarray, rms: float) -> float:
-    """Return the larger relative sigma of the focal lengths, every image's pose being unknown; infinite for none."""
+    """Return the larger relative sigma of both focal lengths with unknown poses; infinite if not identifiable."""
     size = np.linalg.norm(matrix, axis=0) + 1e-300
     _, values, axes = np.linalg.svd(matrix / size, full_matrices=False)
     if values[-1] < 1e-9 * values[0]:

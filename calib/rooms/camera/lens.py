@@ -1,4 +1,4 @@
-"""How a camera maps points to pixels: pinhole with Brown–Conrady distortion, and fisheye; with exact derivatives.
+"""Lens models from points to pixels: pinhole with Brown–Conrady distortion, and fisheye; with exact derivatives.
 
 A point (X, Y, Z) [m] in the camera's frame (x right, y down, z forward) has a = X/Z, b = Y/Z, r² = a² + b²:
 
@@ -26,7 +26,7 @@ PLAIN = 9  # values of a pinhole without the rational model's denominator
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """The intrinsics of one camera.
+    """Intrinsics of one camera.
 
     Attributes:
         model: ``pinhole`` or ``fisheye``.
@@ -41,22 +41,22 @@ class Lens:
     def __post_init__(self) -> None:
         values = frozen(self.values)
         if self.model not in NAMES or len(values) not in {"pinhole": (9, 12), "fisheye": (8,)}[self.model]:
-            raise CalibError(f"no camera model '{self.model}' with {len(values)} values; there are pinhole and fisheye")
+            raise CalibError(f"no camera model '{self.model}' with {len(values)} values; known: pinhole, fisheye")
         if not np.isfinite(values).all() or min(values[:2]) <= 0.0:
-            raise CalibError(f"camera: focal lengths {values[0]:g}, {values[1]:g} px cannot be")
+            raise CalibError(f"camera: focal lengths {values[0]:g}, {values[1]:g} px are impossible")
         object.__setattr__(self, "values", values)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the values."""
+        """Names of the intrinsic parameters."""
         return NAMES[self.model][: len(self.values)]
 
     def with_values(self, values: np.ndarray) -> Lens:
-        """Return the lens with other values."""
+        """Return the lens with other parameter values."""
         return replace(self, values=values)
 
     def in_sight(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Say which points (N, 3) [m] fall into the image, `margin` [px] inside its edge: (N,) bool.
+        """Return whether points (N, 3) [m] project into the image, `margin` [px] inside its edge: (N,) bool.
 
         A point beyond the angle at which the distortion's polynomial turns back is out of sight, wherever it falls.
         """
@@ -69,7 +69,7 @@ class Lens:
         return ahead & inside & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return pixels (N, 2) of points (N, 3) [m] before the camera."""
+        """Return pixels (N, 2) of points (N, 3) [m] in the camera's frame."""
         return _projected(self, points, False)[0]
 
     def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -78,7 +78,7 @@ class Lens:
 
 
 def pinhole(focal: float, size: tuple[int, int], distortion: tuple[float, ...] = ()) -> Lens:
-    """Return a pinhole with square pixels and its principal point in the middle.
+    """Return a pinhole lens with square pixels and the principal point at the image centre.
 
     Args:
         focal: [px].
@@ -109,7 +109,7 @@ def _projected(lens: Lens, points: np.ndarray, slopes: bool) -> tuple[np.ndarray
 
 
 def _brown_conrady(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return bent coordinates (N, 2), their derivative by the plain ones (N, 2, 2) and by k (N, 2, len(k))."""
+    """Return distorted coordinates (N, 2) and their derivatives by undistorted ones (N, 2, 2) and k (N, 2, len(k))."""
     a, b = plane[:, 0], plane[:, 1]
     square = a * a + b * b
     k1, k2, p1, p2, k3 = k[:5]
@@ -139,7 +139,7 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.n
 
 
 def _fisheye(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return as `_brown_conrady`."""
+    """Return distorted coordinates and derivatives of a fisheye lens, as `_brown_conrady`."""
     r = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
     angle = np.arctan(r)
     powers = angle[:, None] ** np.array([2, 4, 6, 8])
@@ -155,7 +155,7 @@ def _fisheye(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray
 
 
 def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """Return X/Z and Y/Z (N, 2) of pixels (N, 2), by Newton's method; NaN where no ray leads there."""
+    """Return X/Z and Y/Z (N, 2) of pixels (N, 2), by Newton's method; NaN for pixels that no ray reaches."""
     wanted = (pixels - lens.values[2:4]) / lens.values[:2]
     if lens.model == "fisheye":
         long = np.linalg.norm(wanted, axis=1)

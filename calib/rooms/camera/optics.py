@@ -1,4 +1,4 @@
-"""Parameters that images add to an installation: lenses, and the shape of boards as printed; with derivatives.
+"""Parameters that images add to an installation: lenses and shapes of printed boards, with derivatives.
 
 A corner (x, y, 0) of the table stands on the board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y counted
 from the board's middle: s is the scale of the print, b how the board bends [1/m]. In ``robot.toml`` of a fit::
@@ -34,7 +34,7 @@ UNITS = ("", "1/m", "1/m", "1/m")
 
 @dataclass(frozen=True)
 class BoardShape:
-    """How a print differs from its table: scale, and bending [1/m]."""
+    """Deviation of a printed board from its corner table: scale, and bending [1/m]."""
 
     scale: float = 1.0
     bend_xx: float = 0.0
@@ -43,18 +43,18 @@ class BoardShape:
 
     @property
     def values(self) -> np.ndarray:
-        """The four values."""
+        """The four values (scale and bending)."""
         return np.array([self.scale, self.bend_xx, self.bend_xy, self.bend_yy])
 
     @property
     def bent(self) -> bool:
-        """Whether it is not flat."""
+        """Whether the board is not flat."""
         return any((self.bend_xx, self.bend_xy, self.bend_yy))
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """All cameras and boards of an installation; without any where nothing was seen by a camera.
+    """All cameras and boards of an installation; empty without images.
 
     Attributes:
         lenses: one per camera, by name.
@@ -70,32 +70,32 @@ class Optics:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One per parameter: the lenses' values first, then the boards' shapes."""
+        """Names of the parameters: the lenses' values first, then the boards' shapes."""
         own = [f"{name}.{value}" for name, lens in zip(self.lens_names, self.lenses) for value in lens.names]
         return (*own, *(f"{name}.{value}" for name in self.board_names for value in SHAPE))
 
     @property
     def units(self) -> tuple[str, ...]:
-        """One per parameter."""
+        """Units of the parameters."""
         own = [unit for lens in self.lenses for unit in ("px", "px", "px", "px", *[""] * (len(lens.values) - 4))]
         return (*own, *(UNITS * len(self.boards)))
 
     @property
     def values(self) -> np.ndarray:
-        """All parameters."""
+        """Values of all parameters."""
         own = [lens.values for lens in self.lenses] + [board.values for board in self.boards]
         return np.concatenate([np.zeros(0), *own])
 
     @property
     def moving(self) -> np.ndarray:
-        """Positions of those that may be fitted."""
+        """Indices of the parameters that may be fitted."""
         return np.array([k for k, name in enumerate(self.names) if name in self.free], dtype=int)
 
     def __len__(self) -> int:
         return sum(len(lens.values) for lens in self.lenses) + len(SHAPE) * len(self.boards)
 
     def with_values(self, values: np.ndarray) -> Optics:
-        """Return the same with other values; a focal length changes by half at most, however wild the step."""
+        """Return the optics with other parameter values; a focal length changes by half at most per step."""
         lenses, start = [], 0
         for lens in self.lenses:
             own = np.array(values[start : start + len(lens.values)])
@@ -106,7 +106,7 @@ class Optics:
         return replace(self, lenses=tuple(lenses), boards=tuple(BoardShape(*map(float, row)) for row in shapes))
 
     def like(self, other: Optics) -> Optics:
-        """Return the same cameras and boards with the values of another's where they are of one kind; none is free."""
+        """Return these optics with the values of others of the same kind, all of them fixed."""
         known = {(lens.model, lens.size): lens for lens in reversed(other.lenses)}
         lenses = tuple(known.get((lens.model, lens.size), lens) for lens in self.lenses)
         shapes = {name: shape for name, shape in zip(other.board_names, other.boards)}
@@ -115,7 +115,7 @@ class Optics:
         return replace(self, lenses=lenses, boards=boards, free=frozenset())
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
-        """Return the lens and the board that images are predicted with, and which of their values are free."""
+        """Return lens, board shape and free parameters for the prediction of a block of images."""
         if not isinstance(measured, Pixels):
             return None
         if measured.camera not in self.lens_names or measured.target not in self.board_names:
@@ -145,7 +145,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class _Camera:
-    """An entry of ``camera``."""
+    """An entry of the table ``camera``."""
 
     name: str
     model: str
@@ -155,7 +155,7 @@ class _Camera:
 
 @dataclass(frozen=True)
 class _Board(BoardShape):
-    """An entry of ``board``."""
+    """An entry of the table ``board``."""
 
     name: str = ""
 
@@ -177,7 +177,7 @@ def read_optics(cameras: Sequence[Mapping[str, Any]], boards: Sequence[Mapping[s
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The camera and the board of one block of images, for its residuals.
+    """Lens and board shape of one block of images, for its residuals.
 
     Attributes:
         lens, shape: of the camera and the board.
@@ -192,12 +192,12 @@ class View:
 
 
 def shaped_points(board: Board, shape: BoardShape, points: np.ndarray) -> np.ndarray:
-    """Return where points (N, 3) [m] of a board's table stand on the print."""
+    """Return the positions of a corner table's points (N, 3) [m] on the printed board."""
     return _shaped(board, shape, points)[0]
 
 
 def shape_slopes(board: Board, shape: BoardShape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points (N, 3) [m] stand, and the derivative by the four values (N, 3, 4)."""
+    """Return positions (N, 3) [m] on the printed board, and their derivatives by the four values (N, 3, 4)."""
     return _shaped(board, shape, points)
 
 

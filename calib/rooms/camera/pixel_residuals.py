@@ -39,7 +39,7 @@ MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
 
 @dataclass(frozen=True, eq=False)
 class ImageNoise(Frozen):
-    """The noise of one block of images.
+    """Noise of one block of images.
 
     Attributes:
         factor: of the corners' stated sigmas.
@@ -58,7 +58,7 @@ class ImageNoise(Frozen):
 
     @property
     def deviations(self) -> np.ndarray:
-        """(6,) standard deviations of ξ."""
+        """Standard deviations (6,) of ξ."""
         return np.repeat([self.displacement, self.turn], 3)
 
     def unweighted(self, images: int) -> ImageNoise:
@@ -74,7 +74,7 @@ class ImageNoise(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class OwnPoses:
-    """Estimates of k images, each fitted with a pose of its own.
+    """Estimates of k images, each with a free pose.
 
     Attributes:
         residual: (k, 6) of what the arm carries: best pose minus predicted [v; ω].
@@ -90,7 +90,7 @@ class OwnPoses:
 
 
 def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
-    """Return the noise that residuals at an optimum show.
+    """Return the noise estimated from the residuals at an optimum.
 
     Args:
         found: see there.
@@ -136,7 +136,7 @@ STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axi
 
 @dataclass(frozen=True, eq=False)
 class PixelPart(Part):
-    """Residuals of corners, ordered by image; ``jacobian`` is that of what the corners of an image share.
+    """Residuals of corners, ordered by image; ``jacobian`` is that of the pose shared by an image's corners.
 
     Attributes:
         value, sigma: (2, N) [px].
@@ -209,7 +209,7 @@ class PixelPart(Part):
         return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
-        """Return estimates in which each image has a pose of its own, at sigmas `scale` (2, N)."""
+        """Return estimates with a free pose per image, at sigmas `scale` (2, N)."""
         images, first = np.unique(self.index, return_index=True)
         counts = np.diff(np.append(first, len(self.index)))
         table = np.concatenate([self.local[:, :, :6], self.value.T[:, :, None]], axis=2) / scale.T[:, :, None]
@@ -229,7 +229,7 @@ class PixelPart(Part):
         return replace(noise, weight=weight, shared=self._shared_errors(noise))
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
-        """Return the corners' residuals (2, N) [px] after fitting each image's own pose."""
+        """Return the corners' residuals (2, N) [px] after a fit of a free pose per image."""
         images, place = np.unique(self.index, return_inverse=True)
         found = self.own_poses(sigma)
         moved = np.einsum("kij,kj->ki", self.carried[images], found.residual)
@@ -258,9 +258,9 @@ def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
 
 @parts.register
 def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = y - π(point), see the module."""
+    """Return the corner residuals r = y - π(point); see the module."""
     if seen.view is None:
-        refuse_data(measured.file, "no camera is known for these images")
+        refuse_data(measured.file, "the camera of these images is unknown")
     view, in_hand = seen.view, measured.mounting == IN_HAND
     image, corner = np.nonzero(measured.seen)
     place, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
@@ -294,7 +294,7 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 
 def _twist_of_board(jacobian: np.ndarray, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return [v; ω] of the board in the camera's axes (f, 6, m) from those of the camera in the board's.
+    """Return [v; ω] of the board in the camera's axes (f, 6, m) from that of the camera in the board's axes.
 
     With the board at (R, o) in the camera's frame, ω' = -R ω and o' = -R v + ω' × o.
 

@@ -1,4 +1,4 @@
-"""Measurements by a camera: corners of a board in images; one image is one row."""
+"""Camera measurements: corners of a board in images, one row per image."""
 
 from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
@@ -13,7 +13,7 @@ from calib.rooms.camera.lens import Lens
 
 @dataclass(frozen=True, eq=False)
 class Pixels(PoseMeasurements):
-    """Where the corners of one rigid board lie in the image.
+    """Pixel positions of a rigid board's corners in m images.
 
     The camera in the hand: the arm carries the camera (``tool``), ``station`` is the board's place. The camera to the
     hand: the arm carries the board (``tool``), ``station`` is the camera's place.
@@ -49,7 +49,7 @@ class Pixels(PoseMeasurements):
 
     @property
     def seen(self) -> np.ndarray:
-        """(m, K) which corners were seen."""
+        """Whether each corner was detected, (m, K)."""
         return ~np.isnan(self.pixel[:, :, 0])
 
     @property
@@ -58,7 +58,7 @@ class Pixels(PoseMeasurements):
 
     @property
     def camera(self) -> str:
-        """The name of the camera among an installation's lenses: what carries it."""
+        """Name of the camera among an installation's lenses: the tool or station that holds it."""
         return self.tool_names[0] if self.mounting == IN_HAND else self.station
 
     @property
@@ -67,9 +67,9 @@ class Pixels(PoseMeasurements):
 
     @property
     def target(self) -> str:
-        """The name of the board among an installation's boards."""
+        """Name of the board among an installation's boards."""
         return self.station if self.mounting == IN_HAND else self.tool_names[0]
 
     def name(self, row: int) -> str:
-        """Return the name of the image whose number in the file is `row`."""
+        """Return the image's name by its row number in the file."""
         return self.names[row - 1] if 0 < row <= len(self.names) else f"image {row}"

@@ -1,4 +1,4 @@
-"""Where a camera and a board stand, from poses alone: three closed forms of B_i = S A_i X, and which of them is best.
+"""Placement of camera and board from poses: the best of three closed forms of B_i = S A_i X.
 
 * Shah (2013): rotations by the Kronecker product's first singular pair, then translations;
 * Li, Wang & Wu (2010): rotations and translations at once, S⁻¹ B_i = A_i X as one homogeneous linear system;
@@ -19,7 +19,7 @@ from calib.transforms import invert, orthonormal, pose
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """What a closed form says of m poses.
+    """Placement of m poses by a closed form.
 
     Attributes:
         method: its name.
@@ -34,7 +34,7 @@ class Placement:
 
     @property
     def error(self) -> float:
-        """The median misfit [m]."""
+        """Median misfit [m]."""
         return float(np.median(self.misfit))
 
 
@@ -66,7 +66,7 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
             if keep.sum() < 5:
                 break
     if best is None:
-        raise np.linalg.LinAlgError("no closed form places the target")
+        raise np.linalg.LinAlgError("no closed form yields a placement of the target")
     return best
 
 

@@ -1,3 +1,3 @@
-"""Virtual cells, whose truth is known: robots, instruments and errors for demonstrations, studies and tests."""
+"""Virtual cells with known truth: robots, instruments and errors for demonstrations, studies and tests."""
 
 OFFERS = {"commands": "commands:app"}

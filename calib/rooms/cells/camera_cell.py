@@ -1,4 +1,4 @@
-"""A virtual cell with a camera: the arm as it really is, camera and board where they really are, and images of them.
+"""A virtual cell with a camera: true arm, true placements of camera and board, and simulated images.
 
 Corners are either projected, with white noise (`photograph`), or found in rendered images (`take_pictures`), which have
 everything that real images have: see `calib.rooms.cells.rendered_camera`.
@@ -61,18 +61,18 @@ class CameraCell:
 
     @property
     def lens(self) -> Lens:
-        """The true lens."""
+        """True lens."""
         return self.cell.truth.optics.lenses[0]
 
     @property
     def shape(self) -> BoardShape:
-        """The board as it was printed."""
+        """True shape of the printed board."""
         return self.cell.truth.optics.boards[0]
 
 
 @dataclass(frozen=True)
 class Views:
-    """Which views of the board are sought: its distance [m], tilt [rad] at most, and whether all of it is in view."""
+    """Ranges of the random views of the board: distance [m], maximum tilt [rad], and whether it is fully in view."""
 
     distance: tuple[float, float] = RANGE
     tilt: float = TILT
@@ -120,7 +120,7 @@ def _reach(chain: Chain) -> float:
 
 
 def _looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the pose of a camera at `eye` (3,) [m] that looks at a point, its x level."""
+    """Return the pose of a camera at `eye` (3,) [m] that looks at a point, with horizontal x axis."""
     ahead = (at - eye) / np.linalg.norm(at - eye)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -140,7 +140,7 @@ def views(
     sought: Views | None = None,
     free: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Return joint values (count, n) within the limits at which the camera sees the board, at random.
+    """Return joint values (count, n) at random within the limits, with the board in the camera's view.
 
     Args:
         found: the cell.
@@ -171,7 +171,7 @@ def views(
 
 
 def _random_views(found: CameraCell, count: int, rng: np.random.Generator, sought: Views) -> np.ndarray:
-    """Return random poses (count, 4, 4) of the board before the camera, its middle well in the image."""
+    """Return random poses (count, 4, 4) of the board in front of the camera, with its centre well inside the image."""
     lens, middle = found.lens, 0.5 * np.array([*found.board.extent, 0.0])
     if found.mounting != IN_HAND:
         sought = replace(sought, distance=(2.0 * sought.distance[0], 3.0 * sought.distance[1]))
@@ -187,7 +187,7 @@ def _random_views(found: CameraCell, count: int, rng: np.random.Generator, sough
 
 
 def visible(found: CameraCell, q: np.ndarray) -> np.ndarray:
-    """Say which corners (m, K) fall into the image and face the camera at joint values q (m, n)."""
+    """Return whether corners (m, K) fall into the image and face the camera at joint values q (m, n)."""
     poses = board_poses(found, q)
     flat = _points(found, poses).reshape(-1, 3)
     facing = np.einsum("mi,mi->m", poses[:, :3, 2], poses[:, :3, 3]) > 0.0
@@ -202,7 +202,7 @@ def _points(found: CameraCell, poses: np.ndarray) -> np.ndarray:
 def photograph(
     found: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
 ) -> Pixels:
-    """Return the corners seen at q (m, n), each with white noise [px], as images whose lens is not known.
+    """Return the corners seen at q (m, n) with white noise [px], as a block of images with unknown lens.
 
     The recorded joints carry the encoders' noise.
     """
@@ -229,7 +229,7 @@ def take_pictures(
     moving: np.ndarray | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Path:
-    """Render what the camera sees at q (m, n) into a folder of images with ``joints.csv`` and ``board.toml``.
+    """Write rendered images at q (m, n) into a folder with ``joints.csv`` and ``board.toml``.
 
     Args:
         found: the cell.
@@ -276,13 +276,13 @@ tilt = "45 deg"
 
 
 def seen_by_camera(cell: Cell) -> CameraCell:
-    """Return a virtual cell with a 1.3-megapixel camera in the hand."""
+    """Return a virtual cell with a 1.3-megapixel camera on the arm."""
     return camera_cell(cell, IN_HAND, lens=DEMO_LENS)
 
 
 @contextmanager
 def limits_of(found: CameraCell) -> Iterator[Path]:
-    """Yield a constraints file with the camera's rough place; lens and board files are in its folder."""
+    """Yield a constraints file with the camera's approximate placement, next to its lens and board files."""
     truth, middle = found.cell.truth, pose(None, 0.5 * np.array([*found.board.extent, 0.0]))
     places = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
     stated = {name: [np.round(part, DIGITS).tolist() for part in to_xyz_rpy(place)] for name, place in places.items()}

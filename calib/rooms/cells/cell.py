@@ -26,7 +26,7 @@ from calib.transforms import invert, pose
 
 @dataclass(frozen=True)
 class SimulatedInstrument:
-    """An instrument that sees frames (or points), with white noise.
+    """An instrument that measures frames (or points) with white noise.
 
     Attributes:
         name: for messages and certificates.
@@ -88,7 +88,7 @@ def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
 def measure(
     cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated", warm: float = np.inf
 ) -> Positions:
-    """Measure the poses q (m, n) [rad or m] once each, in their order.
+    """Return one simulated measurement of each pose q (m, n) [rad or m], in this order.
 
     Args:
         cell: the cell.
@@ -119,7 +119,7 @@ def measure(
 
 
 def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
-    """Return positions as an instrument sees them that wanders by `drift` [m] from `begin` (0 to 1) to the series' end.
+    """Return positions measured by an instrument that drifts by `drift` [m] from `begin` (0 to 1) to the series' end.
 
     The direction is the seed's, so that several series can share it.
     """
@@ -129,7 +129,7 @@ def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) 
 
 
 def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:
-    """Return poses (m, 4, 4) as seen: noise along and about the instrument's axes."""
+    """Return measured poses (m, 4, 4): noise along and about the instrument's axes."""
     m = len(poses)
     turn = Rotation.from_rotvec(rng.normal(0.0, instrument.orientation_sigma or 0.0, (m, 3))).as_matrix()
     shift = rng.normal(0.0, instrument.position_sigma, (m, 3))
@@ -137,7 +137,7 @@ def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Ge
 
 
 def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return sigmas of position [m] and orientation [rad], each (m, 3).
+    """Return the stated sigmas of position [m] and orientation [rad], each (m, 3).
 
     Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
     """
@@ -148,7 +148,7 @@ def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1)
 
 
 def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Generator) -> np.ndarray:
-    """Return drift and outliers of m rows (m, 3) [m]."""
+    """Return the position errors (m, 3) [m] of m rows from drift and outliers."""
     directions = rng.normal(size=(m + 1, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     wandering = instrument.drift * np.linspace(0.0, 1.0, m)[:, None] * directions[-1]

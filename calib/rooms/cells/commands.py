@@ -1,4 +1,4 @@
-"""A calibration of a simulated robot: demo."""
+"""Command for a calibration of a simulated robot: demo."""
 
 from pathlib import Path
 
@@ -25,12 +25,12 @@ def demo(
     """Calibrate a simulated robot; compare with the hidden truth.
 
     Args:
-        out: the session's folder
+        out: folder of the session
         robot: a robot of the library
-        geometry_only: leave the dynamics out
+        geometry_only: calibrate the geometry only, not the dynamics
         instrument: cmm, or camera: rendered images of a board
-        guided: stop where an engineer would
-        bring: let the simulated cell bring what this session waits for
+        guided: stop at each step that an engineer performs
+        bring: session folder: simulate the files that it waits for
     """
     from calib.rooms.cells import demo as demonstration
 

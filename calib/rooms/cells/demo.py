@@ -1,4 +1,4 @@
-"""The demonstration: a session on a simulated cell, ended by a comparison with the truth it did not know."""
+"""The demonstration: a session on a simulated cell, then a comparison with the hidden truth."""
 
 import resource
 import sys
@@ -42,7 +42,7 @@ LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their no
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The result of the demonstration: the session, its verdict ("" where it stopped), files to look at, and duration.
+    """Result of the demonstration: the session, its verdict ("" where it stopped), files to look at, and duration.
 
     Attributes:
         asks: what to do now, where it stopped for an engineer.
@@ -64,7 +64,7 @@ def run(
     folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False,
     plots: bool = True, instrument: str = "cmm",
 ) -> DemoResult:  # fmt: skip
-    """Calibrate a simulated robot in a session, and compare with its hidden truth.
+    """Return the result of a session on a simulated robot, compared with its hidden truth.
 
     Args:
         folder: new; the session.
@@ -77,14 +77,14 @@ def run(
         instrument: ``cmm``, or ``camera``, which takes rendered images.
     """
     if instrument not in ("cmm", "camera"):
-        raise UsageError(f"--instrument {instrument}: the demonstration has cmm and camera")
+        raise UsageError(f"--instrument {instrument}: expected cmm or camera")
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         known = ", ".join(name for name in library.names() if load(name).inertias is not None)
         say(
-            f"geometry only: the library holds no masses for {robot}, so its motion cannot be simulated (of {known} "
-            "it can)"
+            f"geometry only: the library has no masses for {robot}, so its motion cannot be simulated "
+            f"(known for {known})"
         )
         dynamics = False
     motion = MOTION if dynamics else {}
@@ -114,24 +114,23 @@ def run(
 
 
 def _largest_memory() -> float:
-    """Return the largest resident set of this process so far [MB]; Linux counts it in kB, macOS in bytes."""
+    """Return the largest resident set of this process so far [MB]; the system reports kB on Linux, bytes on macOS."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
 
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
-    """Return what an engineer would be asked, and how to let the simulated cell do it."""
+    """Return the engineer's instructions, and the command that simulates them."""
     from calib.procedure.session.commands import asks
 
     folder = session.folder
     return (
         *asks(session, waiting),
-        f"(or let the simulated cell do it: {command_line('demo', '--bring', folder)}; "
-        f"then: {command_line('next', folder)})",
+        f"(or simulate this step:  {command_line('demo', '--bring', folder)}; then: {command_line('next', folder)})",
     )
 
 
 def _results(session: Session) -> tuple[tuple[str, str], ...]:
-    """Return what to look at."""
+    """Return name and path of each result file."""
     found = [
         ("certificate", CERTIFICATE),
         ("plots" if session.plots else "fit", "4-fit"),
@@ -145,11 +144,11 @@ def _results(session: Session) -> tuple[tuple[str, str], ...]:
 
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Compare a session's result with the cell's truth, print and write the errors; return those of the tool [mm]."""
+    """Return the tool's errors [mm] against the cell's truth; print and write all errors."""
     found = installation.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
-        f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
+        f"hidden truth, over {TRUTH} poses of the whole joint range: tool error {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
     ]
     truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
@@ -167,8 +166,8 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         notes.append(arm.note)
         truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
         lines.append(
-            "hidden truth, on a motion nobody has seen: noise-free torques are predicted to "
-            f"{torques.identified:.2f} % ({torques.nominal:.1f} % behind the gears by the nominal masses, with the "
+            "hidden truth, on unseen motion: noise-free torques are predicted with an error of "
+            f"{torques.identified:.2f} % ({torques.nominal:.1f} % of the link torques with nominal masses and the "
             f"true friction); of {count} base parameters {within:.0%} are within two sigmas of the truth"
         )
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
@@ -179,7 +178,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
 
 
 def simulate_next(folder: Path, say: Say) -> None:
-    """Let the simulated cell bring what the session in `folder` waits for; compare a finished one with the truth.
+    """Simulate the files that the session in `folder` waits for; compare a finished session with the truth.
 
     Raises:
         UsageError: where nothing is waited for, or the session's robot is none of the library.
@@ -207,12 +206,12 @@ def _cell_of(session: Session) -> Cell:
 
 
 def _camera_of(session: Session) -> CameraCell | None:
-    """Return the same with a camera, where the session's instrument is one."""
+    """Return the virtual cell with a camera if the session's instrument is a camera."""
     return seen_by_camera(_cell_of(session)) if session.settings.instrument.measures == IMAGES else None
 
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
-    """Let the simulated cell do what a step waits for."""
+    """Simulate the files that a step waits for."""
     seed, cell, seen = session.settings.seed, _cell_of(session), _camera_of(session)
     if step in ("measure", "validate") and seen is not None:
         _mark(session, seen.cell.note)
@@ -227,7 +226,7 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda wor
         simulate_recordings(session, arm_of(session, cell), seed)
         say("    (the simulated arm plays both motions)")
     else:
-        raise SessionError(f"the demonstration cannot bring what {step} needs")
+        raise SessionError(f"the demonstration cannot simulate the files of {step} needs")
 
 
 def _rendering(progress: Say, name: str, image: str) -> None:
@@ -235,12 +234,12 @@ def _rendering(progress: Say, name: str, image: str) -> None:
 
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:
-    """Return the arm of a session's simulated cell as it moves."""
+    """Return the moving arm of a session's simulated cell."""
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 
 def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
-    """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
+    """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
     _mark(session, cell.note)
     for number, name, q in measured_files.planned(session.folder, cell.nominal):
         seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
@@ -251,14 +250,14 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
 
 
 def _mark(session: Session, note: str) -> None:
-    """Write down in the session that its files are a simulated cell's; the certificate says so."""
+    """Mark a session's files as simulated, for its certificate."""
     path, line = session.path(MARK), SIMULATED.format(note=note)
     known = read_lines(path)
     files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
 
 
 def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
-    """Let the simulated arm play the designed motions, and log them."""
+    """Simulate recordings of the designed motions."""
     _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)
     for name, number, running in LOGS:

@@ -1,4 +1,4 @@
-"""Robots with known dynamics and known controllers, from the truths in the library.
+"""Simulated robots with known dynamics and controllers, from the library.
 
 Motions for simulated robots: random Fourier series within limits, and moves with trapezoidal velocities.
 """
@@ -75,7 +75,7 @@ def random_fourier(
 def trapezoidal(
     points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, rate: float, pause: float = 0.1
 ) -> Reference:
-    """Return moves from point to point with trapezoidal velocities, all joints at rest together, and pauses.
+    """Return point-to-point moves with trapezoidal velocities, synchronised joints and pauses.
 
     The slowest joint sets the duration of a move; the others accelerate for the same share of it.
 
@@ -120,12 +120,12 @@ SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a j
 
 @cache
 def truth(name: str) -> dict[str, Any]:
-    """Return the truth of ``tx40``, ``rv2sq`` or ``lwr4plus``."""
+    """Return the true parameters of ``tx40``, ``rv2sq`` or ``lwr4plus``."""
     return description.read_extra(library.path(f"{name}_truth"))["truth"]
 
 
 def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) -> Plant:
-    """Return the TX40 or RV-2SQ with Ia, Fv, Fc of every joint.
+    """Return the simulated TX40 or RV-2SQ with Ia, Fv, Fc of every joint.
 
     Args:
         coupled: with the TX40's wrist coupling: Ia6 on both rows, Fvm6, Fcm6.

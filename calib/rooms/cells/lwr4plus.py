@@ -31,18 +31,18 @@ def transform(alpha: float, d: float, theta: float, r: float) -> np.ndarray:
 
 @cache
 def table_2() -> tuple[np.ndarray, np.ndarray]:
-    """Return Table 2, nominal and calibrated, each (9, 4)."""
+    """Return the nominal and calibrated values of Table 2, each (9, 4)."""
     geometry = description.read_extra(library.path("lwr4plus_truth"))["truth"]["geometry"]
     return np.array(geometry["nominal"]), np.array(geometry["calibrated"])
 
 
 def nominal_chain() -> Chain:
-    """Return the library's arm."""
+    """Return the library's nominal LWR4+ arm."""
     return description.read(library.path("lwr4plus"))
 
 
 def arm(table: np.ndarray) -> Chain:
-    """Return the library's arm with frames 2 to 7 of a table; frame 1 stays, it belongs to the base placement."""
+    """Return the library's arm with frames 2 to 7 of a table (frame 1 belongs to the base placement)."""
     values = {f"{column}{row}": table[row, position] for row in range(2, 8) for position, column in enumerate(COLUMNS)}
     return nominal_chain().with_values(values)
 
@@ -58,7 +58,7 @@ def tool(table: np.ndarray) -> np.ndarray:
 
 
 def constraint_values(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return Table 1 as values that have to be >= 0, (m, 6): roll and pitch above and below, distance, height.
+    """Return the constraints of Table 1 (m, 6), satisfied if >= 0: roll and pitch above and below, distance, height.
 
     The paper leaves open how roll and pitch are defined and where z is measured from; our reading: R = Rz Ry Rx of the
     fixture in the camera's frame; distance from axis 1 and height above the floor plate, 0.31 m below the shoulder.
@@ -94,7 +94,7 @@ def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q:
 
 
 def feasible(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Say which joint values q (m, 7) meet Table 1, joint angles included: (m,) bool."""
+    """Return whether joint values q (m, 7) satisfy Table 1, joint limits included: (m,) bool."""
     limits = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
     within = np.concatenate([limits - np.abs(q), constraint_values(chain, station, tool, q)], axis=1)
     return np.all(within >= 0.0, axis=1)

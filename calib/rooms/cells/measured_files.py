@@ -1,4 +1,4 @@
-"""Simulated measurements and logs, written as the CSV files that `calib` reads."""
+"""Writing simulated measurements and logs as CSV files for `calib`."""
 
 import io
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from calib.robot.chain import Chain
 
 
 def planned(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
-    """Yield the lists of poses that a session in `folder` planned for an arm: number, name when measured, q (m, n)."""
+    """Yield the pose lists planned by the session in `folder` for an arm: number, name when measured, q (m, n)."""
     kinds = [joint.kind for joint in arm.joints]
     for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
         if (path := folder / f"2-poses/{plan}.csv").exists():

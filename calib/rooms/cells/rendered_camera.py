@@ -1,4 +1,4 @@
-"""A synthetic camera: images of a printed board as a lens, its focus, the light and a sensor make them.
+"""A synthetic camera: rendered images of a printed board with lens, focus, light and sensor noise.
 
     grey = round(clip(255 exposure · light(u, v) · (defocus * mean over the exposure of reflectance), 0, 255) + noise)
 
@@ -24,7 +24,7 @@ PAPER = 0.02  # white margin around the pattern [m]
 
 @dataclass(frozen=True)
 class Imaging:
-    """How an image is taken.
+    """Exposure, focus, light and noise of an image.
 
     Attributes:
         exposure: grey level of white paper in full light, as a share of 255; above 1 it saturates.
@@ -51,7 +51,7 @@ def render(
     seed: int | np.random.Generator = 0,
     shape: BoardShape | None = None,
 ) -> np.ndarray:
-    """Return the image (height, width) of a board, 8 bits.
+    """Return the rendered 8-bit image (height, width) of a board.
 
     Args:
         board: what was printed.
@@ -105,7 +105,7 @@ def _sheet_at(board: Board, level: int) -> np.ndarray:
 
 
 def _sheet(board: Board, wanted: float) -> tuple[np.ndarray, float]:
-    """Return the board's raster at the next step of resolution, and its pixels per metre."""
+    """Return the board's raster at the next resolution level, and its pixels per metre."""
     level = int(np.ceil(np.log(wanted) / np.log(1.25)))
     return _sheet_at(board, level), 1.25**level
 
@@ -121,7 +121,7 @@ def _outline(board: Board) -> np.ndarray:
 def _on_sheet(
     board: Board, lens: Lens, pose: np.ndarray, shape: BoardShape, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Return where the rays of all sub-pixels of a window meet the board, (h·SUB, w·SUB, 2) [m]."""
+    """Return the intersections of a window's sub-pixel rays with the board, (h·SUB, w·SUB, 2) [m]."""
     knots = [np.arange(a - NODES, b + 2 * NODES, NODES, dtype=float) for a, b in zip(low, high)]
     grid = np.stack(np.meshgrid(*knots), axis=-1)
     ray = np.concatenate([rays(lens, grid.reshape(-1, 2)), np.ones((grid[..., 0].size, 1))], axis=1)

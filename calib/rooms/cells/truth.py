@@ -55,7 +55,7 @@ def _rms(arm: Installation, block: Poses) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TorqueComparison:
-    """Errors of predicted torques against the noise-free truth on motion nobody has seen.
+    """Errors of predicted torques against the noise-free truth on unseen motion.
 
     Attributes:
         identified: 100 ‖τ̂ - τ‖ / ‖τ‖ by the identified model, over all rows [%].
@@ -71,7 +71,7 @@ class TorqueComparison:
 def torque_errors(
     cell: Cell, arm: MovingArm, model: IdentificationModel, values: np.ndarray, chain: Chain, seed: int = 4321
 ) -> TorqueComparison:
-    """Compare a model's torques with the noise-free truth along a random motion of `SECONDS`.
+    """Return the errors of a model's torques against the noise-free truth along a random motion of `SECONDS`.
 
     Args:
         cell, arm: the virtual cell, and its arm as it moves.
@@ -98,7 +98,7 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def share_within(true: Mapping[str, float], estimate: StoredEstimate) -> tuple[float, int]:
-    """Return the share of estimated parameters whose true value is within two sigmas, and how many there are.
+    """Return the share of estimated parameters within two sigmas of the truth, and their number.
 
     Args:
         true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.

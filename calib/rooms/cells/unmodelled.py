@@ -33,14 +33,14 @@ CABLE = 0.5  # [rad]
 
 
 def _named(parts: Sequence[tuple[float, str]]) -> str:
-    """Return the words of effects (size, words) with a size above 0, as the end of a sentence; empty without any."""
+    """Return a clause that lists the effects (size, words) with a size above 0; empty without any."""
     named = ", ".join(words for size, words in parts if size)
-    return f"; in no model: {named}" if named else ""
+    return f"; unmodelled:  {named}" if named else ""
 
 
 @dataclass(frozen=True)
 class PositionErrors:
-    """Sizes of the position errors.
+    """Sizes of the simulated position errors.
 
     Attributes:
         gear: a, of the two gear errors each [rad; 0.3 of it in m for a prismatic joint].
@@ -71,7 +71,7 @@ class PositionErrors:
 def displacements(
     errors: PositionErrors, chain: Chain, q: np.ndarray, torque: np.ndarray, warm: float = 0.0
 ) -> np.ndarray:
-    """Return what the errors add to the displacement of every element of a chain, (K, m) [rad or m].
+    """Return the added displacement (K, m) [rad or m] of every element of a chain.
 
     Args:
         errors: their sizes.
@@ -96,7 +96,7 @@ def displacements(
 
 
 def _largest_load(chain: Chain) -> np.ndarray:
-    """Return the gravity torques (n,) that an arm's joints meet at most [N m or N]; 1 where there are none."""
+    """Return the largest gravity torque of each joint (n,) [N m or N]; 1 for joints without gravity load."""
     if chain.inertias is None:
         return np.ones(chain.n)
     largest = np.abs(gravity_torques(chain, random_joints(chain, 200, 0))).max(axis=0)
@@ -104,7 +104,7 @@ def _largest_load(chain: Chain) -> np.ndarray:
 
 
 def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return tool poses (m, 4, 4) shifted by the tool's droop, which has another stiffness along each of its axes.
+    """Return tool poses (m, 4, 4) shifted by the tool's droop, with a different stiffness along each axis.
 
     Args:
         errors, chain: as for `displacements`.
@@ -120,7 +120,7 @@ def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.n
 
 @dataclass(frozen=True)
 class TorqueErrors:
-    """Sizes of the torque errors, none by default.
+    """Sizes of the simulated torque errors, zero by default.
 
     Attributes:
         memory: Σ_k f_k, of the Coulomb friction.
@@ -156,7 +156,7 @@ class TorqueErrors:
 def gear_torques(
     errors: TorqueErrors, q: np.ndarray, drive: np.ndarray, coulomb: np.ndarray, friction: np.ndarray, t: np.ndarray
 ) -> np.ndarray:
-    """Return the torques (N, n) that gears and motors need besides those of their model [N m or N].
+    """Return the unmodelled torques (N, n) of gears and motors [N m or N].
 
     Args:
         errors: their sizes.
@@ -172,7 +172,7 @@ def gear_torques(
 
 
 def memory(q: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the torque (N, n) of elasto-plastic elements along joint values q (N, n) [rad or m], at rest before.
+    """Return the torque (N, n) of elasto-plastic friction elements along joint values q (N, n) [rad or m] from rest.
 
     Args:
         q: finely sampled, since each step moves an element by the whole step.

@@ -1,4 +1,4 @@
-"""The arm of a virtual cell when it moves: true masses and drives, a controller with the maker's model, noisy sensors.
+"""The moving arm of a virtual cell: true masses and drives, a controller with the maker's model, noisy sensors.
 
     tau_l = Y(q, v, a) φ + Fvl v + Fcl sign(v) + offl,    tau = tau_l + Ia a + Fvm v + Fcm sign(v) + offm,
 
@@ -38,7 +38,7 @@ PUSH_BAND = 20.0  # [Hz]
 
 @dataclass(frozen=True, eq=False)
 class MovingArm:
-    """What moves, and what is recorded of it.
+    """A simulated arm with drives, controller and sensors.
 
     Attributes:
         chain: the true arm, its true inertias included.
@@ -63,7 +63,7 @@ class MovingArm:
         return _modelled(self, q, v, a) + _unmodelled(self, q, v, a, np.full(len(q), np.inf))
 
     def link_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques behind the gears (N, n) without noise [N m or N]."""
+        """Return the noise-free torques (N, n) on the output side of the gears [N m or N]."""
         whole = IdentificationModel(self.plant.bodies, self.plant.terms)
         shared = np.isin(whole.names, self.link.names)
         model = np.einsum("kij,j->ki", self.link.regressor(q, v, a), self.plant.parameters[shared])
@@ -71,7 +71,7 @@ class MovingArm:
 
 
 def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors | None = None) -> MovingArm:
-    """Return the true arm of a cell as it moves.
+    """Return the moving true arm of a cell.
 
     Args:
         cell: whose true geometry it has.
@@ -111,7 +111,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors |
 
 
 def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: int) -> Reference:
-    """Return one period of a motion, both ends included, repeated, with rest before and after.
+    """Return a periodic motion, repeated, with rest before and after.
 
     Args:
         t: (N,), even steps [s].
@@ -129,7 +129,7 @@ def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: in
 def record(
     arm: MovingArm, reference: Reference, seed: int | np.random.Generator = 0, running: float = np.inf
 ) -> Recording:
-    """Let the arm follow a motion, and log encoders, motors' torques and torque sensors.
+    """Return a simulated recording of a motion: encoders, motor torques and torque sensors.
 
     Args:
         arm: what moves.
@@ -170,7 +170,7 @@ def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np
 
 
 def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the torques (N, n) of unmodelled effects [N m or N]; t (N,) since the arm was cold [s]."""
+    """Return the torques (N, n) of unmodelled effects [N m or N]; t (N,) is the time since the cold start [s]."""
     parameters = dict(zip((one.name for one in arm.plant.terms), arm.plant.parameters[arm.plant.inertial :]))
     viscous, coulomb = (
         np.array([parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"] for j in range(arm.chain.n)])
@@ -183,14 +183,14 @@ def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: 
 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return the true drive parameters (n, 7) in the order of `robots.SIDED`, and where they come from."""
+    """Return the true drive parameters (n, 7) in the order of `robots.SIDED`, and a note on their source."""
     source = "drives as published for the type"
     if library.path(f"{robot}_truth").exists():
         rows = known_robots.truth(robot)["drives"]
         if "Fvl" not in rows:
             rows = {"Ia": rows["Ia"], "Fvm": rows["Fv"], "Fcm": rows["Fc"]}
     else:
-        source = "drives made up from its limits"
+        source = "drives assumed from its limits"
         speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
         bare = Plant(bodies_of(chain), (), standard_parameters(chain))
         inertia = bare.inertia_diagonal(random_joints(chain, 200, 0))
@@ -199,7 +199,7 @@ def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, s
 
 
 def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return ten standard parameters of a body that is stretched, shifted and heavier or lighter.
+    """Return ten standard parameters of a body with random errors of size, position and mass.
 
     T P Tᵀ of the pseudo-inertia P (`calib.dynamics.pseudo_inertia`) is positive definite where P is.
     """

@@ -1,4 +1,4 @@
-"""Cells to practise on: the LWR4+ of the study, and any robot of the library made wrong on purpose."""
+"""Simulated cells to practise on: the LWR4+ of the paper, and library robots with random geometric errors."""
 
 from dataclasses import replace
 
@@ -97,7 +97,7 @@ def perturbed_cell(
     hidden: float = 0.2,
     unmodelled: PositionErrors | None = None,
 ) -> Cell:
-    """Return a cell whose arm is its nominal plus normal deviations of every element.
+    """Return a cell whose true arm deviates normally from nominal in every element.
 
     Args:
         nominal: the arm as it is described.
@@ -119,8 +119,8 @@ def perturbed_cell(
         deflection=deflection(true, np.full(true.n, hidden * COMPLIANCE), hidden * amplitude, seed),
     )
     note = (
-        f"simulated {nominal.name}: every element off its nominal by {size * LENGTH * 1e3:g} mm or "
-        f"{size * ANGLE * 1e3:g} mrad, joint offsets by {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
+        f"simulated {nominal.name}: errors per element of {size * LENGTH * 1e3:g} mm or "
+        f"{size * ANGLE * 1e3:g} mrad, joint offsets of {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
         f"{unmodelled.note}"
     )
     return Cell(nominal, truth, instrument or SimulatedInstrument(), note, unmodelled)
@@ -136,7 +136,7 @@ def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0)
 
 
 def rigid(cell: Cell) -> Cell:
-    """Return the cell without its hidden deflections and unmodelled errors."""
+    """Return the cell without hidden deflections and unmodelled errors."""
     still = cell.truth.deflection.with_coefficients(np.zeros(len(cell.truth.deflection.terms)))
     return replace(cell, truth=replace(cell.truth, deflection=still), unmodelled=PositionErrors())
 

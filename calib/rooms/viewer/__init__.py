@@ -1,3 +1,3 @@
-"""Robot, errors, poses, motions and torques in Rerun."""
+"""Display of robot, errors, poses, motions and torques in Rerun."""
 
 OFFERS = {"commands": "commands:app", "recordings": "viewer:write_beside"}

@@ -1,4 +1,4 @@
-"""What a folder holds, in Rerun: view."""
+"""Command that shows a folder's results in Rerun: view."""
 
 from pathlib import Path
 from typing import Annotated
@@ -34,7 +34,7 @@ def view(
 
     stage_of(folder, "calib view")
     if save is None and spawn is False:
-        raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
+        raise UsageError("nothing to do: give --save FILE.rrd, or omit --no-spawn")
     scene = None
     if save:
         inside = folder.iterdir() if folder.is_dir() else ()

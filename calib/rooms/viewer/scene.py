@@ -1,4 +1,4 @@
-"""What there is to see in a folder, as plain arrays: `calib.rooms.viewer.viewer` shows it.
+"""The scene of a folder as plain arrays, shown by `calib.rooms.viewer.viewer`.
 
 A folder is that of a fit, an identification, an excitation, a planned motion, or a session that has several of them.
 All points are in the base of the arm that is drawn.
@@ -92,7 +92,7 @@ class Torques:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """All there is to show.
+    """Robot, poses, motions and torques to show.
 
     Attributes:
         title: of the recording.
@@ -116,7 +116,7 @@ class Scene:
 
 
 def read(folder: str | Path, robot: str | None = None) -> Scene:
-    """Gather what `folder` holds.
+    """Return the scene of a folder's results.
 
     Args:
         folder: of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.
@@ -127,9 +127,9 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     """
     folder = Path(folder)
     one = folder.is_file() and folder.suffix == ".csv"
-    require(one or folder.is_dir(), f"{folder} is no folder; give that of a fit, a session, or a motion", UsageError)
+    require(one or folder.is_dir(), f"{folder} is not a folder; give that of a fit, session or motion", UsageError)
     if one and robot is None:
-        refuse_option(folder, "say whose poses these are: --robot")
+        refuse_option(folder, "robot of these poses unknown; give --robot")
     chain, source = _arm(folder, robot)
     meshes, notes = _meshes(chain, source)
     fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
@@ -149,21 +149,21 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
     )
-    words = f"{folder} holds nothing to see: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
+    words = f"{folder} has nothing to show: no residuals.csv, trajectory.csv, motion.csv or torques_1.csv"
     require(scene.measured or scene.chosen or scene.played or scene.torques, words, UsageError)
     if chain is None:
-        words = "no robot is drawn: the folder does not say which; give --robot"
+        words = "no robot is shown: the folder does not name one; give --robot"
         return replace(scene, notes=(*scene.notes, words))
     return scene
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
-    """Return files of the folder itself and of those up to two levels below, the folder's own first."""
+    """Return the files of a folder and of its subfolders down to two levels, the folder's files first."""
     return [path for depth in ("", "*/", "*/*/") for path in sorted(folder.glob(depth + pattern))]
 
 
 def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
-    """Return the arm to draw, and the file it was described in first."""
+    """Return the arm to show, and its original description file."""
     if robot is not None:
         return load(robot), resolve(robot)
     for place in (folder, folder / IN_SESSION):
@@ -180,7 +180,7 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
 
 
 def _meshes(chain: Chain | None, source: Path | None) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of the links that move, and what to say of those that are missing."""
+    """Return the meshes of the moving links, and a note on missing meshes."""
     if chain is None or source is None or source.suffix != ".urdf" or not chain.links:
         return [], []
     found, missing = visuals(source)
@@ -196,7 +196,7 @@ def _chosen(path: Path, chain: Chain) -> np.ndarray:
 
 
 def _measured(place: Path) -> Measured:
-    """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
+    """Return the measured positions of ``residuals.csv``, with the predictions of both arms."""
     after, before = installation.read_arms(place)
     with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
         known = set(map(shielded, after.station_names))
@@ -218,7 +218,7 @@ def _measured(place: Path) -> Measured:
 
 
 def _joined(fitted: Measured, errors: Path) -> Measured:
-    """Return fitted rows and, behind them, a session's unseen ones."""
+    """Return fitted rows followed by a session's unseen rows."""
     if not errors.is_file():
         return fitted
     table = read_table(errors)
@@ -262,7 +262,7 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
 
 
 def _rehearsed(path: Path, chain: Chain) -> Played:
-    """Return a measuring run as it will play, poses and ways between them."""
+    """Return a planned measuring run: poses and the motions between them."""
     return Played(path.stem, *rehearsed_samples(path, chain))
 
 
@@ -280,7 +280,7 @@ def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
 
 
 def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what the torques of an identification's folder are, and their units."""
+    """Return the labels and units of an identification's torque rows."""
     for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
         if chain is None or not folder.model.is_file():
             continue
@@ -297,7 +297,7 @@ def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[st
 
 
 def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
-    """Return columns letter1, letter2, … as (N, n), which the file has to hold."""
+    """Return the required columns letter1, letter2, … of a file as (N, n)."""
     found = table.block(letter)
     if found is None:
         raise UsageError(f"{path} has no columns {letter}1, {letter}2, …; was it written by this toolkit?")
@@ -310,7 +310,7 @@ def _name(path: Path, folder: Path) -> str:
 
 
 def skeleton(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return where base, joints and tip stand (m, n + 2, 3) [m]."""
+    """Return the positions of base, joints and tip (m, n + 2, 3) [m]."""
     points = np.zeros((len(q), chain.n + 2, 3))
     points[:, 1:-1] = joint_frames(chain, q)[:, :, :3, 3].transpose(1, 0, 2)
     points[:, -1] = forward(chain, q)[:, :3, 3]

@@ -1,4 +1,4 @@
-"""Show a scene in Rerun: the only home of rerun-sdk, which is loaded when something is shown, and never else.
+"""Display of a scene in Rerun; the only module that loads rerun-sdk, and only to show a scene.
 
 Everything plays on one clock, the timeline ``time``, in the order of the work: pose plans as they grow, measured poses
 one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
@@ -30,10 +30,10 @@ FILE = "session.rrd"
 
 
 class _Rerun:
-    """The package rerun, loaded when something of it is used."""
+    """The package rerun, loaded at first use."""
 
     def __getattr__(self, name: str) -> Any:
-        words = "Rerun is not installed here (there is none for Macs with Intel processors): pip install rerun-sdk"
+        words = "Rerun is not installed here (no version for Macs with Intel processors): pip install rerun-sdk"
         with refused_as(UsageError, ImportError, words):
             import rerun
         return getattr(rerun, name)
@@ -43,7 +43,7 @@ rr = _Rerun()
 
 
 def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Scene:
-    """Write what a folder holds as a recording for Rerun, whole or not at all.
+    """Write a folder's scene as a Rerun recording, complete or not at all.
 
     Raises:
         UsageError: where rerun is not installed, or there is nothing to see.
@@ -62,7 +62,7 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
 
 
 def write_beside(folder: str | Path) -> str:
-    """Write ``session.rrd`` into a folder where that is possible, and say in a line what came of it; never raises.
+    """Write ``session.rrd`` into a folder if possible, and report the result in one line; never raises.
 
     A recording is a convenience: neither a missing package nor a full disk stops what it belongs to.
     """
@@ -74,14 +74,14 @@ def write_beside(folder: str | Path) -> str:
 
 
 def spawn(folder: str | Path, robot: str | None = None) -> Scene:
-    """Open Rerun's window on what a folder holds.
+    """Open Rerun's window with a folder's scene.
 
     Raises:
         UsageError: where no display is there, as over SSH.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         saved = command_line("view", folder, "--save", FILE)
-        raise UsageError(f"no display is here to open a window on; {saved} writes a file that rerun shows elsewhere")
+        raise UsageError(f"no display to open a window on; {saved} writes a file for rerun on another computer")
     scene = viewing.read(folder, robot)
     recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
     with refused_as(
@@ -94,7 +94,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
 
 
 def _send(recording: Any, scene: Scene) -> None:
-    """Log everything."""
+    """Log all parts of a scene."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("about", rr.TextDocument(about(scene), media_type="text/markdown"), static=True)
     start = 0.0
@@ -111,7 +111,7 @@ def _send(recording: Any, scene: Scene) -> None:
 
 
 def about(scene: Scene) -> str:
-    """Return the text that stands beside the pictures."""
+    """Return the text shown next to the plots."""
     lines = [f"# {scene.title}"]
     for measured in scene.measured:
         sizes = [1e3 * np.linalg.norm(measured.seen - p, axis=1) for p in (measured.nominal, measured.calibrated)]
@@ -120,12 +120,12 @@ def about(scene: Scene) -> str:
         lines.append(
             f"{len(measured.q)} measured poses ({int(measured.unseen.sum())} of them unseen): {rms[0]:.3f} mm rms "
             f"nominal (orange), {rms[1]:.3f} mm calibrated (green). **Arrows are {scale:g} times as long as the "
-            "errors**; they start where the arm's model puts the target and point to where it was seen."
+            "errors**; from the target's position by the arm's model to the measured one."
         )
     lines += [f"pose plan *{name}*: {len(q)} poses" for name, q in scene.chosen]
     lines += [f"motion *{one.name}*: {one.t[-1]:.1f} s" for one in scene.played]
     lines += [
-        f"torques *{one.name}*: measured orange, predicted green, and what remains [N·m, N]" for one in scene.torques
+        f"torques *{one.name}*: measured orange, predicted green, and residuals [N·m, N]" for one in scene.torques
     ]
     return "\n\n".join([*lines, *(f"note: {note}" for note in scene.notes)])
 
@@ -137,7 +137,7 @@ def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) 
 
 
 def _measured(recording: Any, scene: Scene, measured: Measured, start: float) -> float:
-    """Log points and error arrows as a whole, and pose by pose; return when the next part may begin [s]."""
+    """Log points and error arrows, together and pose by pose; return the start time of the next part [s]."""
     if not len(measured.q) or scene.chain is None:
         return start
     scale = measured.arrow_scale(scene.chain)
@@ -186,7 +186,7 @@ def _chosen(recording: Any, scene: Scene, chain: Chain, name: str, q: np.ndarray
 
 
 def _played(recording: Any, scene: Scene, played: Played, start: float) -> float:
-    """Log a motion with its limits from `start` on [s], and return where the next may begin."""
+    """Log a motion with its limits from `start` on [s], and return the start time of the next part."""
     t = start + played.t - played.t[0]
     some = viewing.thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[some])]
@@ -211,7 +211,7 @@ def _played(recording: Any, scene: Scene, played: Played, start: float) -> float
 
 
 def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> float:
-    """Log measured and predicted torques and what remains, and the arm on the same clock."""
+    """Log measured torques, predicted torques and residuals, with the arm on the same time axis."""
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
     for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
@@ -272,7 +272,7 @@ def _meshes(recording: Any, scene: Scene) -> None:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Return how the recording opens: the arm at the left, what goes with it at the right."""
+    """Return the initial layout of the recording: the arm at the left, what goes with it at the right."""
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []
@@ -281,10 +281,10 @@ def _blueprint(scene: Scene) -> Any:
         tabs.append(rrb.TimeSeriesView(origin="chosen", name="pose plans"))
     if scene.measured:
         sizes = [rrb.TimeSeriesView(origin="errors", name="position error [mm]")]
-        sides = [rrb.TimeSeriesView(origin="axes/position", name="what remains by axis [mm]")]
+        sides = [rrb.TimeSeriesView(origin="axes/position", name="residuals by axis [mm]")]
         if any(np.isfinite(measured.turned).any() for measured in scene.measured):
             sizes.append(rrb.TimeSeriesView(origin="turns", name="orientation error [mrad]"))
-            sides.append(rrb.TimeSeriesView(origin="axes/orientation", name="what remains about each axis [mrad]"))
+            sides.append(rrb.TimeSeriesView(origin="axes/orientation", name="residuals about each axis [mrad]"))
         tabs += [rrb.Vertical(*sizes, name="error of each pose"), rrb.Vertical(*sides, name="error by axis")]
     if scene.played:
         contents = [[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"] for kind in ("position", "velocity")]

@@ -1,4 +1,4 @@
-"""The meshes that a URDF shows of a robot."""
+"""Meshes of a robot's ``<visual>`` elements in its URDF."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ class Visual(Frozen):
 
 
 def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of a URDF's ``<visual>`` elements, and the names of those that were not found.
+    """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing files.
 
     Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse
     the whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.

@@ -1,1 +1,1 @@
-"""From a printed board and images of it, files or bags, to its corners."""
+"""Boards to print, and corner detection in their images (files or bags)."""

@@ -13,14 +13,14 @@ POINT = 0.0254 / 72.0  # PDF's unit [m]
 
 
 def charuco(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return OpenCV's object of a ChArUco board; lengths in metres."""
+    """Return OpenCV's ChArUco board object (lengths in metres)."""
     size = board.columns, board.rows
     with quiet():
         return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
 
 
 def dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary of markers of that name."""
+    """Return OpenCV's marker dictionary by its name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 
@@ -50,7 +50,7 @@ def _black(board: Board) -> np.ndarray:
 
 
 def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray:
-    """Return rectangles (N, 4) that cover the dark modules of a square of them, run by run."""
+    """Return rectangles (N, 4) that cover the dark modules of a marker, one per horizontal run."""
     result = []
     for row, line in enumerate(dark):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
@@ -94,7 +94,7 @@ def page_size(board: Board, paper: str = "") -> tuple[float, float]:
         return needed
     shares = [min(size[0] / needed[0], size[1] / needed[1]) for size in (PAPERS[paper], PAPERS[paper][::-1])]
     raise ValueError(
-        f"the board takes {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm with edges and ruler, more than "
+        f"the board takes {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm with margins and ruler, larger than "
         f"{paper.upper()}; squares of {int(1e3 * board.square * max(shares) * 0.97)} mm would fit"
     )
 
@@ -120,7 +120,7 @@ def svg(board: Board, size: tuple[float, float]) -> str:
 
 
 def pdf(board: Board, size: tuple[float, float]) -> bytes:
-    """Return the page as a PDF of one page at true scale, that asks viewers to print it unscaled."""
+    """Return a one-page PDF at true scale that requests printing without scaling."""
     boxes, words = _page(board, size)
     wide, high = (length / POINT for length in size)
     lines = [f"{x / POINT:.4f} {high - (y + h) / POINT:.4f} {w / POINT:.4f} {h / POINT:.4f} re" for x, y, w, h in boxes]

@@ -1,4 +1,4 @@
-"""Boards to print, and a first look at images of them, for people: what `calib board` and `calib images` say."""
+"""Output of `calib board` and `calib images`: boards to print, and a check of their images."""
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -23,7 +23,7 @@ def make(
     out: Path, kind: str, columns: int | None, rows: int, square: float, marker: float | None, words: str | None,
     paper: str | None, overwrite: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return what to do with them.
+    """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return printing instructions.
 
     Args:
         out: folder.
@@ -45,17 +45,17 @@ def make(
     if square < min_square:
         raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
     usual, share, across = USUAL[kind]
-    with refused_as(UsageError, ValueError, "this board cannot be: {}"):
+    with refused_as(UsageError, ValueError, "impossible board: {}"):
         side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
         made = Board(kind, columns or across, rows, side, between, words or usual).checked()
         if (count := len(boards.corners(made))) < MIN_CORNERS:
-            raise UsageError(f"a {made.words} has {count} corners; an image counts from {MIN_CORNERS} on: more squares")
+            raise UsageError(f"a {made.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
         size = board_print.page_size(made, (paper or "").lower())
     there = out / BOARD
     if not overwrite and there.exists() and not _as_printed(out):
         raise UsageError(
-            f"{there} is not as it was printed: somebody measured its squares, or it is another's; nothing changed. "
-            "Take another folder (--out), or say --overwrite"
+            f"{there} was changed after printing (measured squares?), or is another board's; nothing was written. "
+            "Take another folder (--out), or give --overwrite"
         )
     files.write(out / "board.pdf", board_print.pdf(made, size))
     files.write(out / "board.svg", board_print.svg(made, size))
@@ -86,7 +86,7 @@ def _as_printed(out: Path) -> bool:
 
 
 def look(folder: Path, show: Show) -> list[str]:
-    """Find the board in the images of a folder; return the result in sentences."""
+    """Return sentences on the board detection in the images of a folder."""
     board = read_own_board(folder)
     names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
     found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
@@ -111,7 +111,7 @@ def _summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
     total = len(boards.corners(board))
     problems = problem_words({name: one.problem for name, one in found.images.items()})
     if not kept:
-        raise MeasurementError("; ".join([f"none of {len(list(names))} images is of use ({board.words})", *problems]))
+        raise MeasurementError("; ".join([f"none of {len(list(names))} images is usable ({board.words})", *problems]))
     seen = np.array([one.seen.sum() for one in kept])
     sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
     edge = float(np.nanmedian([one.edge for one in kept]))
@@ -127,7 +127,7 @@ def _summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
 def from_bag(
     bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Show
 ) -> list[str]:
-    """Write the corners and joint values of a bag's images as a folder; return the result in sentences."""
+    """Write the corners and joint values of a bag's images as a folder; return sentences on the result."""
     from calib.rooms.camera.pictures.image_bags import read_image_bag, write_image_folder
 
     made = boards.read_board(board)

@@ -20,7 +20,7 @@ USUAL = 0.1  # sigma where a file states none [px]; our choice
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The corners detected in one image.
+    """Corners detected in one image.
 
     Attributes:
         pixel: (K, 2) of each corner of the board; NaN where it was not seen.
@@ -36,7 +36,7 @@ class Detection:
 
     @property
     def seen(self) -> np.ndarray:
-        """(K,) which corners were seen."""
+        """Whether each corner was detected, (K,)."""
         return ~np.isnan(self.pixel[:, 0])
 
 
@@ -49,7 +49,7 @@ class Found:
 
 
 def write_corners(path: Path, found: Found) -> Path:
-    """Write ``corners.csv``."""
+    """Write detections as ``corners.csv``."""
     rows: list[list[object]] = [["", "", *found.size, None, None, "size of the images"]]
     for name, one in found.images.items():
         edge = None if np.isnan(one.edge) else one.edge
@@ -63,7 +63,7 @@ def write_corners(path: Path, found: Found) -> Path:
 
 
 def read_corners(path: Path, board: Board) -> Found:
-    """Read ``corners.csv`` for a board.
+    """Return the detections of a ``corners.csv`` for a board.
 
     Raises:
         MeasurementError: for corners that the board does not have.

@@ -1,4 +1,4 @@
-"""Corners of a board in an image, sub-pixel, each with a standard deviation; and why an image is of no use.
+"""Sub-pixel corners of a board in an image, each with a standard deviation; or why the image is unusable.
 
 Markers are found in an image of some `max_pixels` pixels; corners are then refined in the full one by the orthogonality
 of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standard deviation is the Cramér–Rao bound of
@@ -27,7 +27,7 @@ MOVED = 1.8  # ratio of the widths of edges across and along from which on blur 
 
 
 def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
-    """Find a board in an image.
+    """Return the corners of a board detected in an image.
 
     Args:
         image: (height, width) 8-bit grey.
@@ -63,7 +63,7 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
 
 
 def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
-    """Return corner numbers (n,) and pixels (n, 2), not refined."""
+    """Return corner numbers (n,) and pixels (n, 2) before refinement."""
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if board.kind == "chessboard":
         inner = board.columns - 1, board.rows - 1
@@ -87,7 +87,7 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _upright(image: np.ndarray, found: np.ndarray, board: Board) -> np.ndarray:
-    """Return a chessboard's corners in the order that begins at the black square in its upper left."""
+    """Return a chessboard's corners, reordered to begin at the upper left black square."""
     inner = found.reshape(board.rows - 1, board.columns - 1, 2)
 
     def level(a: np.ndarray, b: np.ndarray) -> float:
@@ -101,7 +101,7 @@ def _upright(image: np.ndarray, found: np.ndarray, board: Board) -> np.ndarray:
 def _consistent(
     ids: np.ndarray, found: np.ndarray, table: np.ndarray, board: Board
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Drop corners that a plane's picture cannot hold; return the rest, and the length of a square [px]."""
+    """Return the corners consistent with the image of a plane, and the side of a square [px]."""
     plane = cv2.findHomography(table[ids, :2], found, cv2.RANSAC, 8.0)[0]
     if plane is None:
         return ids[:0], found[:0], 1.0
@@ -116,7 +116,7 @@ def _consistent(
 def _refined(
     image: np.ndarray, board: Board, ids: np.ndarray, found: np.ndarray, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine corners in the full image; drop those at its edge and those that run away."""
+    """Return corners refined in the full image, without those at its edge and those that diverge."""
     free = {"charuco": 0.5 * (1.0 - board.marker / board.square), "chessboard": 0.3, "apriltag": 0.09}[board.kind]
     half = int(np.clip(free * spacing, 2, 12))
     inside = ((found > half + 2) & (found < np.array(image.shape[::-1]) - half - 3)).all(axis=1)
@@ -131,7 +131,7 @@ def _refined(
 
 
 def _quality(image: np.ndarray, found: np.ndarray, floor: float, spacing: float) -> tuple[np.ndarray, float, float]:
-    """Return each corner's sigma (n,) [px], the median width of edges [px], and how much wider they are one way."""
+    """Return each corner's sigma (n,) [px], the median width of edges [px], and its ratio across directions."""
     max_half_width = 9  # half width of the patches that quality is measured in [px]
     half = int(np.clip(0.15 * spacing, 3, max_half_width))
     offsets = np.arange(-half, half + 1)
@@ -152,7 +152,7 @@ def _quality(image: np.ndarray, found: np.ndarray, floor: float, spacing: float)
 
 
 def _widths(across: np.ndarray, down: np.ndarray, contrast: float) -> tuple[float, float]:
-    """Return the widths [px] of the two edges that cross in a patch: contrast over the steepest gradient of each."""
+    """Return the widths [px] of both edges that cross in a patch: contrast over the steepest gradient of each."""
     size = np.hypot(across, down)
     best = np.unravel_index(int(np.argmax(size)), size.shape)
     normal = np.array([across[best], down[best]]) / max(float(size[best]), 1e-9)
@@ -176,7 +176,7 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
         if board.kind != "chessboard":
             if (seen := _markers(coarse, board.dictionary)) >= MIN_MARKERS:
                 return (
-                    f"{seen} markers of {board.dictionary} are seen, but not where board.toml has them: are kind, "
+                    f"{seen} markers of {board.dictionary} are seen, but not at their places by board.toml: are kind, "
                     "columns and rows (squares, not inner corners) those of the print?"
                 )
             if other := _other_dictionary(coarse, board):
@@ -188,7 +188,7 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
 
 
 def _other_dictionary(image: np.ndarray, board: Board) -> str:
-    """Return the dictionary with the most detected markers; empty where hardly any are detected."""
+    """Return the name of the dictionary with the most detected markers; "" if hardly any are detected."""
     own = board.dictionary.split("_")[0]
     others = [each for each in DICTIONARIES if each.endswith("_100") or each.startswith("apriltag_36h11")]
     counts = {each: _markers(image, each) for each in others if each.split("_")[0] != own}
@@ -197,7 +197,7 @@ def _other_dictionary(image: np.ndarray, board: Board) -> str:
 
 
 def _markers(image: np.ndarray, name: str) -> int:
-    """Return how many markers of a dictionary an image shows."""
+    """Return the number of detected markers of a dictionary in an image."""
     ids = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(image)[1]
     return 0 if ids is None else len(ids)
 
@@ -239,7 +239,7 @@ def detected(
     usual = Counter(sizes.values()).most_common(1)[0][0]
     for name, size in sizes.items():
         if size != usual:
-            turned = "; was it turned by a program?" if size == usual[::-1] else ""
+            turned = "; did a program rotate it?" if size == usual[::-1] else ""
             words = f"{size[0]} x {size[1]} pixels, where most are {usual[0]} x {usual[1]}{turned}"
             result[name] = Detection(blank, blank[:, 0], words)
     return Found(result, usual)

@@ -1,4 +1,4 @@
-"""Images of a board from ROS 1 and 2 bags and MCAP: sensor_msgs/Image and CompressedImage beside JointState.
+"""Images of a board from ROS 1 and 2 bags and MCAP: sensor_msgs/Image or CompressedImage, with JointState.
 
 Every image takes the joint values at its own stamp, between the joint states before and after it. An image during which
 a joint moved faster than `max_joint_speed` is left out: its joint values are not those of its exposure. Of images taken
@@ -28,7 +28,7 @@ IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msg
 
 @dataclass(frozen=True, eq=False)
 class ImageBag:
-    """What a bag's images come to.
+    """Usable images of a bag with corners and joint values.
 
     Attributes:
         names: of the images kept.
@@ -52,7 +52,7 @@ def read_image_bag(
     joint_topic: str = "",
     say: Callable[[int, str], None] | None = None,
 ) -> ImageBag:
-    """Read images and joint states of a bag, and look for the board.
+    """Return board detections and joint values of a bag's images.
 
     Args:
         path: of the bag (a file, or the folder of a ROS 2 bag).
@@ -66,7 +66,7 @@ def read_image_bag(
     with opened(path) as reader:
         states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")
         names, parts, _ = joint_states(reader, states, None, path)
-        few = f"{len(parts['q'])} joint states are too few to pair images with"
+        few = f"{len(parts['q'])} joint states are too few to interpolate joint values"
         require(len(parts["q"]) >= 2, few, MeasurementError, path)
         order = np.argsort(parts["stamp"], kind="stable")
         connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")
@@ -84,7 +84,7 @@ def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
 
 
 def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
-    """Yield the images of these numbers as grey levels, in their order."""
+    """Yield the images with the given numbers as grey levels, in this order."""
     for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
         if number in wanted:
             yield _grey(reader.deserialize(raw, connection.msgtype))
@@ -113,7 +113,7 @@ def _grey(message: Any) -> np.ndarray:
 
 
 def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the numbers of images taken at rest, their joint values, and what is to be said of the others."""
+    """Return the numbers of images taken at rest, their joint values, and sentences on the other images."""
     notes = []
     after = np.clip(np.searchsorted(stamps, images), 1, len(stamps) - 1)
     before = after - 1
@@ -144,7 +144,7 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
 
 
 def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
-    """Write what a bag came to as a folder that `calib.rooms.camera.pictures.image_folders` reads."""
+    """Write a bag's images as a folder for `calib.rooms.camera.pictures.image_folders`."""
     boards.write_board(board, folder / BOARD)
     rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
     files.write_table(folder / JOINTS, ["image", *found.joint_names], rows)

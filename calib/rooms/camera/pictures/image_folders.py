@@ -1,4 +1,4 @@
-"""A folder of images of a board, with the joint values at each image.
+"""Reading a folder of images of a board with the joint values of each image.
 
 ==================  ===================================================================================================
 ``*.png`` …         the images (png, jpg, tif, bmp, pgm, webp), as the sensor gave them
@@ -51,7 +51,7 @@ def read_images(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> Pixels:
-    """Read a folder of images for a robot with these joints.
+    """Return the measurements of a folder of images for a robot with these joints.
 
     Args:
         path: of the folder.
@@ -85,25 +85,25 @@ def read_images(
 
 
 def read_own_board(path: Path) -> Board:
-    """Read the folder's ``board.toml``.
+    """Return the board of the folder's ``board.toml``.
 
     Raises:
         MeasurementError: where there is none.
     """
-    words = f"has no {BOARD}, which says what board is seen: copy the one that calib board wrote into it"
+    words = f"has no {BOARD}, which describes the board: copy the one that calib board wrote into it"
     require((path / BOARD).is_file(), words, MeasurementError, path)
     return boards.read_board(path)
 
 
 def joint_table(path: Path) -> Table:
-    """Read the folder's ``joints.csv``."""
+    """Return the table of the folder's ``joints.csv``."""
     place = path / JOINTS
     words = f"has no {JOINTS}: a table of image, q1 [deg] ... is needed, one row per image with its joint values"
     require(place.is_file(), words, MeasurementError, path)
     table = read_table(place)
     names = table.texts("image")
     if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise MeasurementError(f"'{twice[0]}' stands there {names.count(twice[0])} times", place, column="image")
+        raise MeasurementError(f"'{twice[0]}' occurs {names.count(twice[0])} times", place, column="image")
     return table
 
 
@@ -151,15 +151,15 @@ def _usable(names: Sequence[str], found: Found, path: Path, min_images: int = 3)
     if len(rows) < min_images:
         why = "; ".join(notes) or "there are no more rows"
         raise MeasurementError(
-            f"{counted(len(rows), 'usable image')}: a calibration takes some 20 to 40 from all "
-            f"around, {min_images} at the very least ({why})",
+            f"{counted(len(rows), 'usable image')}: a calibration takes 20 to 40 from all "
+            f"around, at least {min_images} ({why})",
             path,
         )
     return rows, notes
 
 
 def problem_words(problems: Mapping[str, str]) -> list[str]:
-    """Return a sentence per reason why images are unusable, with their names and the range of the numbers in it."""
+    """Return a sentence per reason why images are unusable, with image names and the range of its numbers."""
     reasons: dict[str, list[str]] = {}
     for name, problem in problems.items():
         if problem:
@@ -174,23 +174,23 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
 
 
 def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
-    """Return the folder's lens and whether it was given; None where it has to be estimated from the images."""
+    """Return the folder's lens and whether it was given; None if the lens must be estimated from the images."""
     place = path / LENS
     if not place.is_file():
         if options.camera.intrinsics == "given":
-            raise MeasurementError(f"has no {LENS}, which intrinsics = 'given' asks for", path)
+            raise MeasurementError(f"has no {LENS}, required by intrinsics = 'given'", path)
         return None, False
     lens = read_lens(place)
     if size[0] and lens.size != size:
         raise MeasurementError(
-            f"is about images of {lens.size[0]} x {lens.size[1]} pixels, those beside it have {size[0]} x {size[1]}",
+            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, the images here have {size[0]} x {size[1]}",
             place,
         )
     return lens, True
 
 
 def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
-    """Return the names of what is fitted of lens and board, as the options say."""
+    """Return the names of the fitted lens and board parameters by the options."""
     camera, result = options.camera, list[str]()
     if camera.intrinsics == "fit" or (camera.intrinsics == "auto" and not known):
         own = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}[camera.model]

@@ -1,4 +1,4 @@
-"""Image files as a sensor gave them: grey, 8 bits, never turned."""
+"""Reading and writing image files as 8-bit grey levels, without EXIF rotation."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,7 +29,7 @@ def read_image(path: Path) -> np.ndarray:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep OpenCV from writing to the terminal: what is wrong is said in our own words."""
+    """Keep OpenCV from writing to the terminal: this toolkit reports errors itself."""
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
@@ -58,7 +58,7 @@ def decode(content: bytes) -> np.ndarray:
 
 
 def to_grey(image: np.ndarray) -> np.ndarray:
-    """Return 8-bit grey levels (height, width) of any image; more than 8 bits are spread over what the image uses."""
+    """Return 8-bit grey levels (height, width) of any image; more than 8 bits are scaled to the image's range."""
     if image.ndim == 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
     if image.dtype == np.uint8:
@@ -69,7 +69,7 @@ def to_grey(image: np.ndarray) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray) -> Path:
-    """Write an image by its suffix."""
+    """Write an image in the format of its suffix."""
     from calib import files
 
     done, content = cv2.imencode(path.suffix, image)
