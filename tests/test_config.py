@@ -98,7 +98,7 @@ def test_the_json_schema_knows_every_key_and_refuses_others(kind: str, capsys: p
 
 def test_a_topic_without_schema_says_which_have_one(capsys: pytest.CaptureFixture) -> None:
     assert run(["formats", "mdh", "--schema"]) == 2
-    assert "there are those of options, identify-options" in capsys.readouterr().err
+    assert "available for options, identify-options" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Findings as sentences, and the verdicts that they give: all that may be said stands in ``findings.toml``.
+"""Findings as sentences, and verdicts from findings: all sentences and limits are in ``findings.toml``.
 
 A stage makes values, ``finding("moved", times=…)`` (`calib.errors.Finding`). The catalogue has for each code
 
@@ -34,7 +34,7 @@ LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
 
 @dataclass(frozen=True)
 class Verdict:
-    """One of `LEVELS`, why, in one sentence, the code of the finding that decided, and what to do.
+    """Verdict: one of `LEVELS`, its reason in one sentence, the code of the deciding finding, and advice.
 
     It equals the name of its level: ``fit.verdict == "pass"``.
     """
@@ -57,7 +57,7 @@ class Verdict:
 
     @classmethod
     def of(cls, figures: str, findings: Iterable[Finding] = ()) -> Verdict:
-        """Return what the worst of findings, the first of equals, allows; `figures` come first in its reason."""
+        """Return the verdict by the worst finding (the first of equals); its reason begins with `figures`."""
         worst = max(findings, key=lambda one: RANKS.index(level_of(one)), default=None)
         if worst is None or level_of(worst) in ("", "note"):
             return cls("pass", figures)
@@ -65,20 +65,20 @@ class Verdict:
         return cls(level_of(worst), reason, worst.code, _filled(advice, worst.values))
 
     def for_prediction(self, why: str) -> Verdict:
-        """Return the verdict of a model that cannot be exported, and `why`: a pass is one for prediction only."""
+        """Return the verdict of a model that cannot be exported because of `why`: a pass becomes prediction only."""
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}") if self.level == "pass" else self
 
 
-UNJUDGED = Verdict("", "the session judges, by unseen rows: see verdict.json at its root")
+UNJUDGED = Verdict("", "judged by the session on unseen rows: see verdict.json in the session's folder")
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What was judged of a robot.
+    """Verdicts on the stages and deliverables of one robot.
 
     Attributes:
         stages: ``geometry``, ``dynamics`` → the verdict on what is to be delivered.
-        deliverables: of the geometry, ``urdf`` and ``corrections`` → the verdict on it; empty where there is one only.
+        deliverables: of the geometry: ``urdf`` and ``corrections`` → the verdict on it; empty if there is only one.
     """
 
     stages: Mapping[str, Verdict] = field(default_factory=dict)
@@ -86,35 +86,35 @@ class Verdicts:
 
     @property
     def level(self) -> str:
-        """The worst of the stages' verdicts; empty without any."""
+        """Worst level among the stages' verdicts; empty without stages."""
         return max((one.level for one in self.stages.values()), key=LEVELS.index, default="")
 
     def of(self, deliverable: str, dynamics: bool = False) -> Verdicts:
-        """Return what was judged of one deliverable, with the dynamics or without."""
+        """Return the verdicts that concern one deliverable, with or without the dynamics."""
         own = {name: one for name, one in self.stages.items() if dynamics or name != "dynamics"}
         if deliverable in self.deliverables:
             own["geometry"] = self.deliverables[deliverable]
         return Verdicts(own)
 
     def __str__(self) -> str:
-        """Say the worst verdict, with the reason of every stage that has it."""
+        """Return the worst verdict with the reasons of all stages at this level."""
         reasons = (f"{stage}: {one.reason}" for stage, one in self.stages.items() if one.level == self.level)
         return f"verdict {self.level}: {'; '.join(reasons)}{'; do not use' if self.level == 'fail' else ''}"
 
     def table(self) -> dict[str, Any]:
-        """Return the worst verdict, and that of each stage with its reason, as JSON holds them."""
+        """Return the worst verdict, and each stage's verdict and reason, as a table for JSON."""
         stages = {stage: {"verdict": one.level, "reason": one.reason} for stage, one in self.stages.items()}
         return {"verdict": self.level, **stages}
 
     @property
     def remark(self) -> str:
-        """What is to be said in a file that does not pass; else empty."""
+        """Remark for files whose verdict is marginal or fail; else empty."""
         return str(self) if self.level in ("marginal", "fail") else ""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the catalogue, see the module's text."""
+    """One entry of the catalogue; the module's docstring explains its fields."""
 
     says: str
     advice: str = ""
@@ -132,7 +132,7 @@ def catalogue() -> Mapping[str, Entry]:
 
 
 def level_of(one: Finding) -> str:
-    """Return one of `RANKS` for a finding, by the catalogue's rule; an accepted one is a note."""
+    """Return the level of a finding (one of `RANKS`) by the limits of the catalogue; accepted findings are notes."""
     entry = catalogue()[one.code]
     reached = [
         max((name for name, limit in steps.items() if one.values[value] > limit), key=RANKS.index, default="")
@@ -143,27 +143,27 @@ def level_of(one: Finding) -> str:
 
 
 def limit(code: str, value: str, level: str = "fail") -> float:
-    """Return above what a value of a finding has a level."""
+    """Return the limit above which a value of a finding reaches a level."""
     return catalogue()[code].limits[value][level]
 
 
 def settle(found: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
-    """Return the findings that there is something to say of, those accepted by the options marked, worst first."""
+    """Return the findings that have a level, worst first; those accepted by the options are marked."""
     marked = [replace(one, accepted=catalogue()[one.code].accept in accepted) for one in found]
     return tuple(sorted(filter(level_of, marked), key=lambda one: -RANKS.index(level_of(one))))
 
 
 def sentence(one: Finding) -> str:
-    """Return what the catalogue says of a finding, without advice and full stop."""
+    """Return the sentence of a finding, without advice and full stop."""
     return _filled(catalogue()[one.code].says, one.values)
 
 
 class Warned(str):
-    """A line on a finding that keeps a verdict from pass: a command always prints it."""
+    """Line on a finding that prevents the verdict pass: commands always print it."""
 
 
 def lines_of(found: Iterable[Finding]) -> list[str]:
-    """Return findings as lines for a user: the sentence, the advice, and how to accept it."""
+    """Return one line for each finding: its sentence, its advice, and how to accept it."""
     lines = [(_line(one, catalogue()[one.code]), level_of(one)) for one in found]
     return [Warned(words) if level in LEVELS else words for words, level in lines]
 
@@ -179,12 +179,12 @@ def _line(one: Finding, entry: Entry) -> str:
 
 @cache
 def glossary() -> Mapping[str, str]:
-    """Return the field's terms that messages and reports use, term -> what it means."""
+    """Return the technical terms of messages and reports, term -> meaning."""
     return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
 
 
 def explain(code: str) -> str:
-    """Return what a code of the catalogue means and what to do, or what a term of the glossary means.
+    """Return the explanation of a finding's code (sentence, limits, advice) or of a term of the glossary.
 
     Raises:
         UsageError: for a code or term that there is none of.
@@ -204,7 +204,7 @@ def explain(code: str) -> str:
 
 
 def _filled(template: str, values: Mapping[str, Any]) -> str:
-    """Return a template with values printed; an optional part goes where a value of it is None or empty."""
+    """Return a template with its values inserted; optional parts with a value None or empty are omitted."""
 
     def kept(part: re.Match[str]) -> str:
         needed = [name for _, name, _, _ in Formatter().parse(part[1]) if name]

@@ -1,4 +1,4 @@
-"""The file formats, as their own modules document them: `calib formats` prints those docstrings and nothing else."""
+"""File formats and their documentation: `calib formats` prints the docstrings of the modules that define them."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -82,18 +82,18 @@ _KINDS = {
 
 
 def overview() -> list[str]:
-    """Return one line per topic."""
+    """Return one line for each format: name and short description."""
     return [f"{name:17} {words}" for name, (words, _) in TOPICS.items()]
 
 
 def describe(topic: str) -> str:
-    """Return the documentation of a topic.
+    """Return the documentation of the format `topic`.
 
     Raises:
-        UsageError: with the topics there are.
+        UsageError: for an unknown topic, with the known ones.
     """
     if topic not in TOPICS:
-        raise UsageError(f"no format '{topic}'; there are {', '.join(TOPICS)}")
+        raise UsageError(f"unknown format '{topic}'; known: {', '.join(TOPICS)}")
     parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1]]
     if topic == "session":
         from calib.procedure.session.settings import example
@@ -102,19 +102,19 @@ def describe(topic: str) -> str:
     elif topic in SCHEMAS:
         found = _schema(topic)
         parts.append(
-            "\n".join(["Every key, what it may hold, and its default:\n", *_keys(found, found.get("$defs", {}))])
+            "\n".join(["Every key, its allowed values, and its default:\n", *_keys(found, found.get("$defs", {}))])
         )
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
 def json_schema(topic: str) -> str:
-    """Return the JSON schema (draft 2020-12) of a TOML file, as editors take it to complete keys and check values.
+    """Return the JSON schema (draft 2020-12) of a TOML file, with which editors complete keys and check values.
 
     Raises:
         UsageError: for a topic without one, with those that have one.
     """
     if topic not in SCHEMAS:
-        raise UsageError(f"no JSON schema of '{topic}'; there are those of {', '.join(SCHEMAS)}")
+        raise UsageError(f"no JSON schema for '{topic}'; available for {', '.join(SCHEMAS)}")
     return json.dumps(_schema(topic), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -124,7 +124,7 @@ def _schema(topic: str) -> dict[str, Any]:
 
 
 def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") -> Iterator[str]:
-    """Yield a line per key of a table of a JSON schema, keys of the tables in it included."""
+    """Yield one line for each key of a JSON schema's table, nested tables included."""
     for key, value in table.get("properties", {}).items():
         if key == "files":  # the same keys, for one file
             continue
@@ -139,7 +139,7 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") 
 
 
 def _held(value: Mapping[str, Any]) -> str:
-    """Return what a key may hold, in words."""
+    """Return the allowed values of a key as text."""
     if "anyOf" in value:
         return " or ".join(dict.fromkeys(map(_held, value["anyOf"])))
     if "enum" in value:
@@ -155,5 +155,5 @@ def _held(value: Mapping[str, Any]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a docstring without reStructuredText's marks for code."""
+    """Return a docstring without the code marks of reStructuredText."""
     return text.replace("::\n", ":\n").replace("``", "")

@@ -1,4 +1,4 @@
-"""Serial arms and other robots behind the same verbs: how another kind of robot is found, and which verbs it has."""
+"""Commands for robots other than serial arms: detecting the kind of robot, and the commands it supports."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from calib.procedure.findings import Verdict
 
 @dataclass(frozen=True)
 class Stage:
-    """How one verb is carried out for a kind of robot.
+    """Implementation of one command for a kind of robot.
 
     Attributes:
-        run: takes the robot and what the verb of `calib` takes; returns a result as of a serial arm.
-        check: takes the folder for the results and the files read; raises UsageError for what would be written over.
+        run: takes the robot and the arguments of the `calib` command; returns the same result type as for an arm.
+        check: takes the folder for the results and the files read; raises UsageError if an input would be overwritten.
         judge: takes inputs, model and findings of an identification; returns its assessment on all recordings.
     """
 
@@ -30,13 +30,13 @@ class Stage:
 
 @runtime_checkable
 class Mechanism(Protocol):
-    """A robot that is no serial arm, as a room offers it (``robots`` of `calib.extensions`).
+    """Robot that is not a serial arm, provided by a plug-in package (``robots`` of `calib.extensions`).
 
     Attributes:
         kind: what it is, in words: ``parallel robot``.
         source: the file it came from.
         chain: its actuated joints as those of an arm: name, n, joint_names, joints.
-        instead: verb that it does not have → what to do, in a clause.
+        instead: command that it does not support → advice, as a clause.
     """
 
     @property
@@ -49,32 +49,32 @@ class Mechanism(Protocol):
     def chain(self) -> Any: ...
 
     def write(self, folder: Path) -> None:
-        """Write ``robot.toml`` into a folder, by which the folder is this robot."""
+        """Write ``robot.toml`` into a folder, so that the folder can be given as this robot."""
         ...
 
     def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, Any]:
-        """Return an identified model as ``dynamics.json`` holds it."""
+        """Return an identified model in the form of ``dynamics.json``."""
         ...
 
 
 @runtime_checkable
 class MechanismResult(Protocol):
-    """A fit or an identification of a robot that is no serial arm; `verdict` judges it."""
+    """Result of a fit or an identification of a robot that is not a serial arm."""
 
     @property
     def verdict(self) -> Verdict: ...
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that the command writes."""
+        """Write the same folder as the command."""
         ...
 
     def with_unseen(self, unseen: Sequence[Any]) -> MechanismResult:
-        """Return the result judged anew on more files; nothing is fitted or identified again."""
+        """Return the result with additional unseen files in its verdict; nothing is fitted or identified again."""
         ...
 
 
 def mechanism(robot: object) -> Mechanism | None:
-    """Return the robot of another kind that `robot` is, or names; None for a serial arm, and for what is no robot.
+    """Return the robot if `robot` is (or names) one that is not a serial arm; else None.
 
     Raises:
         RobotError: for a file that contradicts itself.
@@ -85,13 +85,13 @@ def mechanism(robot: object) -> Mechanism | None:
 
 
 def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> Stage | None:
-    """Return how a verb is carried out for a robot, its `run` bound to it; None for serial arms.
+    """Return the implementation of a command for a robot, `run` bound to that robot; None for serial arms.
 
     Args:
-        base, tip: links of a URDF, which other robots have none of.
+        base, tip: links of a URDF; other robots have no such links.
 
     Raises:
-        UsageError: for a verb that its kind of robot does not have, and for links.
+        UsageError: for a command that this kind of robot does not support, and for links.
     """
     found = mechanism(robot)
     if found is None:
@@ -100,20 +100,20 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     if verb not in stages:
         instead = found.instead.get(verb, f"{', '.join(stages)} take it")
         named = robot if isinstance(robot, (str, Path)) else found.source
-        raise UsageError(f"{named} is a {found.kind}, and {verb} is for serial arms yet; {instead}")
+        raise UsageError(f"{named} is a {found.kind}, {verb} supports only serial arms; {instead}")
     for key, value in (("base", base), ("tip", tip)):
         if value:
-            raise UsageError(f"{key} '{value}': a link of a URDF, which a {found.kind} has none of")
+            raise UsageError(f"{key} '{value}' is a link of a URDF; a {found.kind} has no such links")
     return replace(stages[verb], run=partial(stages[verb].run, found))
 
 
 def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
-    """Refuse settings that a stage does not read, where they ask for something: neither as usual nor switched off.
+    """Refuse settings that a stage does not read, unless they have their default or are switched off.
 
     Args:
-        settings, plain: dataclasses of one type: as given, and as usual.
+        settings, plain: dataclasses of one type: the given values, and the defaults.
         read: names of the fields that the stage reads.
-        where: the file they stand in.
+        where: the file that contains them.
 
     Raises:
         UsageError: naming the first.
@@ -122,4 +122,4 @@ def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: objec
         value = getattr(settings, each.name)
         if each.name not in read and value is not False and value != getattr(plain, each.name):
             place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
-            raise UsageError(f"{place}{each.name}{shown} is for serial arms yet, not for this kind of robot")
+            raise UsageError(f"{place}{each.name}{shown} is supported only for serial arms, not for this kind of robot")

@@ -96,7 +96,7 @@ def test_fit_then_identify_on_the_calibrated_geometry(folder, tmp_path, capsys):
     assert metrics["platform_rms"]["calibrated"]["rz"] < 0.02 * metrics["platform_rms"]["nominal"]["rz"]
     assert calib("identify", fitted, folder / "empty.csv", "--out", tmp_path / "id", "--no-plots") == 0
     assert calib("fit", "dualv", folder / "readings.csv", "--out", tmp_path / "alone") == 0
-    assert "scale nor place" in capsys.readouterr().out
+    assert "scale nor base position" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -161,10 +161,10 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"), 1, "above 30 % fails"),
+        (("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"), 1, "fail above 30 %"),
         (("fit", "dualv", "wrong.csv", "--validate", "poses.csv"), 1, "worse than the nominal"),
-        pytest.param(("identify", "dualv", *NOT_THERE), 0, "move as if it were not there", marks=pytest.mark.slow),
-        pytest.param(("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "a run without it separates them",
+        pytest.param(("identify", "dualv", *NOT_THERE), 0, "move as if it were absent", marks=pytest.mark.slow),
+        pytest.param(("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "record a run without it",
                      marks=pytest.mark.slow),
         *((words, 2, said) for words, said in (
         (("identify", "dualv", "three.csv"), "3 joints"),

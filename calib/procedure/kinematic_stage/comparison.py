@@ -1,4 +1,4 @@
-"""Errors of the nominal and of the calibrated arm on the same rows."""
+"""Errors of the nominal and the calibrated arm on the same rows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MARGIN = 3  # measured numbers per fitted parameter of a placement, below which 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Predicted σ and 95 % interval of the position error on some rows, and the errors themselves.
+    """Position errors on some rows, with their predicted σ and 95 % intervals.
 
     Attributes:
         sigma: (m,) standard deviation of the tool position error, all axes together [m].
@@ -46,12 +46,12 @@ class Intervals:
 
     @property
     def covered(self) -> float:
-        """Share of the errors that are within their 95 % interval."""
+        """Share of the errors inside their 95 % intervals."""
         return float(np.mean(self.size <= self.radius))
 
     @property
     def record(self) -> IntervalCoverage:
-        """Coverage, median radius and rows that extrapolate."""
+        """Coverage of the intervals, their median radius, and the number of extrapolating rows."""
         return IntervalCoverage(
             coverage_percent=100.0 * self.covered,
             median_mm=1e3 * float(np.median(self.radius)),
@@ -64,7 +64,7 @@ class Intervals:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The two arms on the same rows.
+    """Errors of the nominal and the calibrated arm on the same rows.
 
     Attributes:
         blocks: the rows.
@@ -105,11 +105,11 @@ class Comparison:
 
     @property
     def of_urdf(self) -> Comparison:
-        """The same comparison for the URDF alone: without joint corrections and the intervals that include them."""
+        """The comparison for the URDF alone: without joint corrections and without intervals (these include them)."""
         return self if self.alone is None else replace(self, errors=(self.errors[0], self.alone), intervals=None)
 
     def record(self, parameters: int = 0) -> ComparedRows:
-        """Return the comparison as ``metrics.json`` holds it; `parameters` were fitted to its rows."""
+        """Return the comparison in the form of ``metrics.json``; `parameters` is the number fitted to its rows."""
         pairs = self.pairs if len(self.pairs[0]) else ()
         return ComparedRows(
             poses=self.poses,
@@ -137,7 +137,7 @@ def compare(
     alone: Installation | None = None,
     shares_frames: bool = False,
 ) -> Comparison:
-    """Return both arms' errors on some rows, and those of the calibrated geometry `alone` (`without_corrections`)."""
+    """Return the errors of both arms on some rows, and of the calibrated geometry `alone` (`without_corrections`)."""
     cells, torques = (nominal, calibrated), [gravity_of(nominal.chain, block) for block in blocks]
     one, two = (errors(cell, blocks, torques) for cell in cells)
     first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
@@ -158,7 +158,7 @@ def compare_unseen(
     alone: Installation | None = None,
     expected: ErrorModel | None = None,
 ) -> Comparison:
-    """Return both arms' errors on unseen rows; base and tool placement are refitted where these rows need it."""
+    """Return the errors of both arms on unseen rows; base and tool placement are refitted if these rows need it."""
     block, torques, settled, thin = unseen.block, [gravity_of(nominal.chain, unseen.block)], True, None
     if unseen.own_frames:
         placed = [placed_on(cell, block, torques, settings) for cell in (nominal, calibrated)]
@@ -168,7 +168,7 @@ def compare_unseen(
         numbers, fitted = sum(piece.part.value.size for piece in placed[1].pieces), len(placed[1].free)
         words = "base and tool placement refitted on these rows"
         if not settled:
-            words = "base and tool placement did not settle on these rows"
+            words = "base and tool placement did not converge on these rows"
         elif numbers < MARGIN * fitted:
             thin = numbers, fitted
             words = f"base and tool placement: {fitted} parameters fitted to {numbers} numbers of these rows"
@@ -188,14 +188,14 @@ def compare_unseen(
 
 
 def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes: np.ndarray) -> Intervals:
-    """Return predicted σ (m,) [m] and interval of an error model on rows, with the errors' sizes (m,) [m]."""
+    """Return the error sizes (m,) [m] on rows, with σ (m,) [m] and interval predicted by an error model."""
     beyond = np.atleast_2d(outside(block.q, expected.learnt))
     names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
     return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)
 
 
 def interval_cells(found: Comparison, count: int) -> list[tuple[float | None, float | None, int | None]]:
-    """Return the cells of `INTERVAL` for each of `count` rows; empty where the fit states no errors."""
+    """Return the table cells of `INTERVAL` for `count` rows; empty cells if the fit has no error model."""
     if found.intervals is None:
         return [(None, None, None)] * count
     each = found.intervals
@@ -203,7 +203,7 @@ def interval_cells(found: Comparison, count: int) -> list[tuple[float | None, fl
 
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
-    """Return gravity torques (m, n) [N m] of a block; None where the robot's masses are not known."""
+    """Return gravity torques (m, n) [N m] of a block; None if the robot's masses are unknown."""
     if chain.inertias is None or len(chain.driven) != chain.n:
         return None
     from calib.dynamics.rigid_body import gravity_torques

@@ -1,7 +1,7 @@
-"""Nominal targets turned into the joint commands that put the real tool there.
+"""Joint commands that place the tool of the real (calibrated) robot on nominal targets.
 
-Frames are a matter of convention, since an arm that is measured from outside tells neither its base nor its flange from
-the placement of the instrument and of the target:
+Frames are a convention: measurements from outside cannot separate the arm's base from the placement of the instrument,
+nor its flange from the placement of the target:
 
     --frame base      targets stand in the base of the calibrated robot, as its robot.toml has it: base link and flange
                       stay where the nominal description has them (elements that are not identifiable stay nominal)
@@ -50,13 +50,13 @@ STARTS = 24  # random starts for each target without joints
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a fit's folder says of the arm in its cell.
+    """Calibrated arm and its cell, read from the folder of a fit.
 
     Attributes:
         cell: the calibrated installation, deflections included.
-        nominal: the nominal one, placed to fit the same measurements best; without stations where that is not known.
+        nominal: the nominal one, placed to fit the same measurements best; without stations if that is unknown.
         free, covariance: of the fit's parameters, see `read_covariance`.
-        unseen: rms error of the calibrated arm on poses that were not fitted [m]; None where there were none.
+        unseen: rms error of the calibrated arm on unseen poses [m]; None without such poses.
         fitted: rms error on the fitted poses [m].
         learnt: (k, n) poses that were fitted [rad or m], and `discrepancy`: what makes errors at others likely; None
             where the fit does not say.
@@ -74,12 +74,12 @@ class Fitted:
 
     @property
     def placed(self) -> bool:
-        """Whether it is known where the nominal robot stood."""
+        """Whether the placement of the nominal robot is known."""
         return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(self.nominal.station_names)
 
     @property
     def torques(self) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Gravity torques as the fit took them, of the nominal arm; None where no deflection needs them."""
+        """Gravity torques of the nominal arm, as used in the fit; None without deflection terms."""
         if not any(term.basis == "torque" for term in self.cell.deflection.terms):
             return None
         from calib.dynamics.rigid_body import gravity_torques
@@ -89,7 +89,7 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What to send for m targets.
+    """Joint commands for m targets.
 
     Attributes:
         targets, fitted: what was asked for, of which robot in its cell.
@@ -126,7 +126,7 @@ class Commands:
 
 
 def read(folder: str | Path) -> Fitted:
-    """Read the folder of a fit (or of a session that has one).
+    """Read the folder of a fit, or of a session that contains a fit.
 
     Raises:
         UsageError: where it is none, or lacks something.
@@ -135,7 +135,7 @@ def read(folder: str | Path) -> Fitted:
     inside, proof = FitFolder(session / IN_SESSION), ValidationFolder(session / VALIDATED)
     fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
     if not fit.robot.is_file():
-        raise UsageError(f"{fit.path} holds no robot.toml; give the folder that `calib fit --out` has written")
+        raise UsageError(f"{fit.path} contains no robot.toml; give the folder written by `calib fit --out`")
     cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
     own = fit.metrics()
@@ -147,7 +147,7 @@ def read(folder: str | Path) -> Fitted:
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
-    """Return the nominal and the calibrated arm with one station and one tool each, seen from one frame.
+    """Return the nominal and the calibrated arm in one frame, each with one station and one tool.
 
     Args:
         fitted: see `read`.
@@ -182,8 +182,8 @@ def _station(fitted: Fitted, frame: str) -> int:
         raise UsageError(f"frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
     if not fitted.placed:
         raise UsageError(
-            f"{fitted.folder} does not say where the nominal robot stood (it was fitted from an earlier fit's folder, "
-            "by an earlier version, or without an instrument): frame 'base' is left"
+            f"{fitted.folder} does not state the nominal robot's placement (it was fitted from an earlier fit's "
+            "folder, by an earlier version, or without an instrument); use frame 'base'"
         )
     return 0 if frame == "nominal" else names.index(frame)
 
@@ -215,7 +215,7 @@ def compensate(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Commands:
-    """Return the joint commands that put the real tool on the targets.
+    """Return the joint commands that place the real tool on the targets.
 
     The nominal robot says which configuration is meant; from there the calibrated one is led to the target, joints
     moving as little as they can. Where one would move by more than `MAX_CORRECTION`, the arm is near a singularity:
@@ -281,7 +281,7 @@ def compensate(
 
 
 def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, Finding]:
-    """Return how much of a pose counts, and what to say of it."""
+    """Return the number of pose components (6, 5 or 3) that targets determine, and the finding on it."""
     oriented = targets.rotation is not None or (targets.q is not None and targets.position is None)
     given, able = 6 if oriented else 3, 6 if chain.n >= 6 else 5 if chain.n == 5 else 3
     if asked not in (None, *inverse.DOF):
@@ -295,7 +295,7 @@ def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, Findin
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the targets' poses (m, 4, 4) and the nominal robot's joints (m, n) there."""
+    """Return the targets' poses (m, 4, 4) and the nominal robot's joint positions (m, n) at them."""
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
@@ -310,7 +310,7 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 
 
 def _sought(goal: Goal, wanted: np.ndarray, start: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the nominal robot's joints (m, n): of several tries those nearest to `start`, by the largest change."""
+    """Return the nominal robot's joint positions (m, n); of several solutions the one nearest to `start` (max norm)."""
     best, cost = np.tile(start, (len(wanted), 1)), np.full(len(wanted), np.inf)
     for first in (start, *others):
         q = inverse.reach(goal, wanted, np.tile(first, (len(wanted), 1)))
@@ -322,7 +322,7 @@ def _sought(goal: Goal, wanted: np.ndarray, start: np.ndarray, others: np.ndarra
 
 
 def _sizes(difference: np.ndarray) -> np.ndarray:
-    """Return lengths (m, 2) of position and orientation differences; NaN where no orientation counts."""
+    """Return lengths (m, 2) of position and orientation differences; NaN if orientations are not required."""
     position = np.linalg.norm(difference[:, :3], axis=1)
     turn = np.linalg.norm(difference[:, 3:], axis=1) if difference.shape[1] > 3 else np.full(len(position), np.nan)
     return np.stack([position, turn], axis=1)
@@ -333,7 +333,7 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
 
 
 def _missed(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool) -> Finding:
-    """Return why a target is not reached, from what is left there (2,) [m, rad]."""
+    """Return the finding why a target is not reached, from the remaining errors (2,) [m, rad]."""
     rest = {"left": left[0], "turn": None if np.isnan(left[1]) else left[1]}
     for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
         if not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
@@ -345,7 +345,7 @@ def _missed(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, 
 
 
 def _extrapolated(chain: Chain, beyond: np.ndarray) -> Finding | None:
-    """Return which joints (n,) of a command stand outside the range that was measured."""
+    """Return the finding on joints (n,) of a command that are outside the measured range."""
     names = [name for name, out in zip(chain.joint_names, beyond) if out]
     return finding("command-extrapolates", joints=names) if names else None
 
@@ -353,7 +353,7 @@ def _extrapolated(chain: Chain, beyond: np.ndarray) -> Finding | None:
 def _predicted_sigmas(
     fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the tool's sigmas (m, 2) by the parameters, and what to expect of it (m, 2), see `Commands`.
+    """Return the tool's sigmas (m, 2) from the parameters, and its expected errors (m, 2), see `Commands`.
 
     Where the fit did not place the tool, it counts as known.
     """
@@ -374,7 +374,7 @@ def _predicted_sigmas(
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
-    """Return in which frame targets were taken to be, and how far its alternative is."""
+    """Return the finding on the frame of the targets, and the distance to the alternative frame."""
     if frame not in ("base", "nominal"):
         return finding("targets-in-station", station=frame)
     shift = turn = None
@@ -385,7 +385,7 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
 
 
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
-    """Return that orientations count and were never measured."""
+    """Return a finding if targets have orientations, but no orientation was measured."""
     table = layout(fitted.cell)
     measured = {table.names[k] for k in np.intersect1d(fitted.free, table.tool_index)}
     if dof == 3 or any(name.rsplit(".", 1)[-1] in ("rx", "ry", "rz") for name in measured):
@@ -401,7 +401,7 @@ COLUMNS = (
 
 
 def _unreached(commands: Commands) -> list[str]:
-    """Return which targets are not reached, and why; at most `SHOWN` of them."""
+    """Return one line for each target that is not reached, with the reason; at most `SHOWN` lines."""
     lost = np.flatnonzero(~commands.reached)
     more = [f"{len(lost) - SHOWN} more"] if len(lost) > SHOWN else []
     return [*(f"target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]), *more]
@@ -416,7 +416,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     fitted, targets = commands.fitted, commands.targets
     lost, count = int(np.sum(~commands.reached)), len(commands.q)
     if lost and (not partial or lost == count):
-        advice = "" if lost == count else "\npartial (--partial) writes the others, these rows empty"
+        advice = "" if lost == count else "\npartial (--partial) writes the others and leaves these rows empty"
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         raise UsageError("\n  ".join([head, *_unreached(commands)]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names
@@ -435,7 +435,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
 
 
 def lines(commands: Commands) -> list[str]:
-    """Return what a person should know of the commands."""
+    """Return the lines on the commands for the user."""
     good, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []
@@ -458,7 +458,7 @@ def lines(commands: Commands) -> list[str]:
 
 
 def _expectation(commands: Commands) -> Finding:
-    """Return what to expect of the real arm at these targets, by the error model where there is one."""
+    """Return the finding on the expected error of the real arm at these targets, by the error model if available."""
     good, unseen = commands.reached, commands.fitted.unseen
     if commands.expected is not None:
         rms, within = np.sqrt(np.mean(commands.expected[good, 0] ** 2)), commands.expected[good, 1].max()

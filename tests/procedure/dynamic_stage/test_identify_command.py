@@ -62,7 +62,7 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     assert found["validation"]["train.npz@10:"]["evidence"] is False
     assert (found["verdict"], found["code"]) == ("marginal", "validation-repeats") and found["advice"]
     assert {"validation-repeats", "repeats-training"} <= {one["code"] for one in found["noticed"]}
-    assert "it is no evidence" in capsys.readouterr().out
+    assert "is no evidence" in capsys.readouterr().out
 
 
 def test_the_calibrated_robots_folder_serves_and_the_nominal_chooses_columns(tmp_path):
@@ -105,7 +105,7 @@ def test_reversed_torques_are_refused_and_one_reversed_joint_fails(robot, tmp_pa
     assert run(robot, every, "--out", tmp_path / "out", "--friction", "standard") == 2
     assert "sign is reversed" in capsys.readouterr().err and not (tmp_path / "out").exists()
     assert run(robot, one, "--out", tmp_path / "out", "--friction", "standard") == 1
-    assert "friction drives joint 3" in capsys.readouterr().out
+    assert "friction of joint 3 adds energy" in capsys.readouterr().out
 
 
 def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):

@@ -81,7 +81,7 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
     notes = deliver(Export(tmp_path / "source.urdf", identified=folder), tmp_path / "out")
-    assert any("no place for motor inertias" in note for note in notes)
+    assert any("without motor inertias" in note for note in notes)
     given = identified.read(folder)
     check_torques_with_pinocchio(tmp_path / "out" / "robot.urdf", given)
     before, after = read_tree(source, "before"), read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after")
@@ -100,7 +100,7 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
         drive = [*csv.DictReader(file)][1]
     assert float(drive["armature"]) == pytest.approx(standard["values"][place])
     assert float(drive["armature_sigma"]) == pytest.approx(standard["covariance"][place][place] ** 0.5)
-    assert any(note.startswith("masses written, behind each joint: ") for note in notes)
+    assert any(note.startswith("exported masses after each joint: ") for note in notes)
 
 
 def check_torques_with_pinocchio(path: Path, given: identified.IdentifiedRobot) -> None:

@@ -88,7 +88,7 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
     ))  # fmt: skip
     code, out, err = calib("compensate", fitted, "t.csv", "--frame", "seen", "--tool", "tool", "--out", "commands.csv")
     assert code == 0, err
-    assert "instrument's frame, station 'seen'" in out and "tool 'tool'" in out
+    assert "instrument's frame, station 'seen'" in out and "targets: 'tool'" in out
     rows = commands()
     assert {row["status"] for row in rows} == {"reached"}
     position, turn = off(true_poses(cell, numbers(rows, Q)), wanted)
@@ -104,7 +104,7 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
     assert position < np.sqrt(np.mean(expected**2)) and 0.7 < np.sqrt(np.mean(expected**2)) / unseen < 1.3
     sizes = np.linalg.norm(true_poses(cell, numbers(rows, Q))[:, :3, 3] - wanted[:, :3, 3], axis=1)
     assert np.mean(sizes <= radius) > 0.9
-    assert f"what to expect of the real arm at these targets: {1e3 * np.sqrt(np.mean(expected**2)):.3g} mm rms" in out
+    assert f"expected error of the real arm at these targets: {1e3 * np.sqrt(np.mean(expected**2)):.3g} mm rms" in out
 
 
 def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(cell, fitted, here, calib):
@@ -115,8 +115,8 @@ def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(c
     near, far = commands()
     names = cell.nominal.joint_names
     assert (near["extrapolated"], near["reason"], far["extrapolated"]) == ("0", "", "1")
-    assert far["reason"] == f"extrapolated: {names[0]}, {names[5]} outside the range that was measured"
-    assert f"EXTRAPOLATED: 1 of 2 targets have joints outside the range that was measured ({names[0]}, " in out
+    assert far["reason"] == f"extrapolated: {names[0]}, {names[5]} outside the measured range"
+    assert f"EXTRAPOLATED: 1 of 2 targets have joints outside the measured range ({names[0]}, " in out
     assert float(far["expected [mm]"]) > 1.2 * float(near["expected [mm]"])
 
 
@@ -126,7 +126,7 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     write(here / "t.csv", [f"q{k + 1} [deg]" for k in range(6)], np.rad2deg(q))
     code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
     assert code == 0, err
-    assert "calibrated robot's base" in out and "tool 'flange'" in out
+    assert "base frame of the calibrated robot" in out and "targets: 'flange'" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
     found = compensation.read(fitted)
     goal = Goal(compensation.placements(found)[1], torques=found.torques)
@@ -158,7 +158,7 @@ def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     assert sizes["nominal"] == pytest.approx(metrics["nominal"]["position_mm"]["rms"], rel=0.2)
     assert sizes["nominal"] < sizes["base"]
     own = " ".join(said["nominal"].split()).split(" without compensation")[0].rpartition("targets: ")[2]
-    assert f"({own} are the arm's own" in " ".join(said["base"].split()) and "the arm's own" not in said["nominal"]
+    assert f"({own} from the arm itself" in " ".join(said["base"].split()) and "the arm itself" not in said["nominal"]
 
 
 def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):

@@ -122,7 +122,7 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
     other = cell.write("b.csv", cell.measure(40, 1, elsewhere), columns)
     code, out, _ = calib("fit", "ur5", file, "--validate", other, "--model", "geometry", "--out", "one")
     assert (code, judged_by("one"), "--refit-frames" in out) == (1, "placed-elsewhere", True)
-    assert "calibrated already" not in out
+    assert "already be calibrated" not in out
     code, out, err = calib(
         "fit", "ur5", file, "--validate", other, "--refit-frames", "--model", "geometry", "--out", "two"
     )

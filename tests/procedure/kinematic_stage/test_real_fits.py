@@ -81,7 +81,7 @@ def test_motoman_small_box(data, calib, here):
     unseen = found["validation"]["right_6x6x6_150.csv"]
     assert (found["fit"]["poses"], unseen["poses"]) == (100, 50)
     assert unseen["calibrated"]["position_mm"]["rms"] < 0.07
-    assert any("it trades with the placement of" in line for line in found["not_identifiable"])
+    assert any("it is correlated with the placement of" in line for line in found["not_identifiable"])
 
 
 def test_motoman_wide(data, calib, here):

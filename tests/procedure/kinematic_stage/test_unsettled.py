@@ -47,5 +47,5 @@ def test_a_file_that_its_own_placement_explains_proves_nothing(cell, calib) -> N
     for count, scored in ((6, False), (12, True)):
         few = cell.write("few.csv", other[:count])
         _, out, err = calib("fit", "ur5", file, "--model", "offsets", "--validate", few, "--refit-frames", "--out", "o")
-        assert ("few.csv is not scored: base and tool placement take 9" in out) is not scored, err
+        assert ("few.csv is not scored: base and tool placement use 9" in out) is not scored, err
         assert ("on few.csv, unseen" in out) is scored

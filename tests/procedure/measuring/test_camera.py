@@ -166,7 +166,7 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
     stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
     told = " ".join(said)
     assert "of no use (blurred: still moving): 0003.png" in told and "the arm carries the camera" in told
-    assert "the board gives the scale (30 mm a square)" in told
+    assert "the board sets the scale (30 mm per square)" in told
     assert stop.verdict == "pass"
     found = json.loads(session.path("5-validation/metrics.json").read_text())
     unseen = found["validation"]["validation"]
