@@ -62,13 +62,13 @@ class Base:
 
     @property
     def regrouped(self) -> tuple[str, ...]:
-        """Names of the parameters that go into others."""
+        """Names of the standard parameters regrouped into others."""
         silent = set(self.split.without_effect.tolist())
         return tuple(self.standard[k] for k in self.split.dropped if k not in silent)
 
     @property
     def transform(self) -> np.ndarray:
-        """(b, p), base = transform @ standard."""
+        """Matrix (b, p) of base = transform @ standard."""
         result = np.zeros((self.b, len(self.standard)))
         result[np.arange(self.b), self.kept] = 1.0
         result[:, self.split.dropped] = self.split.coefficients
@@ -76,7 +76,7 @@ class Base:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The b names, with R where others are regrouped in, by no less than `MIN_COEFFICIENT`."""
+        """Names of the b parameters, with R if others are regrouped into them by at least `MIN_COEFFICIENT`."""
         return tuple(
             self.standard[k] + ("R" if (np.abs(row) >= MIN_COEFFICIENT).any() else "")
             for k, row in zip(self.kept, self.split.coefficients)
@@ -87,7 +87,7 @@ class Base:
         return tuple(self.standard_units[k] for k in self.kept)
 
     def to_standard(self, values: np.ndarray) -> np.ndarray:
-        """Return standard parameters (p,) with the same torques: base values at the kept ones, zero at the others."""
+        """Return standard parameters (p,) with the same torques: base values for the kept ones, zero for the others."""
         result = np.zeros(len(self.standard))
         result[self.kept] = shaped(values, (self.b,), "base parameters")
         return result
@@ -95,7 +95,7 @@ class Base:
 
 @dataclass(frozen=True, eq=False)
 class BaseModel:
-    """A model seen through its base columns: what excitation and identification work with."""
+    """A model reduced to its base columns: used by excitation and identification."""
 
     model: IdentificationModel
     base: Base
@@ -120,20 +120,20 @@ class BaseModel:
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the regressor (N, rows, b); arguments as of `IdentificationModel.regressor`."""
+        """Return the base regressor (N, rows, b); for the arguments see `IdentificationModel.regressor`."""
         full = self.model.regressor(q, v, a, load, carried, states)
         return full.transpose(2, 1, 0)[self.base.kept].transpose(2, 1, 0)
 
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · regressor by q, v, a, each (N, n); weights (N, rows, b)."""
+        """Return the derivatives of Σ weights · regressor by q, v, a, each (N, n); weights (N, rows, b)."""
         return self.model.regressor_gradient(q, v, a, weights, self.base.kept)
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · regressor values by q, v, a, each (N, n); values (b,), weights (N, rows)."""
+        """Return the derivatives of Σ weights · regressor values by q, v, a, each (N, n); weights (N, rows)."""
         standard = np.zeros(self.model.p)
         standard[self.base.kept] = values
         return self.model.torque_gradient(q, v, a, standard, weights)
@@ -146,14 +146,14 @@ def random_samples(
     lower: np.ndarray | None = None,
     upper: np.ndarray | None = None,
 ) -> States:
-    """Draw `count` states of a model, within limits (n,) of its coordinates; see its `sample`."""
+    """Return `count` random states of a model within limits (n,) of its coordinates; see its `sample`."""
     return model.sample(count, np.random.default_rng(seed), lower, upper)
 
 
 def find(
     model: RegressorModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6
 ) -> Base:
-    """Choose the base columns of a model.
+    """Return the base parameters of a model: independent columns of its regressor.
 
     Args:
         samples: states to compare columns over; default `random_samples`. Recorded motion says what that motion
@@ -170,7 +170,7 @@ def find(
 
 
 def regroup(base: Base, model: RegressorModel, samples: States | None = None, loads: Loads | None = None) -> Base:
-    """Recompute K on another geometry (the calibrated chain), the columns kept: W_dropped ≈ W_kept K, least squares.
+    """Return the base recomputed for another geometry with the same columns: W_dropped ≈ W_kept K by least squares.
 
     The remainder says how well that holds over the samples. Columns without effect on the nominal chain (on the
     calibrated one a small one) take part; the singular values are those of the new geometry.
@@ -212,7 +212,7 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
 
 
 def expressions(base: Base) -> tuple[str, ...]:
-    """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``; small coefficients are left out."""
+    """Return the base parameters as sums of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``, without small coefficients."""
     lines = []
     for name, k, row in zip(base.names, base.kept, base.split.coefficients):
         text = base.standard[k]
@@ -227,7 +227,7 @@ def expressions(base: Base) -> tuple[str, ...]:
 
 
 def standard_name(name: str, standard: Collection[str]) -> str:
-    """Return the standard parameter that a base parameter of a file is named after: ``ZZ1R`` stands at ``ZZ1``."""
+    """Return the standard parameter of a base parameter's name in a file: ``ZZ1`` for ``ZZ1R``."""
     return name[:-1] if name.endswith("R") and name not in standard and name[:-1] in standard else name
 
 
@@ -243,7 +243,7 @@ def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _clean(split: ColumnSplit, rounding: float = 1e-11) -> ColumnSplit:
-    """Return the split with coefficients that are rounding set to zero.
+    """Return the split with rounding errors in the coefficients set to zero.
 
     `rounding`: coefficients below this part of the largest of their column are rounding.
     """
@@ -256,7 +256,7 @@ def _clean(split: ColumnSplit, rounding: float = 1e-11) -> ColumnSplit:
 
 
 def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which columns are without effect, and the norms of the others (1 for these)."""
+    """Return the mask of columns without effect, and the norms of all columns (1 for those without effect)."""
     norms = np.linalg.norm(factor, axis=0)
     silent = norms <= 1e-12 * norms.max(initial=0.0)
     return silent, np.where(silent, 1.0, norms)
@@ -275,14 +275,14 @@ def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, sam
 
 def _require_same(base: Base, model: RegressorModel) -> None:
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
-        raise CalibError("the base parameters belong to another model: its rows or its parameters' names differ")
+        raise CalibError("the base parameters belong to another model: rows or parameter names differ")
 
 
 BLOCK = 4000  # samples at a time
 
 
 def information(model: BaseModel, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return Σ ωᵀω (b, b) of a motion's regressors ω.
+    """Return the information Σ ωᵀω (b, b) of a motion with regressors ω.
 
     Args:
         model: with b columns; q, v, a: (N, n) [rad or m, and per s, per s²].
@@ -303,11 +303,11 @@ def columns_at_rest(
     upper: np.ndarray,
     known: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return which base columns (c,) are independent where some joints rest.
+    """Return the indices (c,) of base columns that stay independent when some joints are at rest.
 
     Args:
         model: with b columns.
-        resting: joint → where it rests [rad or m]; None: anywhere, but in one place.
+        resting: joint → its position at rest [rad or m]; None: one random position.
         lower, upper: (n,) finite limits of the random states at which columns are compared.
         known: (b, b) information of other motions, in which those joints may move.
     """

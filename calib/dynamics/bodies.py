@@ -26,7 +26,7 @@ UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """B rigid bodies moved by n coordinates, parents before children.
+    """B rigid bodies with n coordinates, ordered with parents before children.
 
     Attributes:
         labels: (B,) what a body's parameters are numbered with: ``ZZ3`` belongs to body ``3``.
@@ -67,7 +67,7 @@ class Bodies:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The 10·B standard parameters, body after body."""
+        """Names of the 10·B standard parameters, body after body."""
         return tuple(name + label for label in self.labels for name in STANDARD)
 
     @property
@@ -75,7 +75,7 @@ class Bodies:
         return UNITS * self.count
 
     def with_gravity(self, gravity: np.ndarray) -> Bodies:
-        """Return the bodies under another gravity vector (3,) in the base frame [m/s²]."""
+        """Return the bodies with another gravity vector (3,) in the base frame [m/s²]."""
         gravity = shaped(gravity, (3,), "gravity")
         check_gravity(gravity)
         constants = np.array(self.constants)
@@ -115,7 +115,7 @@ def bodies_of(chain: Chain) -> Bodies:
 
 
 def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None, on: int = -1) -> Bodies:
-    """Return the bodies with one more body, fixed to body `on` (default the last).
+    """Return the bodies with a payload added, fixed to body `on` (default the last).
 
     Args:
         placement: (4, 4), the frame of the payload's parameters in the frame of the body it is fixed to; `Chain.tail`
@@ -125,7 +125,7 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
     parent = range(bodies.count)[on]
     label = str(bodies.n + 1) if label is None else label
     if label in bodies.labels:
-        raise RobotError(f"a body '{label}' is there already; give the payload another label")
+        raise RobotError(f"a body '{label}' exists already; give the payload another label")
     return _assemble(
         [*bodies.labels, label],
         [*bodies.parents, parent],
@@ -140,13 +140,13 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
 
 
 def standard_parameters(chain: Chain) -> np.ndarray:
-    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias; followers have none.
+    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias; mimic joints have none.
 
     Raises:
         RobotError: where the chain has no inertias.
     """
     if chain.inertias is None:
-        raise RobotError(f"robot '{chain.name}': its masses are not known; add 'inertia' to its joints")
+        raise RobotError(f"robot '{chain.name}'has no masses; add 'inertia' to its joints")
     bodies = bodies_of(chain)
     result = np.zeros((bodies.count, 10))
     for row, label in enumerate(bodies.labels):
@@ -156,7 +156,7 @@ def standard_parameters(chain: Chain) -> np.ndarray:
 
 
 def _elementary(element: Element) -> np.ndarray:
-    """Return the constant part of an element, exp(sign · axis · value), (4, 4)."""
+    """Return the constant transform of an element (4, 4), exp(sign · axis · value)."""
     axis, amount = AXES.index(element.axis) % 3, element.sign * element.value
     if element.axis[0] == "t":
         return pose(position=amount * np.eye(3)[axis])
@@ -168,7 +168,7 @@ def _elementary(element: Element) -> np.ndarray:
 
 
 def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gravity, n) -> Bodies:
-    """Freeze the arrays and list the coordinates that move each body."""
+    """Return the bodies with frozen arrays and the list of coordinates that move each body."""
     paths = np.full((len(labels), n), -1)
     depths = np.zeros(len(labels), dtype=int)
     for i, (parent, coordinate) in enumerate(zip(parents, coordinates)):
@@ -205,12 +205,12 @@ _PERMUTED = tuple(
 
 
 def upright_turn(axis: int) -> np.ndarray:
-    """Return the turn (4, 4) from a body's frame to the kernels', whose z is the moving axis (0, 1, 2 for x, y, z)."""
+    """Return the rotation (4, 4) from a body's frame to the kernels', with the joint axis (0, 1, 2: x, y, z) as z."""
     return pose(np.eye(3)[:, _TURNS[axis]])
 
 
 def _upright(parents, axes, placements) -> list[np.ndarray]:
-    """Return the placements between frames whose axes are relabelled so that the moving one is z."""
+    """Return the placements between frames with axes relabelled so that the joint axis is z."""
     turns = [upright_turn(axis) for axis in axes]
     before = [np.eye(4) if parent < 0 else turns[parent].T for parent in parents]
     return [first @ placement @ turn for first, placement, turn in zip(before, placements, turns)]

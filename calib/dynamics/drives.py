@@ -24,15 +24,15 @@ MOTOR_SIDE = {"Ia": "acceleration", "Fvm": "velocity", "Fcm": "sign", "offm": "o
 
 @dataclass(frozen=True)
 class DriveTerm:
-    """One column.
+    """One drive term: a column of the regressor.
 
     Attributes:
         name: of its parameter, e.g. ``Fc3``.
         shape: a key of `SHAPES`.
         acts: pairs (torque row, motion seen there), the motion as pairs (joint, weight); empty for a parameter without
             any effect.
-        settings: as many numbers as the shape asks for; an ``edge`` may be left out.
-        side: "link" or "motor" of a joint torque sensor; without one all is seen from the motor.
+        settings: the numbers that the shape needs; an ``edge`` may be omitted.
+        side: "link" or "motor" of a joint torque sensor; without such a sensor all terms are on the motor side.
         linear: whether the joint is prismatic (units).
     """
 
@@ -52,7 +52,7 @@ class DriveTerm:
             raise CalibError(
                 f"term '{self.name}': shape '{self.shape}' needs ({', '.join(wanted)}), not {self.settings}"
             )
-        require(self.side in ("link", "motor"), f"term '{self.name}': side '{self.side}' is neither 'link' nor 'motor'")
+        require(self.side in ("link", "motor"), f"term '{self.name}': side '{self.side}', expected 'link' or 'motor'")
 
     @property
     def form(self) -> Shape:
@@ -60,14 +60,14 @@ class DriveTerm:
 
     @property
     def joint(self) -> int | None:
-        """The joint whose torque depends on its own motion through this term; None for a coupling."""
+        """Joint of a term that couples its torque to its own motion; None for a coupling of joints."""
         if len(self.acts) != 1 or self.acts[0][1] != ((self.acts[0][0], 1.0),):
             return None
         return self.acts[0][0]
 
     @property
     def nonnegative(self) -> bool:
-        """Whether no robot has a parameter below zero; the inertia of a coupling may be."""
+        """Whether the parameter is physically non-negative; the inertia of a coupling may be negative."""
         return self.form.nonnegative and (self.form.dissipative or self.joint is not None)
 
     @property
@@ -75,7 +75,7 @@ class DriveTerm:
         return self.form.unit_linear if self.linear else self.form.unit
 
     def acting(self, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each torque row that a term acts on, and its column there (N,).
+        """Yield each torque row that a term acts on, and the term's column in it (N,).
 
         Args:
             motions: as in `fill`.
@@ -86,19 +86,19 @@ class DriveTerm:
             yield row, self.values(seen)
 
     def values(self, seen: Joined) -> np.ndarray:
-        """Return the column (N,) at a motion, per unit of the parameter."""
+        """Return the term's column (N,) for a motion, per unit of the parameter."""
         if self.shape == "acceleration":
             return seen.a
         found = self._evaluated(seen, 1)[0]
         return found * np.abs(seen.load) if self.form.loaded and seen.load is not None else found
 
     def slopes(self, seen: Joined) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the slopes of the column by x, v (N,) and a."""
+        """Return the derivatives of the column by x, v (N,) and a."""
         _, by_x, by_v = self._evaluated(seen, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
     def _evaluated(self, seen: Joined, rows: int) -> np.ndarray:
-        """Return the value, or value and slopes by x and v, (1 or 3, N)."""
+        """Return the value (1, N), or value and derivatives by x and v (3, N)."""
         from calib.dynamics import shape_kernels
 
         acts, out = np.zeros((1, 8)), np.empty((rows, len(seen.v)))
@@ -109,14 +109,14 @@ class DriveTerm:
 
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
-    """Return the term of one joint that depends on that joint's motion."""
+    """Return a drive term of one joint that depends on that joint's motion."""
     return DriveTerm(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
 
 
 def standard(
     sets: Sequence[str], v0: float | Sequence[float] = V0, linear: Sequence[bool] | None = None
 ) -> tuple[DriveTerm, ...]:
-    """Return the terms of n joints, joint after joint.
+    """Return the standard drive terms of n joints, joint after joint.
 
     Args:
         sets: n strings of names out of Ia Fv Fc off (and Fvl Fcl offl, Fvm Fcm offm), e.g. ``["Ia Fv Fc"] * 6``.
@@ -165,7 +165,7 @@ def coupled(
 
 
 def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
-    """Return the constant inertia (n, n) that acceleration terms add to the bodies': diag(Ia) and couplings."""
+    """Return the constant inertia (n, n) that acceleration terms add to that of the bodies: diag(Ia) and couplings."""
     result = np.zeros((n, n))
     for one, value in zip(terms, values, strict=True):
         if one.shape == "acceleration":
@@ -176,7 +176,7 @@ def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.
 
 
 def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarray | None], states: np.ndarray) -> None:
-    """Write the columns of terms into out (k, n, N), zero on entry.
+    """Write the columns of terms into out (k, n, N), which must be zero.
 
     Args:
         motions: q, v, a, load, each (n, N), load None where unknown.
@@ -191,7 +191,7 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
 
 
 def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) -> None:
-    """Write the kinetic energies ½ Σ weight v_row v_joint of acceleration terms into out (k, N); v (n, N)."""
+    """Write the kinetic energies ½ Σ weight v_row v_joint of acceleration terms into out (k, N), given v (n, N)."""
     for column, one in zip(out, terms, strict=True):
         for row, motion in one.acts if one.shape == "acceleration" else ():
             for joint, weight in motion:
@@ -201,9 +201,9 @@ def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) ->
 def slopes(
     terms: Sequence[DriveTerm], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
 ) -> None:
-    """Add the slopes of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
+    """Add the derivatives of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
     for weight, one in zip(weights, terms, strict=True):
-        require(one.form.slopes, f"term '{one.name}' ({one.shape}) depends on the past or on torques: it has no slopes")
+        require(one.form.slopes, f"term '{one.name}' ({one.shape}) depends on past motion or torques: no derivatives")
         for row, motion in one.acts:
             parts = one.slopes(_join(one, motion, [*motions, None], None))
             for target, part in zip(out, parts):
@@ -212,7 +212,7 @@ def slopes(
 
 
 def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
-    """Return the stop operators' states (s, N) of one uninterrupted record q (n, N), at rest and unstressed at first.
+    """Return the stop operators' states (s, N) of one uninterrupted record q (n, N), starting unstressed.
 
         z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1):
 
@@ -229,9 +229,9 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
 
 
 def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
-    """Return what a term sees: weighted sums of q, v, a; of the load, that of the row's first joint."""
+    """Return the motion of a term: weighted sums of q, v, a and load."""
     if one.form.loaded and motions[3] is None:
-        raise CalibError(f"term '{one.name}' needs the transmitted torque: give load (N, n), measured or predicted")
+        raise CalibError(f"term '{one.name}' needs the transmitted torque; give load (N, n), measured or predicted")
     if len(motion) == 1 and motion[0][1] == 1.0:
         x, v, a, load = (None if m is None else m[motion[0][0]] for m in motions)
     else:
@@ -240,7 +240,7 @@ def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], 
 
 
 def offered(step: str, joint: int, seen: JointRange, linear: bool = False) -> tuple[DriveTerm, ...]:
-    """Return the terms of one joint that a step of the friction ladder offers, by what the joint did."""
+    """Return the candidate terms of one joint in a step of the friction ladder, scaled by the joint's motion."""
     found = [
         (number, term(f"{one.label}{joint + 1}{end}", one.shape, joint, *settings, side=one.side, linear=linear))
         for one in STEPS[step]

@@ -1,4 +1,4 @@
-"""Compiled slopes (numba) of the regressor and of torques by q, v and a: reverse differentiation, by hand.
+"""Compiled derivatives (numba) of the regressor and of torques by q, v and a: reverse differentiation, by hand.
 
 Arrays and notation are those of `calib.dynamics.kernels`, whose forward pass is undone here from the last body to the
 first.
@@ -26,7 +26,7 @@ from calib.dynamics.kernels import (
 
 @njit(**OPTIONS)
 def _share(links, order, i, weights, motion, twists, slopes, bars):
-    """Add body i's own part of the reverse pass: slopes of Σ_j S_j · wrench_i(g_j), g_j = weights[j, body i].
+    """Add body i's part of the reverse pass: derivatives of Σ_j S_j · wrench_i(g_j), g_j = weights[j, body i].
 
     ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
     """
@@ -68,7 +68,7 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
 
 @njit(**OPTIONS)
 def _unjoint(links, i, rate, motion, slopes):
-    """Undo the joint's own terms of `advance` in reverse; return the slopes by rate and by change."""
+    """Reverse the joint terms of `advance`; return the derivatives by joint rate and by its change."""
     h = i + 1
     if links[i, KIND] == FIXED:
         return 0.0, 0.0
@@ -85,7 +85,7 @@ def _unjoint(links, i, rate, motion, slopes):
 
 @njit(**OPTIONS)
 def _unadvance(links, i, rate, frames, motion, slopes):
-    """Take the slopes of body i's motion to its parent's; return the slope by the joint's own motion."""
+    """Propagate the derivatives by body i's motion to its parent's; return the derivative by the joint position."""
     p, h = links[i, PARENT] + 1, i + 1
     by_amount = 0.0
     if links[i, KIND] == REVOLUTE:  # d(Rᵀ x)/dθ = -z × Rᵀ x, of the rotated parts of w, dw, a alone
@@ -124,7 +124,7 @@ def _unadvance(links, i, rate, frames, motion, slopes):
 
 @njit(**OPTIONS)
 def _uncarry(links, i, frames, twists, bars):
-    """Take the slopes of body i's twists to its parent's; return the slope by the joint's own motion."""
+    """Propagate the derivatives by body i's twists to its parent's; return the derivative by the joint position."""
     p, h = links[i, PARENT], i + 1
     x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
     by_amount = 0.0
@@ -153,7 +153,7 @@ def _uncarry(links, i, frames, twists, bars):
 
 @njit(**OPTIONS)
 def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, gv, ga):
-    """Add one sample's slopes to gq, gv, ga (n,), from the last body on; `hung` says where the twists hang."""
+    """Add one sample's derivatives to gq, gv, ga (n,), from the last body on; `hung`: links that carry the twists."""
     for i in range(len(frames) - 1, -1, -1):
         c, scale = links[i, COORDINATE], constants[i, SCALE]
         rate = scale * v[c]
@@ -168,7 +168,7 @@ def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, g
 
 @njit(**OPTIONS)
 def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weights, gq, gv, ga):
-    """Add the slopes of Σ weights · Y(q, v, a) by q, v and a to gq, gv, ga (N, n), zero on entry; weights (N, n, 10 B).
+    """Add the derivatives of Σ weights · Y(q, v, a) by q, v, a to gq, gv, ga (N, n), initially 0; weights (N, n, 10 B).
 
     Reverse differentiation of the regressor, by hand: one forward pass, one pass back, O(n B) per sample.
     """
@@ -192,7 +192,7 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
 
 
 def hung_on_one(links: np.ndarray) -> np.ndarray:
-    """Return links (B, 4 + n) whose bodies all hang on one virtual joint without coordinate, for `torque_gradient`."""
+    """Return links (B, 4 + n) with all bodies on one virtual joint without coordinate, for `torque_gradient`."""
     chain = links.copy()
     chain[:, DEPTH], chain[:, PATH], chain[:, COORDINATE] = 1, 0, -1
     return frozen(chain, np.int64)
@@ -200,7 +200,7 @@ def hung_on_one(links: np.ndarray) -> np.ndarray:
 
 @njit(**OPTIONS)
 def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, parameters, weights, gq, gv, ga):
-    """Add the slopes of Σ weights · tau(q, v, a), weights (N, n), by q, v and a to gq, gv, ga (N, n), zero on entry.
+    """Add the derivatives of Σ weights · tau(q, v, a), weights (N, n), by q, v, a to gq, gv, ga (N, n), initially 0.
 
     `regressor_gradient` for weights of rank one: the joints' twists enter only as their weighted sum, so one virtual
     joint, which every body hangs on (``chain``, `hung_on_one`), does for all of them: O(B) per sample. ``parameters``

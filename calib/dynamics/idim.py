@@ -28,12 +28,12 @@ KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}  # YY MZ M;
 
 @dataclass(frozen=True, eq=False)
 class IdentificationModel:
-    """Bodies and drives as one regressor.
+    """Regressor of bodies and drives.
 
     Attributes:
         bodies: of the robot.
         terms: the drives' terms.
-        torque_rows: which torques it explains.
+        torque_rows: torque rows that the model explains.
     """
 
     bodies: Bodies
@@ -47,7 +47,7 @@ class IdentificationModel:
         for one in self.terms:
             for row, motion in one.acts:
                 if not all(0 <= joint < self.n for joint in (row, *(j for j, _ in motion))):
-                    raise CalibError(f"term '{one.name}' names a joint beyond the robot's {self.n}")
+                    raise CalibError(f"term '{one.name}' refers to a missing joint; the robot has {self.n}")
 
     @property
     def n(self) -> int:
@@ -55,13 +55,13 @@ class IdentificationModel:
 
     @property
     def prismatic(self) -> np.ndarray:
-        """(n,) bool by coordinate."""
+        """Mask (n,) of prismatic coordinates."""
         moved = {int(c): int(kind) for c, kind in zip(self.bodies.coordinates[::-1], self.bodies.kinds[::-1])}
         return np.array([moved.get(j) == PRISMATIC for j in range(self.n)], dtype=bool)
 
     @property
     def inertial(self) -> int:
-        """Number of columns that are bodies' parameters; they come first."""
+        """Number of body parameters, the first columns."""
         return 10 * self.bodies.count if self.torque_rows.has_bodies else 0
 
     @property
@@ -74,18 +74,18 @@ class IdentificationModel:
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
-        """The terms that these rows can see."""
+        """Drive terms that affect these torque rows."""
         seen = self.torque_rows.sides
         return tuple(one for one in self.terms if one.side in seen)
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """(p,) what each column is to `TorqueRows`."""
+        """Side of each column (p,) for `TorqueRows`."""
         return (*(BODIES,) * self.inertial, *(one.side for one in self.columns))
 
     @property
     def rows(self) -> int:
-        """Torque rows per sample."""
+        """Number of torque rows per sample."""
         return self.torque_rows.count(self.n)
 
     @property
@@ -101,7 +101,7 @@ class IdentificationModel:
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the regressor (N, rows, p); its memory is ordered (p, rows, N), so stacking copies nothing.
+        """Return the regressor (N, rows, p); memory order (p, rows, N), so that stacking needs no copy.
 
         Args:
             q, v, a: (N, n) [rad or m, and per s, per s²].
@@ -123,7 +123,7 @@ class IdentificationModel:
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray, columns: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · regressor(q, v, a) by q, v and a, each (N, n), exactly; all bodies on board.
+        """Return the exact derivatives of Σ weights · regressor(q, v, a) by q, v, a, each (N, n), with all payloads.
 
         Args:
             weights: (N, rows, c).
@@ -148,7 +148,7 @@ class IdentificationModel:
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · regressor(q, v, a) values by q, v and a, each (N, n); all bodies on board.
+        """Return the derivatives of Σ weights · regressor(q, v, a) values by q, v, a, each (N, n), with all payloads.
 
         Args:
             values: (p,) of the parameters.
@@ -166,7 +166,7 @@ class IdentificationModel:
         return out[0], out[1], out[2]
 
     def acting(self) -> np.ndarray:
-        """Return which entries of the regressor can differ from 0, (p, rows) bool.
+        """Return the mask (p, rows) of regressor entries that can differ from 0.
 
         A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
         """
@@ -189,7 +189,7 @@ class IdentificationModel:
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the torques (N, rows) of parameters (p,), by recursive Newton-Euler and without the regressor.
+        """Return the torques (N, rows) of parameters (p,), by recursive Newton-Euler.
 
         Friction that depends on the load feels the torque that the bodies need by the model.
         """
@@ -210,7 +210,7 @@ class IdentificationModel:
     def transmitted(
         self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None
     ) -> np.ndarray:
-        """Return the torques (N, n) that the gears pass on to the bodies: what load-dependent friction feels."""
+        """Return the torques (N, n) transmitted by the gears to the bodies, for load-dependent friction."""
         present = np.ones(self.inertial) if carried is None else self.carried_columns(carried)
         bodies = np.array(values[: self.inertial]) * present
         return rigid_body.inverse_dynamics(self.bodies, bodies, q, v, a)
@@ -228,13 +228,13 @@ class IdentificationModel:
         return out
 
     def carried_columns(self, carried: Collection[str]) -> np.ndarray:
-        """Return (10 B,) one for parameters of bodies that are there, zero for those of payloads that are not."""
+        """Return factors (10 B,): one for parameters of bodies present, zero for those of absent payloads."""
         kinds = zip(self.bodies.labels, self.bodies.kinds)
         present = [kind != FIXED or label in carried for label, kind in kinds]
         return np.repeat(np.array(present, dtype=float), 10)
 
     def preference(self) -> np.ndarray:
-        """Return the columns in the order they are tried: of moving links what Khalil keeps, drives, rest, payloads."""
+        """Return the columns in order of preference: those Khalil keeps of moving links, drives, others, payloads."""
         bodies = self.bodies
         first: list[int] = []
         late: list[int] = []
@@ -249,13 +249,13 @@ class IdentificationModel:
         return np.array([*first, *range(self.inertial, self.p), *late, *fixed], dtype=int)
 
     def load_cases(self) -> Loads:
-        """Return all payloads and none, where the model has payloads."""
+        """Return the load cases: all payloads and none, or only one case without payloads in the model."""
         return (None, ()) if self.inertial and np.any(self.bodies.kinds == FIXED) else (None,)
 
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
+        """Return random states: q uniform within its limits (default ±π), v, a uniform within ±3 per s and per s²."""
         low = np.full(self.n, -np.pi) if lower is None else lower
         q = rng.uniform(low, np.full(self.n, np.pi) if upper is None else upper, (count, self.n))
         v, a, load = rng.uniform(-3.0, 3.0, (3, count, self.n))
@@ -263,7 +263,7 @@ class IdentificationModel:
         return States(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
 
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
-        """Zero the columns of fixed bodies that are absent."""
+        """Set the columns of absent payloads to zero."""
         if carried is None:
             return
         payloads = {label for label, c in zip(self.bodies.labels, self.bodies.coordinates) if c < 0}
@@ -274,7 +274,7 @@ class IdentificationModel:
             out[10 * index : 10 * index + 10] = 0.0
 
     def with_load(self) -> tuple[str, ...]:
-        """Return the names of the terms that need `load`."""
+        """Return the names of the terms that depend on `load`."""
         return tuple(one.name for one in self.columns if one.form.loaded)
 
     def with_terms(self, *terms: DriveTerm) -> IdentificationModel:
@@ -289,7 +289,7 @@ def from_chain(
     rows: TorqueRows = MOTOR,
     v0: float | Sequence[float] = V0,
 ) -> IdentificationModel:
-    """Return the model of a chain with the same drive terms on every joint, or with a set per joint.
+    """Return the model of a chain with the same drive terms on all joints, or one set per joint.
 
     Args:
         sets: names out of `drives.standard`, one string for all joints or n strings.
@@ -306,5 +306,5 @@ def from_chain(
 
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of friction with memory along one uninterrupted record q (N, n), to slice in blocks."""
+    """Return the states (s, N) of friction with memory along one uninterrupted record q (N, n), not cut into blocks."""
     return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.n), "q").T))

@@ -49,7 +49,7 @@ def sincos(x):
 
 @njit(**OPTIONS)
 def place(links, constants, i, amount, cosine, sine, frames):
-    """Write row i of `frames`, the joint moved by `amount`."""
+    """Write the frame of body i into row i of `frames`, at joint position `amount`."""
     for r in range(3):
         x, y, z, t = constants[i, 4 * r], constants[i, 4 * r + 1], constants[i, 4 * r + 2], constants[i, 4 * r + 3]
         frames[i, 3 * r], frames[i, 3 * r + 1] = x, y
@@ -63,7 +63,7 @@ def place(links, constants, i, amount, cosine, sine, frames):
 
 @njit(**OPTIONS)
 def advance(links, i, rate, change, frames, motion):
-    """Write w, dw, a of body i (row i + 1 of `motion`, (B + 1, 9)) from its parent's."""
+    """Write w, dw, a of body i from its parent's into row i + 1 of `motion` (B + 1, 9)."""
     p, h = links[i, PARENT] + 1, i + 1
     wx, wy, wz = motion[p, 0], motion[p, 1], motion[p, 2]
     ex, ey, ez = motion[p, 3], motion[p, 4], motion[p, 5]
@@ -90,7 +90,7 @@ def advance(links, i, rate, change, frames, motion):
 
 @njit(**OPTIONS)
 def carry(links, constants, i, frames, twists):
-    """Write the twists (u_j, s_j) of body i (row i + 1 of `twists`, (B + 1, n, 6)) from its parent's."""
+    """Write the twists (u_j, s_j) of body i from its parent's into row i + 1 of `twists` (B + 1, n, 6)."""
     t00, t01, t02 = frames[i, 0], frames[i, 1], frames[i, 2]
     t10, t11, t12 = frames[i, 3], frames[i, 4], frames[i, 5]
     t20, t21, t22 = frames[i, 6], frames[i, 7], frames[i, 8]
@@ -217,7 +217,7 @@ def _load_lanes(kind, scale, amount, v, a, joint):
 
 @njit(**OPTIONS)
 def regressor(links, constants, order, amount, v, a, out):
-    """Fill out (10 B, n, N), zero on entry, with the standard regressor.
+    """Fill out (10 B, n, N), initially zero, with the standard regressor.
 
     L samples at a time, the sample index innermost, so that the compiler turns every line into vector instructions.
 
@@ -282,7 +282,7 @@ def _wrench(i, parameters, motion, wrench):
 
 @njit(**OPTIONS)
 def _return(links, constants, i, frames, wrench, tau):
-    """Add body i's share to tau (n,), then its wrench to the parent's."""
+    """Add body i's torque to tau (n,) and its wrench to the parent's."""
     c, p = links[i, COORDINATE], links[i, PARENT]
     fx, fy, fz = wrench[i, 0], wrench[i, 1], wrench[i, 2]
     nx, ny, nz = wrench[i, 3], wrench[i, 4], wrench[i, 5]
@@ -303,7 +303,7 @@ def _return(links, constants, i, frames, wrench, tau):
 
 @njit(**OPTIONS)
 def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, out):
-    """Fill out (N, n), zero on entry, with the torques (recursive Newton-Euler; Luh, Walker, Paul 1980).
+    """Fill out (N, n), initially zero, with the torques (recursive Newton-Euler; Luh, Walker, Paul 1980).
 
     Args:
         amount, cosine, sine: (N, B), each body's own motion.

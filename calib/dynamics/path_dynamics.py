@@ -1,4 +1,4 @@
-"""The dynamics of a robot along a path q = Φ(s), straight from the regressor of its identification model.
+"""Dynamics of a robot along a path q = Φ(s), from the regressor of its identification model.
 
     tau = A(s) s̈ + B(s) ṡ² + Γ(s) + f(Φ, Φ' ṡ),    v = Φ' ṡ,    a = Φ' s̈ + Φ'' ṡ²
     Γ = w(Φ, 0, 0) X,    B = w(Φ, Φ', Φ'') X - Γ,    A = w(Φ, Φ', Φ' + Φ'') X - B - Γ = w(Φ, 0, Φ') X - Γ
@@ -27,10 +27,10 @@ Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class PathDynamics:
-    """A model with numbers, its friction apart.
+    """A model with parameter values, friction separate from the rest.
 
     Attributes:
-        regressor: q, v, a (N, n) to (N, rows, b); the last n rows are the torques that are limited.
+        regressor: maps q, v, a (N, n) to (N, rows, b); the last n rows are the limited torques.
         parameters: (b,) X, zero for friction.
         terms, amounts: all drive terms and their (k,) values; Coulomb's sign is the exact one.
         bodies, inertial: bodies and their (10 B,) parameters.
@@ -55,7 +55,7 @@ class PathDynamics:
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return A, B, Γ, each (N, n), at Φ, Φ', Φ'' (N, n)."""
+        """Return the coefficients A, B, Γ of the path dynamics, each (N, n), at Φ, Φ', Φ'' (N, n)."""
         still = np.zeros_like(q)
         gravity = self.rigid(q, still, still)
         return self.rigid(q, still, slope) - gravity, self.rigid(q, slope, curvature) - gravity, gravity
@@ -72,12 +72,12 @@ class PathDynamics:
         return self._drives(rubbing, q, v, a, load)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) of a motion, friction included: recursive Newton-Euler, not the regressor."""
+        """Return the torques (N, n) of a motion with friction, by recursive Newton-Euler."""
         load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a)
         return load + self._drives(range(len(self.terms)), q, v, a, load)
 
     def _drives(self, chosen: Sequence[int], q, v, a, load: np.ndarray | None) -> np.ndarray:
-        """Return the torques (N, n) of chosen terms."""
+        """Return the torques (N, n) of chosen drive terms."""
         terms = [self.terms[k] for k in chosen]
         motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
         out = np.zeros((len(terms), self.n, len(q)))
@@ -86,7 +86,7 @@ class PathDynamics:
 
 
 def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
-    """Return the path dynamics of a model with standard (or regrouped) parameters (p,), all payloads on board."""
+    """Return the path dynamics of a model with standard (or regrouped) parameters (p,), with all payloads."""
     values = shaped(values, (model.p,), "parameters of the model")
     _require_torques(model)
     rubbing = _is_friction(model)
@@ -98,10 +98,10 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
 
 
 def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
-    """Return the path dynamics of base parameters (b,): the regressor is the base regressor.
+    """Return the path dynamics of base parameters (b,), with the base regressor.
 
     Raises:
-        CalibError: where friction is regrouped with masses or offsets, so that they cannot be distinguished.
+        CalibError: if friction is regrouped with masses or offsets, so that they cannot be distinguished.
     """
     values = shaped(values, (model.base.b,), "base parameters")
     _require_torques(model.model)
@@ -111,7 +111,7 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
     max_mixed = 1e-6  # of a column, beyond which friction counts as regrouped with something else
     if mixed.max(initial=0.0) > max_mixed:
         name = model.names[int(mixed.max(axis=1).argmax())]
-        raise CalibError(f"base parameter {name} mixes friction with other effects: torques are not distinguished")
+        raise CalibError(f"base parameter {name} mixes friction with other effects: path torques cannot be computed")
     standard = model.base.to_standard(values)
     bodies = standard[: model.model.inertial]
     terms, amounts = _valued(model.model, standard)
@@ -120,23 +120,23 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
 
 def _require_torques(model: IdentificationModel) -> None:
     if not model.torque_rows.has_bodies:
-        raise CalibError("rows tau - tau_l hold no bodies: no motion to plan; use a model of the torques tau")
+        raise CalibError("rows tau - tau_l contain no bodies: no motion planning; use a model of the torques tau")
 
 
 def _is_friction(model: IdentificationModel) -> np.ndarray:
-    """Return (p,) which columns depend on speed."""
+    """Return the mask (p,) of friction columns."""
     bodies = np.zeros(model.inertial, dtype=bool)
     return np.concatenate([bodies, np.array([one.form.friction for one in model.columns], dtype=bool)])
 
 
 def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[DriveTerm, ...], np.ndarray]:
-    """Return the drive terms with a value and an exact sign, and the values."""
+    """Return the drive terms with non-zero values, with exact Coulomb sign, and their values."""
     found = [(one, x) for one, x in zip(model.columns, values[model.inertial :]) if x]
     return tuple(_sharp(one) for one, _ in found), np.array([x for _, x in found], dtype=float)
 
 
 def _sharp(one: DriveTerm) -> DriveTerm:
-    """Return the term with Coulomb's sign as it is, not smoothed: at low speed the larger torque."""
+    """Return the term with the exact, unsmoothed Coulomb sign: the larger torque at low speed."""
     names = one.form.settings
     return replace(one, settings=tuple(0.0 if name == "v0" else x for name, x in zip(names, one.settings)))
 

@@ -28,10 +28,10 @@ def to_standard(pseudo: np.ndarray) -> np.ndarray:
 
 
 def margin(parameters: np.ndarray) -> float:
-    """Return by how much a body is possible: the smallest eigenvalue of Σ about its centre, by its mass, as a root.
+    """Return the margin of physical consistency [m]: root of the smallest eigenvalue of Σ / mass about the centre.
 
-    A length [m]: the standard deviation of the mass in its thinnest direction (a plate of thickness t has t / √12);
-    negative, the root of what is missing, for a body that cannot be, -inf where its mass is not positive.
+    It is the standard deviation of the mass in its thinnest direction (t / √12 for a plate of thickness t); negative
+    for an impossible body; -inf if the mass is not positive.
     """
     pseudo = from_standard(parameters)
     mass = pseudo[3, 3]
@@ -43,9 +43,9 @@ def margin(parameters: np.ndarray) -> float:
 
 
 def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
-    """Return D(P ‖ P₀) = tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4, of -log det (Lee, Wensing & Park 2020).
+    """Return D(P ‖ P₀) = tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4, Bregman's for -log det (Lee, Wensing & Park 2020).
 
-    Zero at P = P₀ alone, infinite at the border, and the same in any frame and any units.
+    Zero only at P = P₀, infinite at the boundary, independent of frame and units.
     """
     ratio = np.linalg.solve(reference, pseudo)
     sign, size = np.linalg.slogdet(ratio)
@@ -63,7 +63,7 @@ def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.nda
 
 
 def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
-    """Return the ten parameters of mass spread evenly from the origin to `end`, as thick as a ball of `radius`."""
+    """Return the ten parameters of a uniform rod from the origin to `end`, with the thickness of a ball of `radius`."""
     x = np.asarray(end, dtype=float)
     pseudo = from_standard(ball(mass, radius, x / 2.0))
     pseudo[:3, :3] += mass * np.outer(x, x) / 12.0
@@ -97,6 +97,6 @@ BASIS, UNITS = _basis(), _units()
 
 
 def unknown_bodies(count: int, others: int) -> np.ndarray:
-    """Return P (count, 4, 4, 10 count + others) as linear in unknowns: ten by body in `UNITS`, then others."""
+    """Return P of bodies linear in unknowns (count, 4, 4, 10 count + others): ten per body in `UNITS`, then others."""
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS).reshape(count, 4, 4, 10 * count)
     return np.concatenate([bodies, np.zeros((count, 4, 4, others))], axis=3)

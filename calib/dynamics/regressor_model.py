@@ -1,4 +1,4 @@
-"""What identification needs of a model: torques as a linear function of parameters, W(q, v, a) x = y.
+"""Interface of models for identification: torques as a linear function of parameters, W(q, v, a) x = y.
 
 A serial chain meets it (`calib.dynamics.idim.IdentificationModel`), and so may anything whose torques are linear in its
 parameters: a closed chain reduced to its actuated coordinates, a model of the power alone. What only a serial chain
@@ -19,7 +19,7 @@ Loads = Sequence[Collection[str] | None]
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """States over which columns are compared, random or recorded.
+    """Random or recorded states for comparing columns.
 
     Attributes:
         q, v, a: (N, n) [rad or m, and per s, per s²].
@@ -35,11 +35,11 @@ class States:
 
 
 class RegressorModel(Protocol):
-    """A model of n recorded coordinates and p parameters, those of bodies first, then those of drive terms."""
+    """Interface of a model with n recorded coordinates and p parameters, first of bodies, then of drive terms."""
 
     @property
     def n(self) -> int:
-        """Coordinates of a recorded motion."""
+        """Number of coordinates of a recorded motion."""
         ...
 
     @property
@@ -57,22 +57,22 @@ class RegressorModel(Protocol):
 
     @property
     def inertial(self) -> int:
-        """How many of the parameters are bodies'."""
+        """Number of body parameters."""
         ...
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
-        """(p - inertial,) the drive terms behind the other parameters."""
+        """Drive terms of the other parameters (p - inertial,)."""
         ...
 
     @property
     def torque_rows(self) -> TorqueRows:
-        """Which measured torques it explains."""
+        """Torque rows that the model explains."""
         ...
 
     @property
     def rows(self) -> int:
-        """Torque rows per sample."""
+        """Number of torque rows per sample."""
         ...
 
     def regressor(
@@ -84,7 +84,7 @@ class RegressorModel(Protocol):
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return W (N, rows, p) at q, v, a (N, n); further arguments as of `IdentificationModel.regressor`."""
+        """Return W (N, rows, p) at q, v, a (N, n); for further arguments see `IdentificationModel.regressor`."""
         ...
 
     def torque(
@@ -100,19 +100,19 @@ class RegressorModel(Protocol):
         ...
 
     def acting(self) -> np.ndarray:
-        """Return which entries of the regressor can differ from 0, (p, rows) bool."""
+        """Return the mask (p, rows) of regressor entries that can differ from 0."""
         ...
 
     def preference(self) -> np.ndarray:
-        """Return all columns (p,) in the order in which they are tried as base columns."""
+        """Return all columns (p,) in order of preference as base columns."""
         ...
 
     def load_cases(self) -> Loads:
-        """Return the load cases to choose base columns over, each as `carried` of the regressor."""
+        """Return the load cases for choosing base columns, each as argument `carried` of the regressor."""
         ...
 
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Draw `count` states that the model can be in, within limits (n,) of its coordinates where there are any."""
+        """Return `count` random states of the model, within limits (n,) of its coordinates if given."""
         ...

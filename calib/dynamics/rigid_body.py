@@ -28,7 +28,7 @@ def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np
 
 
 def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, out: np.ndarray) -> None:
-    """Write the regressor into out (10 B, n or more, N), zero on entry; q, v, a (N, n) already checked."""
+    """Write the regressor into out (10 B, n or more, N), initially zero; q, v, a (N, n) must be checked."""
     from calib.dynamics import kernels
 
     amount = q.T[bodies.coordinates] * bodies.scales[:, None]
@@ -79,7 +79,7 @@ def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
 def regressor_gradient(
     bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slopes of s = Σ weights · Y(q, v, a) by q, v and a, three arrays (N, n), exactly.
+    """Return the exact derivatives of s = Σ weights · Y(q, v, a) by q, v and a, three arrays (N, n).
 
     Args:
         weights: (N, n, 10 B); rank one, ``weights[k] = outer(lambda_k, chi)``, gives the derivatives of
@@ -99,7 +99,7 @@ def regressor_gradient(
 def torque_gradient(
     bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slopes of Σ weights · tau(q, v, a) by q, v and a, three arrays (N, n), exactly; weights (N, n).
+    """Return the exact derivatives of Σ weights · tau(q, v, a) by q, v and a, three arrays (N, n); weights (N, n).
 
     As `regressor_gradient` with weights of rank one, at a fraction of its cost.
 
@@ -159,7 +159,7 @@ def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.nda
 
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
-    """Return standard parameters (10 B,) as the kernels want them: about frames whose moving axis is z."""
+    """Return standard parameters (10 B,) in the kernels' frames, whose z is the joint axis."""
     rows = shaped(parameters, (10 * bodies.count,), "standard parameters").reshape(bodies.count, 10)
     return np.take_along_axis(rows, bodies.order, axis=1).ravel()
 
@@ -168,7 +168,7 @@ _NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accel
 
 
 def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Return q, v, a as finite (N, n) arrays of one length and one kind: numba compiles a kernel per kind of array."""
+    """Return q, v, a as finite (N, n) arrays of one memory layout (numba compiles a kernel per layout)."""
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
@@ -178,11 +178,11 @@ def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
-    """Return an array as C-contiguous and writable memory, itself where it is."""
+    """Return an array in C-contiguous, writable memory, without copy if possible."""
     return np.require(array, requirements=["C", "W"])
 
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each body's own motion and its cosine and sine, (N, B): numpy's are vectorised, the kernels' are not."""
+    """Return each body's joint position, its cosine and sine (N, B), vectorised by numpy."""
     amount = q.take(bodies.coordinates, axis=1) * bodies.scales  # q[:, …] is laid out by columns
     return amount, np.cos(amount), np.sin(amount)

@@ -18,7 +18,7 @@ FADE = 0.1  # [rad] over which ripple of a band fades outside the positions it w
 
 @njit(**JOINED)
 def smooth_sign(v, v0):
-    """Return tanh(v / v0), cut where it is one to rounding; the exact sign for v0 = 0."""
+    """Return tanh(v / v0), set to ±1 where it differs only by rounding; the exact sign for v0 = 0."""
     if not v0 > 0.0:
         return 1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0
     scaled = v / v0
@@ -32,9 +32,9 @@ def _sign_slope(sign, v0):
 
 @njit(**JOINED)
 def _band(acts, t, x, v):
-    """Return the gain of ripple in one band and one direction: a hat over the frequency order · |v| / 2π [Hz].
+    """Return the gain of ripple in one band and one direction: triangular over the frequency order · |v| / 2π [Hz].
 
-    It fades over `FADE` beyond the positions it was identified at, lower … upper: its phase does not reach further.
+    It decreases to zero within `FADE` beyond the positions of the identification, lower … upper.
     """
     left, middle, right, lower, upper = acts[t, 2], acts[t, 3], acts[t, 4], acts[t, 6], acts[t, 7]
     frequency = abs(v) * acts[t, 1] / (2.0 * pi)
@@ -48,7 +48,7 @@ def _band(acts, t, x, v):
 
 @njit(**OPTIONS)
 def shape(code, acts, t, x, v, state):
-    """Return what a shape is per unit of its parameter (and of its load, where it has one), and its slopes by x and v.
+    """Return a shape per unit of its parameter (and load, if it has one), and its derivatives by x and v.
 
     Args:
         code: which shape.
@@ -101,7 +101,7 @@ def shape(code, acts, t, x, v, state):
 
 @njit(**OPTIONS)
 def steepest(code, acts, t):
-    """Return the steepest slope by v of a smoothed sign, about which |v|, its width, and the spring of a stop."""
+    """Return a smoothed sign's largest slope by v, the |v| where it occurs, its width, and the stiffness of a stop."""
     first, second, third = acts[t, 1], acts[t, 2], acts[t, 3]
     if code in (SIGN, LOAD):
         return 1.0 / first, 0.0, first, 0.0
@@ -120,7 +120,7 @@ def steepest(code, acts, t):
 
 @njit(**OPTIONS)
 def fill(code, acts, x, v, state, out):
-    """Write values, and with three rows slopes by x and v, of one shape into out (1 or 3, N)."""
+    """Write the values of one shape into out (1, N), with derivatives by x and v for out (3, N)."""
     for k in range(v.shape[0]):
         value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
         out[0, k] = value

@@ -1,4 +1,4 @@
-"""What a drive's torque can depend on: one row per shape; its formula and slopes are in `calib.dynamics.shape_kernels`.
+"""Shapes of drive torques: one row per shape; its formula and slopes are in `calib.dynamics.shape_kernels`.
 
 A shape sees x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints, where a gear couples them), the
 torque the joint transmits, and its settings; it says by how much the torque changes per unit of its parameter. To add
@@ -24,7 +24,7 @@ V0 = 0.01  # [rad/s or m/s], default smoothing of the Coulomb sign
 
 @dataclass(frozen=True)
 class Joined:
-    """The motion one term sees, each (N,); `load` [N m or N] and `state` None where no term asks for them."""
+    """Motion of one term, each (N,); `load` [N m or N] and `state` are None if not needed."""
 
     x: np.ndarray
     v: np.ndarray
@@ -35,7 +35,7 @@ class Joined:
 
 @dataclass(frozen=True)
 class JointRange:
-    """What a joint did while it was recorded, by which its terms are scaled.
+    """Ranges of a joint's recorded motion, which scale its terms.
 
     Attributes:
         v0: smoothing of its Coulomb sign [rad/s or m/s].
@@ -51,7 +51,7 @@ class JointRange:
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape.
+    """One shape of drive torque and its properties.
 
     Attributes:
         unit: of the parameter for a revolute joint, and `unit_linear` for a prismatic one.
@@ -103,7 +103,7 @@ SHAPES: dict[str, Shape] = {
 
 
 class Offer(NamedTuple):
-    """What a step of the friction ladder offers a joint: parameters ``label + joint + end``, settings by their end."""
+    """Candidate terms of a joint in a step of the friction ladder: names ``label + joint + end``, settings by end."""
 
     label: str
     shape: str
@@ -112,13 +112,13 @@ class Offer(NamedTuple):
 
 
 def _presliding(seen: JointRange) -> dict[str, tuple[float, ...]]:
-    """Offer stop operators of several widths: z - sign(v) each, so that Fc stays the friction of steady sliding."""
+    """Return candidate stop operators of several widths, each z - sign(v), so that Fc stays the friction of sliding."""
     shares = (0.0005, 0.002, 0.008, 0.03)  # of the joint's travel (our choice)
     return {f".{k}": (share * seen.travel, seen.v0) for k, share in enumerate(shares, 1)}
 
 
 def _cable(seen: JointRange) -> dict[str, tuple[float, ...]]:
-    """Offer the lowest waves of a period of twice the travel, as of cables and hoses: a smooth function on it."""
+    """Return candidate harmonics with a period of twice the travel, for cables and hoses: a smooth function on it."""
     return {f".{k}": (k * math.pi / seen.travel, math.inf) for k in (1, 2, 3)}  # no more (our choice)
 
 

@@ -1,4 +1,4 @@
-"""Which torque rows a model explains: a linear map of the joints' torques, of regressors and of measured torques alike.
+"""Torque rows that a model explains: a linear map of the joints' torques, of regressors and of measured torques alike.
 
 With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2) four kinds of rows exist:
 
@@ -44,7 +44,7 @@ class _JointBlock:
 
 @dataclass(frozen=True)
 class Projection:
-    """A linear map on top of joint rows, which may depend on the state.
+    """A linear map of joint rows, which may depend on the state.
 
     Attributes:
         labels, units: of the rows that it makes.
@@ -60,7 +60,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class TorqueRows:
-    """Which torques a model explains, whatever the number of its joints.
+    """Definition of the torques that a model explains, for any number of joints.
 
     Attributes:
         name: what options and files call them.
@@ -76,7 +76,7 @@ class TorqueRows:
 
     @property
     def sides(self) -> frozenset[str]:
-        """Which columns any row sees."""
+        """Sides of the columns that affect any row."""
         return frozenset().union(*(block.sides for block in self.blocks))
 
     @property
@@ -85,7 +85,7 @@ class TorqueRows:
 
     @property
     def sensed(self) -> bool:
-        """Whether torques of sensors behind the gears are needed."""
+        """Whether torques of sensors on the link side of the gears are needed."""
         return any(block.sensor for block in self.blocks)
 
     @property
@@ -95,7 +95,7 @@ class TorqueRows:
 
     @property
     def motors_alone(self) -> bool:
-        """Whether the rows are the motors' torques, joint by joint, and nothing else."""
+        """Whether the rows are only the motors' torques, joint by joint."""
         return self.projection is None and self.with_motors and len(self.blocks) == 1
 
     @property
@@ -109,39 +109,39 @@ class TorqueRows:
         return n * len(self.blocks) if self.projection is None else len(self.projection.labels)
 
     def of_side(self, side: str, joint: int, n: int) -> list[int]:
-        """Return the rows of one of n joints that see a drive term of the ``link`` or ``motor`` side."""
+        """Return the rows of one of n joints affected by a drive term on the ``link`` or ``motor`` side."""
         return [k * n + joint for k, block in enumerate(self.blocks) if side in block.sides]
 
     def labels(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return how tables call the rows, from labels of the joints."""
+        """Return the row labels in tables, given the joint labels."""
         if self.projection is not None:
             return self.projection.labels
         return tuple(block.prefix + joint for block in self.blocks for joint in joints)
 
     def numbered(self, n: int) -> tuple[str, ...]:
-        """Return the labels with the numbers of n joints."""
+        """Return the row labels for joints numbered 1 to n."""
         return self.labels([str(j + 1) for j in range(n)])
 
     def titles(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the full names of the rows, from the names of the joints."""
+        """Return the full names of the rows, given the joint names."""
         if self.projection is not None:
             return self.projection.labels
         return tuple(joint + block.suffix for block in self.blocks for joint in joints)
 
     def units(self, prismatic: Sequence[bool]) -> tuple[str, ...]:
-        """Return N m or N by row."""
+        """Return the unit of each row, N m or N."""
         if self.projection is not None:
             return self.projection.units
         return tuple("N" if linear else "N m" for linear in prismatic) * len(self.blocks)
 
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
-        """Return for (N, n) flags of the joints those of the rows (N, rows): all joints' where rows mix them."""
+        """Return flags of rows (N, rows) from flags of joints (N, n): those of all joints for projected rows."""
         if self.projection is not None:
             return np.repeat(mask.all(axis=1, keepdims=True), len(self.projection.labels), axis=1)
         return np.tile(mask, (1, len(self.blocks)))
 
     def observe(self, torques: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the rows (N, rows, p) of columns of joint torques (N, n, p), ordered as the columns are.
+        """Return the rows (N, rows, p) for columns of joint torques (N, n, p), in the columns' memory order.
 
         Args:
             torques: regressor of the n joints, or torques themselves as columns.
@@ -156,9 +156,9 @@ class TorqueRows:
         return self.observe_in_place(columns, sides, q, v)
 
     def observe_in_place(self, columns: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the same from columns (p, n for each block, N) whose first n rows are the joints', others zero.
+        """Return the rows as `observe` from columns (p, n per block, N): joint torques in the first n rows, else zero.
 
-        They are written over: a regressor is as large as memory is slow.
+        The columns are overwritten, to avoid a copy of a large regressor.
         """
         n = columns.shape[1] // len(self.blocks)
         for k in reversed(range(len(self.blocks))):
@@ -179,7 +179,7 @@ class TorqueRows:
             CalibError: for rows with a projection, whose own dependence on the state it would leave out.
         """
         if self.projection is not None:
-            raise CalibError(f"rows '{self.name}' are projected by a map that depends on the state: no slopes")
+            raise CalibError(f"rows '{self.name}' use a projection that depends on the state: no derivatives")
         seen = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
         if len(seen) == 1 and seen[0].all():
             return weights
@@ -188,15 +188,15 @@ class TorqueRows:
         return np.add.reduce(parts[::-1])
 
     def target(self, motor: np.ndarray, sensor: np.ndarray | None, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return what the rows have to explain (N, rows).
+        """Return the measured torques of the rows (N, rows).
 
         Args:
             motor: (N, n) the motors' torques.
-            sensor: (N, n) of sensors behind the gears; None where there are none.
+            sensor: (N, n) of sensors on the link side of the gears; None without sensors.
             q, v: (N, n) of the motion.
         """
         if sensor is None and self.sensed:
-            raise CalibError(f"rows '{self.name}' need torques of sensors behind the gear")
+            raise CalibError(f"rows '{self.name}' need torques of sensors behind the gears")
         parts = []
         for block in self.blocks:
             part = block.motor * motor if block.motor else np.zeros_like(motor)
@@ -208,21 +208,21 @@ class TorqueRows:
         return np.einsum("nrk,nk->nr", own(q, v), stacked)
 
     def repeated(self, n: int) -> np.ndarray:
-        """Return for every row (rows,) the one whose entries it repeats, where it is not zero: itself where none."""
+        """Return for each row (rows,) the row with the same non-zero entries; itself if there are none."""
         rows = np.arange(self.count(n))
         return rows if self.projection is not None else rows % n + n * (len(self.blocks) - 1)
 
 
 def projected(name: str, projection: Projection, of: TorqueRows | None = None) -> TorqueRows:
-    """Return the rows that a projection makes of others, by default of the motors' torques."""
+    """Return the projection of other torque rows, by default of the motors' torques."""
     return replace(MOTOR if of is None else of, name=name, projection=projection)
 
 
 def torque_rows(name: str) -> TorqueRows:
-    """Return the rows that options and files call by this name.
+    """Return the torque rows with this name in options and files.
 
     Raises:
-        CalibError: for a name that is none of `ROWS`.
+        CalibError: for a name that is not in `ROWS`.
     """
     one_of(name, ROWS, "model kind")
     return ROWS[name]

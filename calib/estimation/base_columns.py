@@ -1,4 +1,4 @@
-"""Linearly independent columns of an observation matrix, for geometry and dynamics alike."""
+"""Linearly independent columns of an observation matrix, for geometry and dynamics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class ColumnSplit:
         without_effect: indices of the columns that are zero.
         coefficients: (b, p - b) with ``W[:, dropped] = W[:, kept] @ coefficients`` up to the tolerance.
         singular_values: (p,) of W with its non-zero columns scaled to unit norm, falling.
-        tolerance: relative size below which what remains of a scaled column counts as nothing.
+        tolerance: relative size below which the remainder of a scaled column counts as zero.
     """
 
     kept: np.ndarray
@@ -35,7 +35,7 @@ class ColumnSplit:
 
     @property
     def gap(self) -> float:
-        """Smallest kept over largest dropped singular value; infinite where nothing is dropped."""
+        """Ratio of the smallest kept to the largest dropped singular value; infinite if no column is dropped."""
         values = self.singular_values
         if self.rank >= len(values) or values[self.rank] == 0.0:
             return float("inf")
@@ -47,10 +47,10 @@ def split_columns(
 ) -> ColumnSplit:
     """Choose independent columns of W by pivoted QR, groups of columns in order of preference.
 
-    Within a group the columns enter by pivoted QR (Gautier 1991), of two alike the earlier one first (so that rounding
-    does not choose); a later group only adds what the earlier ones leave.
-    Columns are scaled to unit norm first, except those of negligible norm, which have no effect (scaling a column of
-    1e-17 would turn rounding into information).
+    Within a group the columns enter by pivoted QR (Gautier 1991), of two equivalent ones the earlier (so that rounding
+    does not decide); a later group only adds columns independent of the earlier groups. Columns are scaled to unit norm
+    first, except those of negligible norm, which have no effect (scaling a column of 1e-17 would turn rounding into
+    information).
 
     Args:
         matrix: (rows, p), whitened or in one unit; only its R factor is used.
@@ -77,14 +77,14 @@ def split_columns(
 
 
 def _complete(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
-    """Append the columns no group names."""
+    """Return the groups with the columns in no group appended."""
     listed = [np.asarray(group, dtype=int) for group in groups] if groups is not None else []
     named = np.concatenate(listed) if listed else np.array([], dtype=int)
     return [*listed, np.setdiff1d(np.arange(p), named)]
 
 
 def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the sorted indices of independent columns, group after group."""
+    """Return the sorted indices of independent columns, chosen group by group."""
     basis = np.zeros((scaled.shape[0], 0))
     kept: list[int] = []
     tie = 1e-3  # columns of nearly equal norm enter in their own order

@@ -1,4 +1,4 @@
-"""Least squares under bounds, equalities and matrices that must be positive definite, from a triangle of [W y].
+"""Least squares under bounds, equalities and positive definite matrices, from a triangle of [W y].
 
 min ½ ‖R b - z‖² under A b >= e, E b = d and M_k(b) = Σ_j A_kj b_j ⪰ λ I. With R from `triangles.combine` it is
 constrained least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40,
@@ -28,7 +28,7 @@ ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where roundi
 
 @dataclass(frozen=True, eq=False)
 class Definite:
-    """Matrices M_k(b) = Σ_j A_kj b_j whose eigenvalues must not be below `least`.
+    """Constraint on matrices M_k(b) = Σ_j A_kj b_j: no eigenvalue below `least`.
 
     Attributes:
         matrices: A (K, n, n, p), symmetric.
@@ -41,7 +41,7 @@ class Definite:
     likely: np.ndarray | None = None
 
     def least_eigenvalues(self, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (K,) by how much the smallest eigenvalues are above `least`, and their slopes (K, p) by b (p,)."""
+        """Return the smallest eigenvalues minus `least` (K,), and their derivatives (K, p) with respect to b (p,)."""
         size, n, _, p = self.matrices.shape
         flat = self.matrices.reshape(size, n * n, p)
         values, vectors = np.linalg.eigh((flat @ b).reshape(size, n, n))
@@ -49,7 +49,7 @@ class Definite:
         return values[:, 0] - self.least, np.asarray((pairs.reshape(size, 1, n * n) @ flat)[:, 0])
 
     def satisfied(self, sizes: np.ndarray) -> bool:
-        """Say whether smallest eigenvalues (K,), as above `least`, are those of definite matrices."""
+        """Return whether the smallest eigenvalues minus `least` (K,) satisfy the constraint."""
         max_violation = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
         return bool((sizes >= -max_violation * self.least).all())
 
@@ -110,7 +110,7 @@ def minimise(
             break
     b, dual = np.array(found.x)[:p], np.array(found.z)
     if str(found.status) not in ("Solved", "AlmostSolved"):
-        raise NotConverged(f"the constraints may contradict each other: Clarabel says {found.status}", b)
+        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {found.status}", b)
     pushes = np.zeros((size, n, n))
     pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
     pushes[:, j, i] = pushes[:, i, j]
@@ -118,7 +118,7 @@ def minimise(
 
 
 def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
-    """Return rows of lower <= A b <= upper that no b satisfies together; none where some b satisfies all.
+    """Return rows of lower <= A b <= upper that contradict each other; an empty result if some b satisfies all rows.
 
     A linear program over the excess of each row; the rows are those with a multiplier, Farkas' certificate.
     """
@@ -142,7 +142,7 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
 
 
 def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return the estimate under A b = d from the free one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
+    """Return the estimate under A b = d from the unconstrained one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
 
     Gouriéroux & Monfort (1995, section 10.3): under inequalities the same, A and d those that bind.
 
@@ -159,7 +159,7 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: n
 
 
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the covariance of an estimate held on A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
+    """Return the covariance of an estimate under A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
 
     C may be any covariance of the free estimate, that of correlated residuals too.
 
@@ -181,7 +181,7 @@ def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) 
 
 
 def _null_space(rows: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (p, p - rank) of what the rows do not see; exact zeros where they fix a parameter."""
+    """Return an orthonormal basis (p, p - rank) of the null space of rows; exact zeros for fixed parameters."""
     size = np.linalg.norm(rows, axis=1)
     rows = rows[size > 0.0] / size[size > 0.0, None]
     _, values, right = np.linalg.svd(rows)
@@ -191,7 +191,7 @@ def _null_space(rows: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Constrained:
-    """The optimum, with what is needed to check it.
+    """Optimum under constraints, with multipliers and slack to check it.
 
     Attributes:
         values: (p,) b.
@@ -211,7 +211,7 @@ class Constrained:
 def within(
     factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray, matrices: Definite | None = None
 ) -> Constrained:
-    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper, with equality where both are the same, and definite matrices.
+    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper, with equality if both are the same, and definite matrices.
 
     Infinite bounds are left out. Multipliers, slack, binding and normals come in the order of the finite lower bounds,
     the finite upper ones, the matrices, the equalities, whose multipliers have either sign.
@@ -249,7 +249,7 @@ def within(
 
 
 class _Planes:
-    """The problem without matrices, A b >= e and E b = d, and in units of its own.
+    """Problem A b >= e and E b = d without matrices, in scaled units.
 
     Columns of R and rows of A and E of unit norm, ‖z‖ = 1: `upper`, `target`, `scaled` and `edges` in b / `unit`.
     """
@@ -269,7 +269,7 @@ class _Planes:
         self._require_solvable()
 
     def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
-        """Refuse equalities that contradict each other or leave nothing.
+        """Refuse equalities that contradict each other or fix all parameters.
 
         `max_contradiction`: of an equality, by which the best point may miss it.
         """
@@ -277,14 +277,14 @@ class _Planes:
         if not len(scaled):
             return
         acts = scaled.any(axis=1)
-        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} acts on no parameter")
+        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients")
         origin, _, rank, _ = np.linalg.lstsq(scaled, wanted, rcond=1e-10)
         away = np.abs(scaled @ origin - wanted) / np.maximum(np.abs(wanted), max(float(np.abs(origin).max()), 1e-300))
         require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
-        require(rank < len(self.free), f"equalities fix all {rank} parameters: they leave nothing to estimate")
+        require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
 
     def optimum(self, active: np.ndarray) -> Constrained:
-        """Return the optimum on the equalities and the inequalities that are active (c,), whatever the others say."""
+        """Return the optimum under equalities and active inequalities (c,), the other inequalities ignored."""
         binding = np.append(active, np.ones(len(self.sides) - self.count, dtype=bool))
         normals, sides = self.normals[binding], self.sides[binding]
         values, multipliers = np.array(self.free), np.zeros(len(binding))
@@ -299,7 +299,7 @@ class _Planes:
         return _frozen(values, multipliers * self.length**2 / self.sizes, slack, binding, self.normals)
 
     def bounded(self) -> Constrained:
-        """Return the optimum under the inequalities, exactly on those that bind.
+        """Return the optimum under the inequalities, exact on the binding ones.
 
         As the solver has it where that is degenerate: a multiplier would change its sign, or another be violated.
         """
@@ -359,7 +359,7 @@ def _frozen(*parts: np.ndarray) -> Constrained:
 
 
 def _widened(found: Constrained, place: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
-    """Return the optimum with further inequalities, none of which binds, from `place` on."""
+    """Return the optimum with further, inactive inequalities inserted at `place`."""
     zero = np.zeros(len(slack))
     return _frozen(
         found.values, np.insert(found.multipliers, place, zero), np.insert(found.slack, place, slack),

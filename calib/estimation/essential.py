@@ -1,4 +1,4 @@
-"""From base to essential parameters: leave out, one by one, what the data do not identify, and write down each step."""
+"""Elimination of base parameters down to essential ones: drop parameters that the data do not identify, one by one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from calib.records import Number
 
 
 class Rule(Enum):
-    """When to stop leaving out.
+    """Criterion that ends the elimination.
 
-    RSD alone trusts a ratio: where one parameter is known to 0.01 %, it sends home others known to 1 %. F alone keeps
-    all that is significant, however useless. BOTH leaves out only what both would.
+    RSD rests on a ratio: with one parameter known to 0.01 % it drops others known to 1 %. F keeps every significant
+    parameter, however small its effect. BOTH drops only parameters that both criteria would drop.
     """
 
     RSD = "rsd"
@@ -27,7 +27,7 @@ class Rule(Enum):
 
 @dataclass(frozen=True)
 class EliminationStep:
-    """One parameter left out.
+    """One step of the elimination: a dropped parameter.
 
     Attributes:
         name: of the parameter.
@@ -51,7 +51,7 @@ class EliminationStep:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """The way from base to essential parameters.
+    """Result of the elimination from base to essential parameters.
 
     Attributes:
         base, essential: the fit before and after, with the same weights for the rows.
@@ -78,7 +78,7 @@ def eliminate(
     std: np.ndarray | None = None,
     inflation: np.ndarray | None = None,
 ) -> Elimination:
-    """Leave out the parameter with the largest RSD and estimate the rest anew, until the rule says stop.
+    """Return the elimination: drop the parameter with the largest RSD and re-estimate, until the rule stops it.
 
     RSD rule: stop when max RSD / min RSD < r_σ (Kolyubin et al. 2019; Jubien, Gautier & Janot 2014: r_σ in 10 … 30).
     F rule: stop when leaving out the next one is refuted, by F = x² / σ² ~ F(1, r - b_e), or when all left out together
@@ -114,7 +114,7 @@ def eliminate(
 
 
 def nested_test(base: LinearFit, gone: Sequence[int]) -> tuple[float, float]:
-    """Return F and its p-value for the claim that the parameters with these indices are all zero.
+    """Return F and its p-value for the hypothesis that the parameters with these indices are all zero.
 
     Equal to the F-test of the two residual sums; F uses the residual variance of the base fit.
     """
@@ -139,7 +139,7 @@ def _step(
 
 
 def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int | None:
-    """Return the index of the parameter to leave out next: listed ones first, then the largest RSD."""
+    """Return the index of the next parameter to drop: listed ones first, then the largest RSD."""
     names, rsd = current.estimate.names, current.estimate.rsd
     listed = [k for k, name in enumerate(names) if name in drop]
     candidates = listed or [k for k, name in enumerate(names) if name not in keep]
@@ -154,7 +154,7 @@ def _refused(step: EliminationStep, rule: Rule, ratio: float, level: float) -> b
 
 def _check_lists(names: Sequence[str], keep: Sequence[str], drop: Sequence[str]) -> None:
     unknown = [name for name in (*keep, *drop) if name not in names]
-    require(not unknown, f"keep or drop names {', '.join(unknown)}, not among the parameters {', '.join(names)}")
+    require(not unknown, f"keep or drop: unknown {', '.join(unknown)}; the parameters are {', '.join(names)}")
     both = [name for name in keep if name in drop]
-    require(not both, f"{', '.join(both)} cannot be kept and dropped")
-    require(len(set(drop)) < len(names), "dropping every parameter leaves no model", Unidentifiable, drop)
+    require(not both, f"{', '.join(both)} cannot be both kept and dropped")
+    require(len(set(drop)) < len(names), "all parameters are dropped: no model remains", Unidentifiable, drop)

@@ -1,4 +1,4 @@
-"""What an estimation returns: values with their covariance."""
+"""Result of an estimation: values with their covariance."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from calib.arrays import Frozen
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Frozen):
-    """p estimated parameters.
+    """Estimates of p parameters with covariance.
 
     Attributes:
         names, units: p strings each.
@@ -38,7 +38,7 @@ class Estimate(Frozen):
             return np.where(self.values == 0.0, np.inf, 100.0 * self.sigma / np.abs(self.values))
 
     def strong_correlations(self, threshold: float = 0.95) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters whose estimates correlate by more than `threshold`, strongest first."""
+        """Return pairs of parameters with estimates correlated above `threshold` in magnitude, strongest first."""
         sigma = np.where(self.sigma > 0, self.sigma, 1.0)
         correlation = self.covariance / np.outer(sigma, sigma)
         rows, columns = np.triu_indices(len(sigma), 1)
@@ -50,7 +50,7 @@ class Estimate(Frozen):
 
 
 def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return [R z] (p, p + 1) of values and covariance (p, p), RᵀR = Σ⁻¹ and z = R x; variances of zero as if one."""
+    """Return [R z] (p, p + 1) of values and covariance (p, p), RᵀR = Σ⁻¹ and z = R x; zero variances count as one."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     sigma = np.where(sigma > 0.0, sigma, 1.0)
     size, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))

@@ -34,7 +34,7 @@ from calib.records import Number, stored
 
 @dataclass(frozen=True, eq=False)
 class InstrumentStrength:
-    """How well instruments stand for the columns.
+    """Strength of instruments: how well they explain the columns of W.
 
     Attributes:
         names: p columns of W.
@@ -58,7 +58,7 @@ class InstrumentStrength:
 
 @dataclass(frozen=True)
 class ExogeneityTest:
-    """A test of the claim that W is uncorrelated with the noise, hence least squares unbiased.
+    """Test of the hypothesis that W is uncorrelated with the noise, hence least squares unbiased.
 
     Attributes:
         statistic: F of the augmented regression.
@@ -72,11 +72,11 @@ class ExogeneityTest:
 
     @stored
     def least_squares_biased(self) -> bool:
-        """Whether least squares is refuted at the level of `biased`."""
+        """Whether the test rejects least squares at the default level of `biased`."""
         return self.biased()
 
     def biased(self, level: float = 0.01) -> bool:
-        """Say whether least squares is refuted at this level: use IV."""
+        """Return whether the test rejects least squares at this level: use IV."""
         return self.p < level
 
 
@@ -96,7 +96,7 @@ class Instruments:
         return self.data.select(np.arange(p, 2 * p))
 
     def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
-        """Return triangles [A b; 0 ‖ρ‖] of one group, on which least squares gives the IV estimate and its covariance.
+        """Return one group's triangles [A b; 0 ‖ρ‖] with the IV estimate and its covariance as least-squares solution.
 
         ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
         section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
@@ -123,7 +123,7 @@ def instrument(
     units: Sequence[str] | None = None,
     before: Instruments | None = None,
 ) -> Instruments:
-    """Return the triangles of [Z W y], with those of earlier rows where `before` is given.
+    """Return the triangles of [Z W y], added to those of earlier rows if `before` is given.
 
     Args:
         instruments: Z (r, p), one column for each of W.
@@ -142,7 +142,7 @@ def instrument(
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
-    """Return triangles of [Z W y] that have seen no rows, for columns of W with these names and units."""
+    """Return empty triangles of [Z W y] (no rows yet) for columns of W with these names and units."""
     return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
 
 
@@ -168,7 +168,7 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
     left = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
     dof = int(problem.data.rows.sum() / inflation) - p
-    require(dof > 0, "fewer independent rows than parameters; record longer", Unidentifiable, problem.names)
+    require(dof > 0, "fewer independent rows than parameters; record longer motion", Unidentifiable, problem.names)
     residual_std = float(np.sqrt(np.sum(squares / sigma**2) / left.sum()))
     covariance = inflation * residual_std**2 * inverse @ inverse.T
     units = problem.data.units[p:]
@@ -177,7 +177,7 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
 
 
 def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
-    """Say whether the outer loop (simulate, estimate) may stop: parameters and residual have come to rest.
+    """Return whether the outer loop (simulate, estimate) has converged in parameters and residual.
 
     |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
     usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
@@ -190,7 +190,7 @@ def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: 
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
-    """Return how well the instruments identify the columns; all measures from one R factor.
+    """Return measures of how well the instruments explain the columns, all from one R factor.
 
     Args:
         problem: triangles of [Z W y].
@@ -216,7 +216,7 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
 
 
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
-    """Test whether W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
+    """Return the test that W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
 
     With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the claim is
     δ = 0, F = [(RSS0 - RSS1) / k] / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). Only
@@ -238,7 +238,7 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     split = split_columns(columns, [np.arange(p)], 1e-8)
     k = split.rank - p
     dof = int(rows) - p - k
-    require(k > 0 and dof > 0, "instruments equal to the columns leave nothing to test (or too few rows)")
+    require(k > 0 and dof > 0, "nothing to test: the instruments equal the columns, or there are too few rows")
     target = factor[:, -1]
     first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
     f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
@@ -255,17 +255,17 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the R factor of P_Z [W y], after making sure that Z and Zᵀ W have full rank."""
+    """Return the R factor of P_Z [W y]; refuse Z and Zᵀ W without full rank."""
     p = len(names)
     size = np.linalg.norm(factor[:p, :p], axis=0)
     require_rank(
         factor[:p, :p] / np.where(size > 0.0, size, 1.0), [f"instrument of {name}" for name in names],
-        "the simulated motion does not excite them: simulate the reference of the recording itself",
+        "the simulated motion does not excite them: simulate the reference of this recording",
     )  # fmt: skip
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     require_rank(
         factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0), names,
-        "the instruments do not distinguish them: they are dependent in W, or the simulated motion is another one",
+        "the instruments do not distinguish them: dependent columns of W, or another simulated motion",
     )  # fmt: skip
     return retriangulate(factor[:p, p:])
 

@@ -21,7 +21,7 @@ from calib.estimation.triangles import Triangles, combine, retriangulate, solve_
 
 @dataclass(frozen=True, eq=False)
 class LinearFit(Frozen):
-    """A linear estimate and what it rests on.
+    """Linear estimate with the residuals of groups and condition numbers.
 
     Attributes:
         estimate: values, covariance, standard deviation of the weighted residuals, degrees of freedom.
@@ -93,7 +93,7 @@ def subsystem_std(data: Triangles) -> np.ndarray:
         own = split_columns(factor[:, :p], tolerance=1e-8).kept
         if data.rows[g] <= len(own):
             raise CalibError(
-                f"group {g} has {data.rows[g]} rows for {len(own)} parameters of its own: no residual is left for "
+                f"group {g} has {data.rows[g]} rows for its {len(own)} independent columns: no residual is left for "
                 "its noise; state the standard deviations"
             )
         rest = retriangulate(factor[:, np.append(own, p)])[-1, -1]
@@ -102,7 +102,7 @@ def subsystem_std(data: Triangles) -> np.ndarray:
 
 
 def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> np.ndarray:
-    """Return σ_g that reproduce themselves: σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), x the WLS estimate with them.
+    """Return the converged σ_g of the groups: σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), x the WLS estimate with them.
 
     h_g = ‖W_g R⁻¹‖² / σ_g² is the group's share of the p parameters; the fixed point is the restricted maximum
     likelihood (Patterson & Thompson 1971). Starts from `subsystem_std`.
@@ -117,13 +117,13 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
             return std
     raise NotConverged(
         f"the standard deviations of the groups still change by {change:.1g} after {limit} rounds; a group with few "
-        "rows may be fitted exactly: state the standard deviations",
+        "rows may be fitted exactly; state the standard deviations",
         std,
     )
 
 
 def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated: bool) -> LinearFit:
-    """Solve with rows divided by std; `stated`: the covariance takes std as the noise, otherwise up to a factor."""
+    """Return the fit with rows divided by std; `stated`: std is the noise, otherwise the noise up to a factor."""
     tau = np.ones(data.groups) if inflation is None else shaped(inflation, (data.groups,), "inflation per group")
     values, inverse, conditions = solve_triangle(combine(data, std), data.names)
     covariance = inverse @ inverse.T
@@ -145,21 +145,21 @@ def _pack(
     inverse: np.ndarray,
     conditions: tuple[float, float],
 ) -> LinearFit:
-    """Return the fit with its residuals' sizes, degrees of freedom counted with the inflation τ."""
+    """Return the fit with the residuals' standard deviations; degrees of freedom account for the inflation τ."""
     squares = data.residual_squares(values)
     left = data.rows - tau * leverage(data, std, inverse)
     dof = int(np.round(np.sum(left / tau), 6))
     if dof <= 0 or left.sum() <= 0:
         independent = float(np.sum(data.rows / tau))
-        advice = "record longer or estimate fewer"
+        advice = "record longer or estimate fewer parameters"
         if independent > data.parameters:  # the rows would do: what is left of them is no noise
             advice = (
-                "the residuals of neighbouring rows are nearly one motion, as where the model is not this robot's or "
-                "columns are swapped: check both, then record longer"
+                "the residuals of neighbouring rows are strongly correlated, as for the model of another robot or for "
+                "swapped columns; check both, then record longer"
             )
         raise Unidentifiable(
             f"{int(data.rows.sum())} rows ({independent:.0f} independent ones) for {data.parameters} "
-            f"parameters leave nothing to judge them by; {advice}",
+            f"parameters: no residual is left to check them; {advice}",
             data.names,
         )
     residual_std = float(np.sqrt(np.sum(squares / std**2) / left.sum()))
@@ -169,11 +169,11 @@ def _pack(
 
 
 def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return h_g = ‖W_g R⁻¹‖² / σ_g² (g,), which sum to p."""
+    """Return each group's share of the p parameters, h_g = ‖W_g R⁻¹‖² / σ_g² (g,)."""
     return np.sum((data.factors[:, :, :-1] @ inverse) ** 2, axis=(1, 2)) / std**2
 
 
 def _floored(std: np.ndarray) -> np.ndarray:
-    """Return std with a floor of 1e-9 of the largest: exact data must not turn into infinite weights."""
+    """Return std with a floor of 1e-9 of the largest, so that exact data do not get infinite weights."""
     largest = std.max(initial=0.0)
     return np.maximum(std, 1e-9 * largest) if largest > 0.0 else np.ones_like(std)

@@ -16,10 +16,10 @@ State = TypeVar("State")
 
 
 class Status(Enum):
-    """How an iteration ended, with what to do about it."""
+    """How an iteration ended, with advice."""
 
     CONVERGED = "converged"
-    STALLED = "stalled: no damping gives a better step; the model is at its floor or the Jacobian is wrong"
+    STALLED = "stalled: no damping gives a better step; the model is at its smallest residual or the Jacobian is wrong"
     ITERATIONS = "stopped at the iteration limit; start nearer (a better nominal, fewer free parameters)"
 
     @property
@@ -49,7 +49,7 @@ class Solution(Generic[State]):
 
 
 def triangle(residual: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Reduce min ‖r - W x‖ to min ‖z - R x‖ by one QR of [W r]; return R (p, p), z (p,) and ‖r‖².
+    """Return R (p, p), z (p,) and ‖r‖² that reduce min ‖r - W x‖ to min ‖z - R x‖, by one QR of [W r].
 
     `matrix` is best column-major: LAPACK then works in a single copy.
     """
@@ -80,7 +80,7 @@ def solve(
     tolerance: float = 1e-3,
     limit: int = 300,
 ) -> Solution[State]:
-    """Minimise ‖y - f(state)‖² by Levenberg–Marquardt with the paper's damping rule.
+    """Return the state that minimises ‖y - f(state)‖², by Levenberg–Marquardt with the paper's damping rule.
 
     A better step divides λ by ten, a worse one is rejected and multiplies it by ten (Kolyubin et al. 2019, after
     eq. 12). ``damping=0`` is the iterative linear least squares of eq. 11: every step is taken.

@@ -34,13 +34,13 @@ class Gram:
 
 
 def gram(residual: np.ndarray, matrix: np.ndarray) -> Gram:
-    """Return the statistics of residual (rows,) and W (rows, p)."""
+    """Return the sufficient statistics of residual (rows,) and W (rows, p)."""
     return Gram(matrix.T @ matrix, matrix.T @ residual, float(residual @ residual), len(residual))
 
 
 @dataclass(frozen=True, eq=False)
 class Relevance:
-    """What the data support.
+    """Result of the ridge regression: estimate, ridges and noise.
 
     Attributes:
         values: (p,) estimate; zero where a group was switched off.
@@ -57,7 +57,7 @@ class Relevance:
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """Coordinates z (r,) of the columns x (p,), r ≤ p, which hold all the information of the data on every group.
+    """Coordinates z (r,), r ≤ p, that replace the columns x (p,) without loss of information on any group.
 
     Harmonics of a joint that turns by less than a whole turn are linear combinations of fewer of them, to within
     rounding: their evidence costs r³, not p³.
@@ -88,7 +88,7 @@ class Condensed:
 
 
 def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Condensed:
-    """Return coordinates of the columns with statistics WᵀW `square` (p, p), with equal prior size within a group.
+    """Return coordinates of the columns with statistics WᵀW `square` (p, p), with equal prior magnitude within a group.
 
     Args:
         square: of all rows that will ever be used.
@@ -123,7 +123,7 @@ def relevance(
     settled: float = 0.0,
     counts: np.ndarray | None = None,
 ) -> Relevance:
-    """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable.
+    """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable values.
 
     MacKay's fixed point (1992; Tipping 2001, eq. 16–18): λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and
     β = (N - Σ γ - p_free) / ‖y - W x‖². Works on WᵀW, which the ridges keep well conditioned; columns without a ridge
@@ -195,7 +195,7 @@ def _posterior(
             break
     else:
         raise Unidentifiable(
-            "the measurements cannot distinguish the model's terms; are rows repeated? Measure more poses"
+            "the measurements cannot distinguish the model's terms. Are rows repeated? Measure more poses"
         )
     solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
     inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more

@@ -23,7 +23,7 @@ def variance_weights(
 
     Args:
         squares: (m,) squared errors.
-        shapes: (m, k) by what their variances may grow, not negative.
+        shapes: (m, k) columns whose non-negative combination is the variance; not negative.
         start: (k,) not negative; what is zero stays.
         counts: (m,) how many errors each is worth.
         rounds: of the fixed point; fewer will do from weights of nearly the same errors.
@@ -60,7 +60,7 @@ def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarr
     if loss == "cauchy":
         c = 2.385 if scale is None else scale
         return 1.0 / (1.0 + (size / c) ** 2)
-    raise ValueError(f"loss '{loss}' is none of {', '.join(LOSSES)}")
+    raise ValueError(f"unknown loss '{loss}'; expected one of {', '.join(LOSSES)}")
 
 
 def spread(residuals: np.ndarray) -> float:
@@ -70,7 +70,7 @@ def spread(residuals: np.ndarray) -> float:
 
 @lru_cache
 def tuning(joints: int, loss: str, efficiency: float = 0.95) -> float:
-    """Return the constant of `weights` that is `efficiency` efficient for `joints` normal residuals at once.
+    """Return the constant of `weights` with efficiency `efficiency` for normal residuals of `joints` joints at once.
 
     The efficiency of the weights w(d) is b² / a with a = E w² d² / n and b = E w d² / n (Maronna 1976; the latter
     equals E[w + w' d / n] by Stein's lemma). For one joint: 1.345 (Huber), 2.385 (Cauchy).
@@ -137,5 +137,5 @@ def _gated(size: np.ndarray, joints: int, loss: str, gate: float | None) -> np.n
 
 @lru_cache
 def _quantiles(joints: int) -> np.ndarray:
-    """Return 4000 equally likely values of d²."""
+    """Return 4000 equally likely values of d², for numerical expectations."""
     return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))

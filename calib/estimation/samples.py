@@ -1,4 +1,4 @@
-"""Least squares where the rows of one sample belong together: full covariance across joints, samples that do not fit.
+"""Least squares with noise correlated across the rows of a sample: full covariance across joints, outliers.
 
 The residual of sample k, e_k = y_k - W_k x (n joints), has covariance S across joints and none between samples; its
 size is Mahalanobis', d_k² = e_kᵀ S⁻¹ e_k. A robust fit weights each sample by w(d_k), and beyond the gate by nothing.
@@ -42,13 +42,13 @@ class Samples:
 
     @property
     def joints(self) -> np.ndarray:
-        """(N,) rows in use per sample."""
+        """Number of rows in use per sample (N,)."""
         return self.present.sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class SampleFit:
-    """A fit with the covariance of the noise across joints.
+    """Linear fit with the noise covariance across joints.
 
     Attributes:
         fit: the estimate; ``fit.group_std`` is the root of the diagonal of `noise`.
@@ -123,7 +123,7 @@ def irls(
 
 
 def by_joint(data: Samples) -> LinearFit:
-    """Estimate x by WLS with one settled variance per joint: `linear.wls` of the samples' rows."""
+    """Estimate x by WLS with one converged variance per joint: `linear.wls` of the samples' rows."""
     return wls(_triangles(data, np.ones(data.target.shape)))
 
 
@@ -145,12 +145,12 @@ def row_irls(data: Samples, loss: str = "cauchy") -> LinearFit:
         step, values = fit.estimate.values - values, fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
             return LinearFit(fit.estimate, std, fit.condition, fit.condition_normalised)
-    raise NotConverged("the weights of the rows do not settle; try the Huber loss", values)
+    raise NotConverged("the weights of the rows do not converge; try the Huber loss", values)
 
 
 @dataclass(frozen=True)
 class _Weighing:
-    """How samples are weighed: loss, gate, and whether S is stated."""
+    """Weighing of samples: loss, gate, and whether S is stated."""
 
     loss: str
     gate: float | None
@@ -180,14 +180,14 @@ def _iterate(
         values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, how, values, covariance, size, weights, factor, inflation)
-    raise NotConverged("the weights of the samples do not settle; try the other loss or a wider gate", values)
+    raise NotConverged("the weights of the samples do not converge; try the other loss or a wider gate", values)
 
 
 def _pack(
     data: Samples, how: _Weighing, values: np.ndarray, noise: np.ndarray, size: np.ndarray, weights: np.ndarray,
     factor: np.ndarray, inflation: float,
 ) -> SampleFit:  # fmt: skip
-    """Return the fit with the covariance of its kind of estimator."""
+    """Return the fit with the covariance of the chosen estimator."""
     _, inverse, conditions = solve_triangle(factor, data.names)
     variance = robust.variance_factor(size, data.joints, how.loss, how.gate) if how.robust else 1.0
     squares = np.sum(weights * _consistent(data, how) * size**2)
@@ -211,7 +211,7 @@ def _sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.n
 
 
 def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return L⁻¹ (k, n, n) for every pattern of rows present, zero for the absent, and each sample's pattern (N,)."""
+    """Return L⁻¹ (k, n, n) for every pattern of rows present, zero for absent ones, and each sample's pattern (N,)."""
     patterns, which = np.unique(present, axis=0, return_inverse=True)
     roots = np.zeros((len(patterns), *noise.shape))
     for k, pattern in enumerate(patterns):
@@ -248,26 +248,26 @@ def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
 
 
 def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
-    """Return the robust standard deviation of each joint's residuals (n,), never zero."""
+    """Return the robust standard deviation of each joint's residuals (n,), always positive."""
     std = np.array([robust.spread(column[used]) for column, used in zip(residual.T, data.present.T)])
     return np.maximum(std, 1e-9 * max(std.max(initial=0.0), 1e-300))
 
 
 def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
-    """Return 1 - h_j / r_j (n,): what the fit leaves of the variance of joint j's residuals."""
+    """Return 1 - h_j / r_j (n,), the share of joint j's noise variance that remains in its residuals."""
     triangles = _triangles(data, np.ones(data.target.shape))
     taken = leverage(triangles, std, solve_triangle(combine(triangles, std), data.names)[1])
     return np.maximum(1.0 - taken / np.maximum(triangles.rows, 1), 1e-3)
 
 
 def _consistent(data: Samples, how: _Weighing) -> np.ndarray:
-    """Return the factor (N,) that makes the weighted scatter one for normal residuals."""
+    """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
     each = [robust.consistency(n, how.loss, how.gate) if n else 0.0 for n in range(data.target.shape[1] + 1)]
     return np.array(each)[data.joints]
 
 
 def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return S_ij = Σ c w e_i e_j / Σ w over samples with both rows present, eigenvalues floored where they must be."""
+    """Return S_ij = Σ c w e_i e_j / Σ w over samples with both rows, eigenvalues kept positive."""
     present = data.present.astype(float)
     noise = (residual * scaled[:, None]).T @ residual / np.maximum((present * weights[:, None]).T @ present, 1e-300)
     std = np.sqrt(np.diag(noise))

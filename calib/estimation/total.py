@@ -43,11 +43,11 @@ def tls(
     factor = combine(data, std)
     direction, singular = _null_direction(factor, noise, count, data.names)
     if abs(direction[p]) <= 1e-10 * np.abs(direction).max():
-        raise Unidentifiable("no combination of the columns reaches y: the dependence found is among them", data.names)
+        raise Unidentifiable("no combination of the columns explains y: the columns depend on each other", data.names)
     values = -direction[:p] / direction[p]
     variance = singular**2 / (count - p) if count > p else np.nan
     if not np.isfinite(variance):
-        raise Unidentifiable(f"{count} rows for {p} parameters leave nothing to judge them by", data.names)
+        raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
     more, independent = np.zeros((0, p)), count
     if inflation is not None:
         scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
@@ -62,7 +62,7 @@ def tls(
 def _null_direction(
     factor: np.ndarray, noise: np.ndarray, rows: int, names: tuple[str, ...]
 ) -> tuple[np.ndarray, float]:
-    """Return v (p + 1,) with [W y] v smallest against the noise, and the smallest singular value.
+    """Return v (p + 1,) that minimises ‖[W y] v‖ relative to the noise, and the smallest singular value.
 
     Singular values of pure noise spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967): when the second
     smallest is within that band of the smallest, the noise picks the solution.
@@ -74,8 +74,8 @@ def _null_direction(
     edge = min(np.sqrt(len(noisy) / rows), 0.5)
     if len(values) > 1 and values[-2] * (1.0 - edge) < values[-1] * (1.0 + edge):
         raise Unidentifiable(
-            f"the two smallest singular values are {values[-2]:.4g} and {values[-1]:.4g}: some columns carry no more "
-            "than their stated noise. State it smaller, filter, or excite more",
+            f"the two smallest singular values are {values[-2]:.4g} and {values[-1]:.4g}: some columns contain only "
+            "their stated noise; state less noise, or excite more",
             [names[c] for c in noisy[noisy < len(names)]],
             values,
         )
@@ -83,7 +83,7 @@ def _null_direction(
     direction[noisy] = vt[-1] / noise[noisy]
     if k:
         if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
-            raise Unidentifiable("the exact columns depend on one another", [names[c] for c in exact if c < len(names)])
+            raise Unidentifiable("the exact columns are dependent", [names[c] for c in exact if c < len(names)])
         direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], upper[:k, k:] @ direction[noisy])
     return direction, float(values[-1])
 
@@ -98,7 +98,7 @@ def _covariance(
     gram = scaled.T @ scaled - rows * np.diag(own)
     eigenvalues = np.linalg.eigvalsh(gram)
     if eigenvalues[0] <= 0.0:
-        raise Unidentifiable("some columns carry no more than their noise; filter, or excite more", names, eigenvalues)
+        raise Unidentifiable("some columns contain only noise; filter, or excite more", names, eigenvalues)
     inverse = np.linalg.inv(gram)
     total = variance * noise[-1] ** 2 + own @ x**2
     middle = np.diag(own) * total - np.outer(own * x, own * x)

@@ -1,4 +1,4 @@
-"""All the information of y = W x, in triangles: the R factor of [W y] of every group of rows, updated block by block.
+"""All information of y = W x in triangles: the R factor of [W y] of each group of rows, updated block by block.
 
 An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. One triangle is kept
 per group (a joint, a load case, a file), so that weights may change afterwards without another pass over the data: the
@@ -56,7 +56,7 @@ class Triangles:
         return 100.0 * np.sqrt(self.residual_squares(values) / np.where(size > 0.0, size, np.inf))
 
     def select(self, columns: np.ndarray) -> Triangles:
-        """Return the triangles of the model with only these columns, in the order given."""
+        """Return the triangles of the model with only these columns, in the given order."""
         columns = np.asarray(columns, dtype=int)
         wanted = np.append(columns, self.parameters)
         factors = [retriangulate(factor[:, wanted]) for factor in self.factors]
@@ -65,7 +65,7 @@ class Triangles:
 
 
 def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
-    """Return triangles that have seen no rows."""
+    """Return the triangles of a problem without rows."""
     p = len(names)
     given = tuple(units) if units is not None else ("",) * p
     require(len(given) == p, f"{p} parameter names but {len(given)} units")
@@ -73,7 +73,7 @@ def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int 
 
 
 def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.ndarray | int = 0) -> Triangles:
-    """Return the triangles after more rows: R_g becomes the R of [R_g; W_g y_g].
+    """Return the triangles updated by more rows: R_g becomes the R of [R_g; W_g y_g].
 
     Columns that are zero in all rows of a group (a joint does not feel the links before it) cost nothing.
 
@@ -116,7 +116,7 @@ def collect(
 
 
 def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
-    """Return the triangles with the parameters of each set equal: one column, their sum, at the first one's place.
+    """Return the triangles with equal parameters in each set: one column, their sum, in place of the first.
 
     Raises:
         CalibError: for a name that is no column, or in two sets.
@@ -124,7 +124,7 @@ def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
     named = [name for one in sets for name in one]
     if wrong := [name for name in named if name not in data.names or named.count(name) > 1]:
         raise CalibError(
-            f"equal parameters: '{wrong[0]}' is none of the columns, or named twice: {', '.join(data.names)}"
+            f"equal parameters: '{wrong[0]}' is not a column, or named twice; the columns are {', '.join(data.names)}"
         )
     into = {name: one[0] for one in sets for name in one}
     kept = [name for name in data.names if into.get(name, name) == name]
@@ -141,7 +141,7 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of all rows, those of group g divided by std[g] (None: by one)."""
     scale = np.ones(data.groups) if std is None else shaped(std, (data.groups,), "standard deviation per group")
     if (scale <= 0.0).any():
-        raise CalibError(f"standard deviations per group must be positive, found {scale.min()}")
+        raise CalibError(f"standard deviations per group must be positive, smallest is {scale.min()}")
     size = data.parameters + 1
     return retriangulate((data.factors / scale[:, None, None]).reshape(data.groups * size, size))
 
@@ -190,7 +190,7 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
 
 
 def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE) -> np.ndarray:
-    """Return the singular values of a matrix with columns of comparable size, or say which columns are dependent.
+    """Return the singular values of a matrix with columns of comparable size; refuse dependent columns by name.
 
     Raises:
         Unidentifiable: naming every column with a part in a null direction.
@@ -207,7 +207,7 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the R of [factor; matrix target], factorising live columns only."""
+    """Return the R of [factor; matrix target], factorising non-zero columns only."""
     old = factor[factor.any(axis=1)]
     live = np.flatnonzero(np.append(matrix.any(axis=0), True) | old.any(axis=0))
     stacked = np.empty((len(old) + len(matrix), len(live)), order="F")

@@ -12,7 +12,7 @@ from calib.records import Array, Number
 
 @dataclass(frozen=True, eq=False)
 class Whiteness:
-    """Verdicts on one series of residuals.
+    """Results of the whiteness tests of one series of residuals.
 
     Attributes:
         acf, pacf: (lags,) at lags 1, 2, …
@@ -41,7 +41,7 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
     """
     x = shaped(residual, (None,), "residuals")
     if len(x) < max(lags + 1, 20):
-        raise CalibError(f"{len(x)} residuals are too few for {lags} lags; at least {max(lags + 1, 20)}")
+        raise CalibError(f"{len(x)} residuals are too few for {lags} lags; needed are at least {max(lags + 1, 20)}")
     rho = autocorrelation(x, lags)
     bound = 1.96 / np.sqrt(len(x))
     skewness, kurtosis = _shape(x)
@@ -52,7 +52,7 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
 
 
 def _shape(x: np.ndarray) -> tuple[float, float]:
-    """Return skewness and excess kurtosis of a series (N,), from its central moments; NaN where it does not vary."""
+    """Return skewness and excess kurtosis of a series (N,), from its central moments; NaN for a constant series."""
     centred = x - x.mean()
     square = centred**2
     m2 = square.mean()
@@ -62,7 +62,7 @@ def _shape(x: np.ndarray) -> tuple[float, float]:
 
 
 def _normality(skewness: float, kurtosis: float, n: int) -> float:
-    """Return the probability of so much skewness and excess kurtosis in n >= 20 values of the normal law.
+    """Return the probability of at least this skewness and excess kurtosis in n >= 20 normal values.
 
     Both are turned into normal variables, whose squares add up (D'Agostino & Pearson 1973; D'Agostino 1970;
     Anscombe & Glynn 1983). As `scipy.stats.normaltest`, which takes half a second to load.
@@ -124,7 +124,7 @@ def inflation(residual: np.ndarray) -> float:
 
 
 def r_squared(target: np.ndarray, residual: np.ndarray) -> float:
-    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative where the mean would predict better."""
+    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative if the mean predicts better."""
     total = float(np.sum((target - np.mean(target)) ** 2))
     return 1.0 - float(np.sum(np.asarray(residual) ** 2)) / total if total > 0.0 else float("nan")
 

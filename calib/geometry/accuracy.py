@@ -1,4 +1,4 @@
-"""How far an installation's predictions lie from what was measured: the numbers a certificate prints.
+"""Errors of an installation's predictions against the measurements: the numbers printed on a certificate.
 
     position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
                   plane for planes; for images the rms over its corners of what separates seen and predicted, across
@@ -37,7 +37,7 @@ _NONE = np.array([], dtype=int)
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Sizes of errors in mm or deg."""
+    """Statistics of error magnitudes [mm or deg]."""
 
     mean: float
     rms: float
@@ -47,7 +47,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """Errors of one arm by nature; None where nothing of the kind was measured."""
+    """Error statistics of one arm by kind; None for a kind that was not measured."""
 
     position_mm: ErrorStatistics | None = None
     orientation_deg: ErrorStatistics | None = None
@@ -55,13 +55,13 @@ class ArmErrors:
 
     @property
     def main(self) -> ErrorStatistics | None:
-        """What is judged by: positions, or distances where there are no positions [mm]."""
+        """Errors that decide the verdict: of positions, else of distances [mm]."""
         return self.position_mm or self.distance_mm
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Sizes of errors, one per measured row (or pair); None where nothing of the kind was measured.
+    """Error magnitudes by kind, one per measured row (or pair); None for a kind that was not measured.
 
     Attributes:
         position: [m].
@@ -75,23 +75,23 @@ class Errors:
 
     @property
     def main(self) -> np.ndarray:
-        """The errors to judge by: positions, or distances where there are no positions."""
+        """Errors that decide the verdict: of positions, else of distances."""
         chosen = self.position if self.position is not None else self.distance
         return np.zeros(0) if chosen is None else chosen
 
     @property
     def rms(self) -> float:
-        """Root mean square of the errors to judge by; 0 without any."""
+        """Root mean square of the errors in `main`; 0 without errors."""
         return float(np.sqrt(np.mean(self.main**2))) if len(self.main) else 0.0
 
     def summary(self) -> ArmErrors:
-        """Return statistics of each nature, in the units they are printed in."""
+        """Return the statistics of each kind of error in the printed units (mm, deg)."""
         sizes = (getattr(self, nature) for nature in ERRORS)
         return ArmErrors(*(statistics(size, factor) for size, (factor, _) in zip(sizes, ERRORS.values())))
 
 
 def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None) -> Errors:
-    """Return the size of every error.
+    """Return the magnitudes of the prediction errors of all measured rows.
 
     Args:
         cell: the installation that predicts; it has the stations and tools of the measurements.
@@ -109,7 +109,7 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: To
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
-    """Return mean, rms, 95 % quantile and maximum of sizes times `factor`; None for None."""
+    """Return mean, rms, 95 % quantile and maximum of error magnitudes times `factor`; None without errors."""
     if sizes is None:
         return None
     scaled = factor * sizes
@@ -118,7 +118,7 @@ def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics
 
 
 def rms_sigma(sizes: np.ndarray) -> float:
-    """Return the standard error of the rms of independent sizes: sd(e²) / (2 rms sqrt(N)), by the delta method.
+    """Return the standard error of the rms of independent errors: sd(e²) / (2 rms sqrt(N)), by the delta method.
 
     Args:
         sizes: (N,), N > 1.
@@ -133,7 +133,7 @@ def rms_sigma(sizes: np.ndarray) -> float:
 def pair_errors(
     cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None, limit: int = 20000, seed: int = 0
 ) -> np.ndarray:
-    """Return | |p_i - p_j| - |y_i - y_j| | of pairs of measured positions [m]: immune to where the station stands.
+    """Return | |p_i - p_j| - |y_i - y_j| | of pairs of measured positions [m], independent of the station.
 
     Pairs are taken within a block; where there are more than `limit`, that many are drawn by seed.
     """
@@ -158,7 +158,7 @@ def _pairs(m: int, limit: int, generator: np.random.Generator) -> tuple[np.ndarr
 
 
 def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
-    """Return how far the distance of the same two sockets is from its mean over the fixture's positions [m].
+    """Return the deviations of each socket pair's distance from its mean over the fixture's positions [m].
 
     Of predicted points (3, m) [m]. A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets
     occurs in two positions.

@@ -1,4 +1,4 @@
-"""Where the instrument and the target stand: a first guess in closed form, so that no one has to be asked for it.
+"""First guess of instrument and target placements in closed form, so that the user need not state it.
 
 With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 
@@ -38,7 +38,7 @@ LEVER = 0.3  # what a turn counts as [m/rad] (our choice, as the next two)
 
 
 def misfit(arm: np.ndarray, seen: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
-    """Return the distances (m,) [m] of B_i from S A_i X at the target, a turn counting with its lever [m]."""
+    """Return the distances (m,) [m] between B_i and S A_i X at the target; rotations count with a lever [m]."""
     predicted = station @ arm @ tool
     turn = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ seen[:, :3, :3]).magnitude()
     return np.hypot(np.linalg.norm(predicted[:, :3, 3] - seen[:, :3, 3], axis=1), lever * turn)
@@ -50,7 +50,7 @@ def average_pose(poses: np.ndarray) -> np.ndarray:
 
 
 def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Solve B_i = S A_i X for S and X: by orientations (Shah 2013), or by turns and ways together; the better one.
+    """Solve B_i = S A_i X for S and X: by orientations (Shah 2013) or rotations and displacements; the better of both.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
@@ -64,7 +64,7 @@ def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return S and X by Shah: good where the poses turn about two axes by much more than they are off."""
+    """Return S and X by Shah: accurate if the poses rotate about two axes by much more than their errors."""
     a, b = arm[:, :3, :3], seen[:, :3, :3]
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", b, a).reshape(9, 9)
@@ -77,7 +77,7 @@ def by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _by_ways(arm: np.ndarray, seen: np.ndarray, rounds: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Return S and X from what turns and ways from the mean have in common: good for a line driven in one orientation.
+    """Return S and X from rotations and displacements about the mean: accurate for a line with one orientation.
 
     log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned alike, and
     y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, turns at a lever of `LEVER`, and t by its linear
@@ -97,13 +97,13 @@ def _by_ways(arm: np.ndarray, seen: np.ndarray, rounds: int = 5) -> tuple[np.nda
 
 
 def chordal_turns(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the chordal mean (3, 3) of rotations (m, 3, 3), and the rotation vectors (m, 3) that lead away from it."""
+    """Return the chordal mean (3, 3) of rotations (m, 3, 3), and their rotation vectors (m, 3) from it."""
     mean = orthonormal(rotations.mean(axis=0))
     return mean, Rotation.from_matrix(rotations @ mean.T).as_rotvec()
 
 
 def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return p_S (3,) and t (3,) of  y_i - R_S a_i = R_S R_i t + p_S; what of t is hardly identifiable is 0."""
+    """Return p_S (3,) and t (3,) of  y_i - R_S a_i = R_S R_i t + p_S; poorly identifiable components of t are 0."""
     turned, target = rotation @ arm[:, :3, :3], position - arm[:, :3, 3] @ rotation.T
     away = turned - turned.mean(axis=0)
     u, size, vt = np.linalg.svd(away.reshape(-1, 3), full_matrices=False)
@@ -114,14 +114,14 @@ def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -
 
 
 def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
-    """Refuse quaternions that stand as w x y z under a header x y z w, and inverse orientations.
+    """Refuse quaternions in the order w x y z under a header x y z w, and inverse orientations.
 
     Args:
         chain: the nominal arm.
         block: of any kind; only full poses are looked at.
 
     Raises:
-        MeasurementError: where the orientations contradict the arm as they are read, and agree read otherwise.
+        MeasurementError: if the orientations contradict the arm as read, and agree in another reading.
     """
     if not isinstance(block, Poses):
         return
@@ -133,10 +133,10 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= min_angle:
         return
     readings = {
-        "as w x y z they do: are these w first? Name the columns in the order they stand in: qw, qx, qy, qz": np.roll(
+        "read as w x y z they agree. Are the columns w first? Name them in their order: qw, qx, qy, qz": np.roll(
             stated, -1, axis=1
         ),
-        "inverted they do: they have to be those of the target seen from the instrument": stated * [-1, -1, -1, 1],
+        "inverted they agree. State orientations of the target seen from the instrument": stated * [-1, -1, -1, 1],
     }
     max_misfit = 0.1  # of the positions' spread: their median misfit then
     max_angle = 5.0  # and below which another reading of them is
@@ -145,13 +145,13 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
         if angle < max_angle and distance < max_misfit:
             refuse_data(
                 block.file,
-                f"the orientations do not turn with the arm (as x y z w they are off by {found:.0f}° in the median, "
-                f"wherever instrument and tool are placed); {words}",
+                f"the orientations contradict the arm (read as x y z w: median error {found:.0f}° for the best "
+                f"placement of instrument and tool); {words}",
             )
 
 
 def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:
-    """Return how far measured poses are from the arm's after the best placement of instrument and tool.
+    """Return the misfit of measured poses to the arm's after the best placement of instrument and tool.
 
     Args:
         arm: (m, 4, 4) poses of the tip in the base.
@@ -171,13 +171,13 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
 
 
 UNITS = {
-    1e3: "are they mm under a header that says m",
-    1e-3: "are they m under a header that says mm",
-    39.37: "are they in under a header that says m",
-    0.0254: "are they m under a header that says in",
-    1e2: "are they cm under a header that says m",
-    25.4: "are they mm under a header that says in",
-    0.03937: "are they in under a header that says mm",
+    1e3: "are they mm, although the header states m",
+    1e-3: "are they m, although the header states mm",
+    39.37: "are they inches, although the header states m",
+    0.0254: "are they m, although the header states in",
+    1e2: "are they cm, although the header states m",
+    25.4: "are they mm, although the header states in",
+    0.03937: "are they inches, although the header states mm",
 }
 MAX_TURN = 2.1 * math.pi * DEG  # no joint goes further: they may be rad read as deg (our choice)
 TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
@@ -185,7 +185,7 @@ MAX_GUESS_ROWS = 300  # rows of a block that a guess is made from (our choice)
 
 
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
-    """Return the nominal arm, with deflections known from an earlier fit, stations and tools placed by measurements.
+    """Return the nominal arm with known deflections, its stations and tools placed from measurements.
 
     A tool seen in several blocks takes its guess from the block that constrains most (poses before positions before the
     rest, then the one whose poses turn most, then the most rows); a station likewise. Tools that no block can place
@@ -222,7 +222,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
 
 
 def check_scale(block: PoseMeasurements, chain: Chain) -> None:
-    """Refuse measurements whose size cannot be the robot's: the ratio of measured to predicted spread of positions.
+    """Refuse measurements with an implausible ratio of measured to predicted spread of positions.
 
     Args:
         block: measurements; those without positions pass.
@@ -244,32 +244,32 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
         read = "".join(f" The file was {note}." for note in block.notes if note.startswith("read as"))
         refuse_data(
             block.file,
-            f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
-            f"{predicted:.4g} m, {measured / predicted:.3g} times as much{likely}{read} State the unit in the "
-            f"header, as in {header}, or look whether this is the right robot",
+            f"the measured positions spread over {measured:.4g} m, {measured / predicted:.3g} times the "
+            f"{predicted:.4g} m of the robot at these joint values{likely}{read} State the unit in the "
+            f"header, as in {header}, or check that this is the right robot",
         )
     if second < across / max_ratio and across > min_spread:
         refuse_data(
             block.file,
-            f"the measured positions lie on a line, within {1e3 * second:.3g} mm, where the robot's joints make it "
-            f"move {1e3 * across:.3g} mm across: are two of x, y, z constant or the same column, or were points "
+            f"the measured positions lie on a line within {1e3 * second:.3g} mm, those of the robot at these joint "
+            f"values within {1e3 * across:.3g} mm: are two of x, y, z constant or the same column, or are poses "
             "repeated? Measure poses all over the workspace",
         )
 
 
 def _spread(positions: np.ndarray) -> tuple[float, float]:
-    """Return the standard deviation of positions (m, 3), all axes together, and that across the line they lie along."""
+    """Return the standard deviation of positions (m, 3) over all axes, and that across their principal line."""
     sizes = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     return float(np.linalg.norm(sizes)), float(sizes[1])
 
 
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
-    """Return which units would explain a spread, those of the joints first, as a question; and the header to write."""
+    """Return a question with the units that would explain the spread (joint units first), and the header to write."""
     guesses = [("", predicted, "'x [mm]'")]
     if np.abs(block.q).max() < MAX_TURN:
         turning = np.array([joint.kind != "prismatic" for joint in chain.joints])
         moved = _spread(forward(chain, np.where(turning, block.q / DEG, block.q))[:, :3, 3])[0]
-        guesses.insert(0, ("are the joints rad under a header that says deg", moved, "'q1 [rad]'"))
+        guesses.insert(0, ("are the joints rad, although the header states deg", moved, "'q1 [rad]'"))
     for words, size, header in guesses:
         ratio = max(measured / size, 1e-300)
         factor = min((1.0, *UNITS), key=lambda each: abs(math.log(ratio / each)))
@@ -279,7 +279,7 @@ def _likely_units(block: Positions, chain: Chain, measured: float, predicted: fl
 
 
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
-    """Return how far a block's poses turn about their second axis, rms in steps of `TURN`, up to `TURNED` of them."""
+    """Return the rms rotation of a block's poses about the second principal axis in units of `TURN`, up to `TURNED`."""
     rows = np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int))
     if len(rows) < 3:
         return 0.0
@@ -294,13 +294,13 @@ Guess = tuple[np.ndarray | None, np.ndarray]
 def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    """Place one target of a block, and its station where it is not placed yet; rooms register those of their kinds."""
+    """Return station and tool placement of one target; known ones stay. Plug-ins register their kinds of block."""
     arm = arm[rows]
     if isinstance(block, Positions) and len(arm) < (least := 3 if isinstance(block, Poses) else 4):
         refuse_data(
             block.file,
-            f"{len(arm)} usable rows: placing the instrument and the target takes at least {least} different poses, "
-            "and a calibration some 20 or more; measure more poses",
+            f"{len(arm)} usable rows: placing the instrument and the target needs at least {least} different poses, "
+            "a calibration at least about 20; measure more poses",
         )
     if isinstance(block, Poses):
         seen = from_quaternion(block.position[rows], block.quaternion[rows])
@@ -317,7 +317,7 @@ def guess(
 def _place_position(
     arm: np.ndarray, seen: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Solve y_i = S (R_i t + a_i) for S and t, linearly; given S or t, for the other.
+    """Solve y_i = S (R_i t + a_i) linearly for S and t, or for one of them if the other is given.
 
     Of the linear solution and two plainer ones (target at the tip; target at the tip with the mean offset) the one with
     the smallest median error is taken, since a small workspace ruins the linear one.
@@ -358,7 +358,7 @@ def _linear_offset(rotation: np.ndarray, position: np.ndarray, seen: np.ndarray)
 
 
 def _align(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the pose S with seen ≈ S points (Kabsch 1976), after one pass of trimming the worst fifth."""
+    """Return the pose S with seen ≈ S points (Kabsch 1976); the worst fifth is trimmed once."""
     keep = np.ones(len(points), dtype=bool)
     placement = np.eye(4)
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Fit the geometry: Levenberg–Marquardt on whitened residuals of every kind of measurement at once."""
+"""Fit of the geometry: Levenberg–Marquardt on the whitened residuals of all kinds of measurements together."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ def fit(
     drawn: bool = False,
     prior: np.ndarray | None = None,
 ) -> GeometricFit:
-    """Fit what can be identified of the parameters `candidates`; the others keep their nominal values.
+    """Fit the identifiable ones of the parameters `candidates`; the others keep their nominal values.
 
     Minimises Σ ‖(y - f(x)) / σ‖². Three passes: columns that are linear combinations of others are set aside; the rest
     is fitted with a wide prior (`PLAUSIBLE`), which settles the sigmas; then every parameter that the data do not
@@ -64,8 +64,8 @@ def fit(
     free = candidates[split.kept]
     if split is not None and not len(free):
         raise Unidentifiable(
-            "these rows determine nothing of the robot: a socket, a bar, a plane or a pair says something by several "
-            "rows, at different joint values"
+            "these rows determine no parameter of the robot: a socket, a bar, a plane or a pair needs several "
+            "rows at different joint values; measure more rows of each"
         )
     _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
@@ -90,7 +90,7 @@ def fit(
 
 
 def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers: float = 1.5) -> None:
-    """Refuse measurements with less than `min_numbers` numbers for each unknown: only what is left over can be judged.
+    """Refuse measurements with less than `min_numbers` numbers per unknown: without redundancy no fit can be checked.
 
     `min_numbers`: measured numbers per unknown at least (our choice).
     """
@@ -101,14 +101,14 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers:
         needed = math.ceil(min_numbers * unknowns * poses / max(numbers, 1))
         refuse_data(
             blocks[0].measured.file,
-            f"{poses} poses are too few: {unknowns} unknowns need at least {needed} such poses, so that the fit can be "
-            "judged, too, and a full geometry some 20 to 40; measure more, or ask for a smaller model ('offsets' or "
+            f"{poses} poses are too few: {unknowns} unknowns and a check of the fit need at least {needed} poses, "
+            "the full geometry 20 to 40; measure more, or choose a smaller model ('offsets' or "
             "'frames')",
         )
 
 
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the position of the arm's longest length among the base columns, as an array of one (or none).
+    """Return the index of the arm's longest length among the base columns, as an array of one or no element.
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
     come from the nominal: this length stays. What others merge with a column counts with it.
@@ -126,7 +126,7 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 def _shrunk_fit(
     cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings, stated: np.ndarray
 ) -> GeometricFit:
-    """Fit with a prior about the nominal whose widths are the most probable ones (evidence; MacKay 1992).
+    """Fit with a prior about the nominal values; its widths maximise the evidence (MacKay 1992).
 
     One width for joint offsets, one for other angles, one for lengths. Where measurements come from a few places only
     (sockets, a plane), directions they hardly see would otherwise move the arm by centimetres to explain micrometres.
@@ -155,7 +155,7 @@ def _shrunk_fit(
 def _back_to_nominal(
     cell: Installation, nominal: Installation, candidates: np.ndarray, free: np.ndarray
 ) -> Installation:
-    """Return `cell` with the arm's candidates that are not free at their nominal values again."""
+    """Return `cell` with the arm's candidate parameters reset to nominal unless they are free."""
     arm = candidates[candidates < layout(cell).arm]
     back = np.setdiff1d(arm, free)
     return step(cell, back, nominal.chain.values[back] - cell.chain.values[back])
@@ -202,13 +202,13 @@ def fit_with_prior(
 
 
 def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
-    """Return how far a real arm's parameter may lie from its nominal (c,); infinite for frames and deflections."""
+    """Return the plausible deviation of each parameter from nominal (c,); infinite for frames and deflections."""
     table = layout(cell)
     return np.array([PLAUSIBLE[table.units[k]] if k < table.arm else np.inf for k in columns])
 
 
 def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
-    """Return which of the fitted parameters the data identify (indices): σ below half the plausible deviation.
+    """Return the indices of fitted parameters with σ below half the plausible deviation, hence identifiable.
 
     Backward elimination: the worst identified parameter goes back to its nominal, which changes the covariance C of the
     others to C - c cᵀ / c_k (c its column), until all that remain are identified.
@@ -228,7 +228,7 @@ def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndar
 
 
 def _whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residual (rows,) and W (rows, f) of a fit as they were weighed, without its prior."""
+    """Return the whitened and weighted residual (rows,) and W (rows, f) of a fit, without its prior."""
     return stack(
         [piece.part for piece in found.pieces], [piece.sigma / np.sqrt(piece.weight) for piece in found.pieces]
     )
@@ -240,14 +240,14 @@ def polish_frames(
     settings: Settings | None = None,
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> GeometricFit:
-    """Return the fit of station and tool placements alone, the arm unchanged: it gives the 'nominal' errors."""
+    """Return the fit of station and tool placements only, the arm unchanged; it gives the 'nominal' errors."""
     return fit(cell, measured, layout(cell).frame_index, settings=settings, torques=torques)
 
 
 def placed_on(
     cell: Installation, block: PoseMeasurements, torques: Sequence[np.ndarray | None] | None, settings: Settings
 ) -> GeometricFit:
-    """Fit base and tool placement of an arm, deflections included, on a block and nothing else.
+    """Return the arm with base and tool placement fitted to one block, arm and deflections unchanged.
 
     Where that does not settle, since the block hardly identifies some of it (the turn about a line that is driven),
     what it identifies by less than `min_column` stays where it is. Whether that settled is the solution's status.
@@ -264,7 +264,7 @@ def placed_on(
 def without_corrections(
     cell: Installation, rigid: Chain, blocks: Sequence[PoseMeasurements], settings: Settings
 ) -> Installation | None:
-    """Return the arm as a URDF holds it, base and tool placement fitted for it; None where `cell` has no corrections.
+    """Return the arm without corrections (for a URDF), frames fitted again; None if `cell` has no corrections.
 
     Args:
         cell: the calibrated installation.

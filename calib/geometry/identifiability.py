@@ -1,4 +1,4 @@
-"""Which geometric parameters the poses can identify, and findings on those that they cannot.
+"""Identifiable geometric parameters of a set of poses, and findings on the others.
 
 Rank, parameters that merge with others or stay at their nominal, placements that are hardly determined.
 """
@@ -20,7 +20,7 @@ PLACES = {"station": "the placement of the instrument", "tool": "the mounting of
 
 
 def unidentified(found: GeometricFit) -> list[Finding]:
-    """Return what a fit's poses could not identify: its rank first, then parameters, then placements."""
+    """Return findings on what a fit's poses do not identify: rank, parameters, placements."""
     if (split := found.split) is None:
         return _loose(found)
     values, rank = split.singular_values, split.rank
@@ -31,7 +31,7 @@ def unidentified(found: GeometricFit) -> list[Finding]:
 
 
 def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list[Finding]:
-    """Return the arm parameters that are linear combinations of others, by what they merge with.
+    """Return findings on arm parameters that depend linearly on others, grouped by these others.
 
     `max_named`: parameters by which families of merged ones are distinguished.
     """
@@ -56,7 +56,7 @@ def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list
 
 
 def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
-    """Return arm parameters that are independent but identified no better than they are known beforehand."""
+    """Return a finding on independent arm parameters that the data identify no better than the prior."""
     table = layout(found.start)
     if found.prior is not None:
         sigma = found.estimate.sigma
@@ -69,7 +69,7 @@ def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
 
 
 def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:
-    """Return tools whose placement is hardly determined, and the station that each is confused with.
+    """Return findings on tools with a poorly determined placement, and the station correlated with each.
 
     `max_placement_sigma`: [m] a placement known no better than this is worth a word (our choice).
     """
@@ -89,7 +89,7 @@ def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Findi
 
 
 def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str:
-    """Return the station whose estimate trades with the tool's (canonical correlation above 0.95); empty for none."""
+    """Return the station whose estimate is correlated with the tool's (canonical correlation above 0.95); else ''."""
     covariance = found.estimate.covariance
     for station in found.cell.station_names:
         theirs = [k for name, k in index.items() if name.rsplit(".", 1)[0] == station]
@@ -112,7 +112,7 @@ def _orientation_range(found: GeometricFit) -> float | None:
 
 
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:
-    """Return W (rows, c) of all blocks, stated sigmas applied, otherwise metres against radians times the reach.
+    """Return W (rows, c) of all blocks, scaled by stated sigmas; else radians are scaled by the reach.
 
     The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
     """
@@ -133,14 +133,14 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
 
 
 def _reach(cell: Installation) -> float:
-    """Return a length typical of the arm [m]: the sum of its constant offsets."""
+    """Return a typical length of the arm [m]: the sum of its constant offsets."""
     total = sum(abs(e.value) for e in cell.chain.elements if e.axis[0] == "t")
     total += sum(float(np.linalg.norm(e.placement[:3, 3])) for e in cell.chain.elements if e.placement is not None)
     return max(total, 0.1)
 
 
 def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
-    """Return groups of columns, first choice first: frames, joint offsets, rotations, translations, deflections.
+    """Return groups of columns in order of preference: frames, joint offsets, rotations, translations, deflections.
 
     Frames come first, so that what cannot be distinguished from the installation (the first joint's placement, the last
     joint's offset) stays with the installation and the arm keeps its nominal there. Rotations before translations make
@@ -165,5 +165,5 @@ def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
 def base_columns(
     cell: Installation, blocks: Sequence[Block], columns: np.ndarray, tolerance: float = 1e-5
 ) -> ColumnSplit:
-    """Split candidate parameters into identifiable ones and those that merge with them; indices into `columns`."""
+    """Split candidate parameters into identifiable ones and those that depend on them; indices into `columns`."""
     return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)

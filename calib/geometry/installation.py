@@ -1,4 +1,4 @@
-"""An arm as it stands in the cell: chain, instrument placements, tool placements and joint deflections.
+"""An arm installed in the cell: chain, instrument placements, tool placements and joint deflections.
 
 In ``robot.toml``, besides the calibrated robot itself (`calib.robot.description`, `calib.robot.calibrated`)::
 
@@ -36,7 +36,7 @@ FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class NoOptics:
-    """The parameters that instruments add to an installation, where none does; see a camera's for one that does."""
+    """Empty set of instrument parameters of an installation; cameras have a set of their own."""
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
@@ -47,15 +47,15 @@ class NoOptics:
         return 0
 
     def like(self, other: Any) -> NoOptics:
-        """Return the same instruments with the values of another's."""
+        """Return the same instruments with the parameter values of `other`."""
         return self
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> Any:
-        """Return what predicts a block's rows beside the poses; `free` counts from the first of these parameters."""
+        """Return the additional prediction for a block's rows; `free` counts from the first of these parameters."""
         return None
 
     def tables(self) -> Mapping[str, Any]:
-        """Return the tables of ``robot.toml`` that hold the parameters."""
+        """Return the tables of ``robot.toml`` with these parameters."""
         return {}
 
 
@@ -87,7 +87,7 @@ class Installation:
         object.__setattr__(self, "tools", frozen(self.tools))
 
     def merged(self) -> Installation:
-        """Return the same installation with known and fitted deflections as one."""
+        """Return the installation with known and fitted deflections merged."""
         if not self.known.terms:
             return self
         terms = (*self.known.terms, *self.deflection.terms)
@@ -98,7 +98,7 @@ class Installation:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """The targets as the instrument sees them, for m rows.
+    """Targets predicted in the instrument's frame, for m rows.
 
     Attributes:
         walked: the pass along the chain, in the station's frame.
@@ -125,7 +125,7 @@ def see(
     bases: np.ndarray | None = None,
     given: np.ndarray | None = None,
 ) -> Seen:
-    """Predict what an instrument sees at joint values q (m, n).
+    """Return the targets in an instrument's frame at joint values q (m, n).
 
     Args:
         cell: the installation.
@@ -171,7 +171,7 @@ def frame_tables(cell: Installation) -> dict[str, Any]:
 
 
 def read(path: str | Path) -> Installation:
-    """Read the installation that a fit has written, deflections included.
+    """Read the installation written by a fit, deflections included.
 
     Args:
         path: the folder of a fit, or its ``robot.toml``; any other robot file gives identity frames.
@@ -181,7 +181,7 @@ def read(path: str | Path) -> Installation:
 
 
 def read_arms(path: str | Path) -> tuple[Installation, Installation]:
-    """Return the calibrated arm of a fit as `read` does, and the nominal one.
+    """Return the calibrated arm of a fit, as `read` does, and the nominal arm.
 
     The nominal one has the frames that let it fit the same measurements best; of a fit that started from an earlier
     fit's folder they are not known: then it has no stations and no tools.
@@ -200,7 +200,7 @@ def read_arms(path: str | Path) -> tuple[Installation, Installation]:
 
 
 def _placed(chain: Chain, tables: Mapping[str, Any], where: str, deflection: Deflection | None = None) -> Installation:
-    """Return a chain with stations and tools as their tables say; identity frames where a list is empty."""
+    """Return a chain with the stations and tools of the tables; identity frames for an empty list."""
     with refused_as(RobotError, ValueError, f"{where}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
         found = read_record(_Frames, tables)
     given: dict[str, Any] = {"deflection": deflection or Deflection()}

@@ -29,7 +29,7 @@ DOF = (6, 5, 3)
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """The arm, its limits, and how many components of a target pose count.
+    """Arm, joint limits, and number of pose components to reach.
 
     Attributes:
         cell: the arm with one station and one tool; targets are the tool's poses in the station's frame.
@@ -46,14 +46,14 @@ class Goal:
 
 
 def seen_at(goal: Goal, q: np.ndarray) -> Seen:
-    """Return where the arm's tool stands at joint values q (m, n), deflections included."""
+    """Return the tool poses (m, 4, 4) at joint values q (m, n), deflections included."""
     terms = goal.cell.deflection.terms
     torque = goal.torques(q) if goal.torques is not None and any(term.basis == "torque" for term in terms) else None
     return see(goal.cell, q, bases=evaluate(goal.cell.deflection, q, torque))
 
 
 def differences(goal: Goal, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return what is missing from the tool's poses to the targets, (m, dof): position [m], then orientation [rad].
+    """Return the differences of targets and tool poses (m, dof): position [m], then orientation [rad].
 
     dof 6: rotation vector of R* Rᵀ in the station's axes. dof 5: the turn that brings the tool's z axis onto the
     target's, about the tool's x and y.
@@ -77,7 +77,7 @@ def _differences(seen: Seen, targets: np.ndarray, dof: int) -> np.ndarray:
 
 
 def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
-    """Return the derivative (m, dof, n) of what `differences` compares, with respect to the joints."""
+    """Return the Jacobian (m, dof, n) of the pose components of `differences` with respect to the joints."""
     jacobian = joint_jacobian(goal.cell.chain, seen.walked, seen.point)
     if goal.dof == 3:
         return jacobian[:, :3]
@@ -88,7 +88,7 @@ def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
 
 
 def reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int = 60) -> np.ndarray:
-    """Return joint values (m, n) that put the tool on the targets, or as near as the arm comes from `start`.
+    """Return joint values (m, n) that put the tool on the targets, or as close as the search from `start` gets.
 
     Args:
         goal: the arm.
@@ -136,7 +136,7 @@ def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray, lever: float = 0.3
 
 
 def _inside(goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return damped steps (m, n); joints at a limit that would go beyond are held, and the others make up for them."""
+    """Return damped steps (m, n); joints that would exceed a limit stop there, the others compensate."""
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
         held = ((q <= goal.lower) & (step < 0.0)) | ((q >= goal.upper) & (step > 0.0))
@@ -158,7 +158,7 @@ def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.
 
 
 def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray, passes: int = 8) -> np.ndarray:
-    """Return joint values (m, n) with the same tool poses as `q` and nearest to `start`: what redundancy is used for.
+    """Return the joint values (m, n) nearest to `start` with the tool poses of `q`, by the arm's redundancy.
 
     Minimises |q - q_start| (radians and metres alike) under e(q) = 0: each pass steps by d + J⁺ (e - J d), d = q_start
     - q. A target at which that loses what `q` has reached keeps `q`.
@@ -180,7 +180,7 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray, p
 
 
 def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, most: float) -> np.ndarray:
-    """Return joint values (m, n) that come near the targets and move no joint from `start` by more than `most`.
+    """Return joint values (m, n) near the targets with no joint more than `most` away from `start`.
 
     For targets near a singularity, where a small correction takes a large motion: minimises |e|² + μ² |q - q_start|²
     with the smallest μ of `BACK` that keeps to `most` [rad or m].
@@ -204,7 +204,7 @@ def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, most: float) -
 
 
 def conditions(goal: Goal, q: np.ndarray) -> np.ndarray:
-    """Return the smallest over the largest singular value of each Jacobian (m,): 0 at a singularity."""
+    """Return the ratio of smallest to largest singular value of each Jacobian (m,): 0 at a singularity."""
     jacobian = _weighted(goal, q, np.broadcast_to(np.eye(4), (len(q), 4, 4)))[1]
     values = np.linalg.svd(jacobian, compute_uv=False)
     return values[:, -1] / np.maximum(values[:, 0], 1e-300)

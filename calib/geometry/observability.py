@@ -1,4 +1,4 @@
-"""What a pose would reveal of a robot: the callables that pose selection (package `poses`) works with.
+"""Observation Jacobians of candidate poses: the callables used by pose selection (package `poses`).
 
 Both pickle, so that selection can run on several processes.
 """
@@ -51,7 +51,7 @@ class Observation:
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the first target is (m, 3) [m], and its Jacobian (m, 3, p), not whitened."""
+        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p)."""
         return see(self.cell, q).point.T, self(q)[:, :3] * self.sigmas[0]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
@@ -73,13 +73,13 @@ class Observation:
 
     @property
     def _in_station(self) -> np.ndarray:
-        """(p,) which of the parameters place the instrument, before the arm."""
+        """Mask (p,) of the parameters that place the instrument."""
         return np.isin(self.free, layout(self.cell).station_index)
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where a target is, in the arm's base: q (m, n) -> rotation (m, 3, 3), position (m, 3) [m]."""
+    """Pose of a target in the arm's base: q (m, n) -> rotation (m, 3, 3), position (m, 3) [m]."""
 
     cell: Installation
     number: int = 0
@@ -102,7 +102,7 @@ class TargetJacobian:
 
 
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
-    """Return the arm with targets at the given places in the tip's frame (3,) [m]; at the tip where none is given."""
+    """Return the arm with targets at places (3,) [m] in the tip's frame; one at the tip if none are given."""
     places = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
     names = tuple(f"tool {k + 1}" for k in range(len(places))) if len(places) > 1 else ("tool",)
     return Installation(chain, tools=np.array([pose(None, place) for place in places]), tool_names=names)
@@ -128,12 +128,12 @@ def observation(
         turns = [k for k in layout(cell).tool_index if layout(cell).units[k] == "rad"]
         columns = np.setdiff1d(columns, turns)
     split = base_columns(cell, blocks, columns)
-    require(split.rank, f"robot '{cell.chain.name}': no parameter has an effect on what is measured", Unidentifiable)
+    require(split.rank, f"robot '{cell.chain.name}': no parameter affects the measured quantities", Unidentifiable)
     return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
 
 
 def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
-    """Return what an exact instrument would measure of one target."""
+    """Return the noise-free measurements of one target."""
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
     common: dict[str, Any] = {"tool_names": (cell.tool_names[number],), "station": cell.station_names[0]}
     if full:

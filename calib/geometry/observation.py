@@ -19,7 +19,7 @@ from calib.robot.kinematics import element_jacobian
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Measurements made ready for an installation.
+    """Measurements prepared for evaluation with an installation (arm, stations, tools).
 
     Attributes:
         measured: m rows.
@@ -65,12 +65,12 @@ def _ready(
 
 
 def _index(names: tuple[str, ...], name: str, what: str) -> int:
-    require(name in names, f"{what} '{name}' is not part of the installation, which has {', '.join(names)}", UsageError)
+    require(name in names, f"{what} '{name}' is not part of the installation; it has {', '.join(names)}", UsageError)
     return names.index(name)
 
 
 def predict(cell: Installation, block: Block) -> Seen:
-    """Return what the instrument should see in a block."""
+    """Return the predicted targets of a block in the instrument's frame."""
     return see(cell, block.measured.q, block.station, block.tool, block.bases, block.given)
 
 
@@ -85,7 +85,7 @@ def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
 def target_jacobian(
     cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); see `Block` for the last three."""
+    """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); last three arguments: see `Block`."""
     arm, stations, tools, optics, _ = layout_counts(cell)
     m = seen.point.shape[1]
     jacobian = np.zeros((len(free), 6, m))
@@ -115,7 +115,7 @@ def target_jacobian(
 
 
 def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
-    """Fill the column (6, m) of one element of a station placement, at the end of that placement."""
+    """Fill the column (6, m) of one displacement of a station, applied in the station's fitted frame."""
     direction = placement[:3, axis % 3]
     if axis < 3:
         column[:3] = direction[:, None]

@@ -1,4 +1,4 @@
-"""The vector of everything a geometric fit may move, its names, and how a step is taken.
+"""Vector of all fit parameters of the geometry: names, layout and steps along it.
 
 Order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base placement's own axes), six per tool (in
 the target's own axes), of images the lenses' values and the boards' shapes, deflection coefficients (E).
@@ -17,7 +17,7 @@ from calib.transforms import displace
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Where each kind of parameter stands in the full vector.
+    """Layout of the full parameter vector by kind of parameter.
 
     Attributes:
         names, units: one per parameter.
@@ -35,7 +35,7 @@ class ParameterLayout:
     moving: tuple[int, ...] = ()
 
     def group(self, index: int) -> str:
-        """Return 'arm', 'station', 'tool', 'optics' or 'deflection' for a position in the vector."""
+        """Return the kind of the parameter at an index: 'arm', 'station', 'tool', 'optics' or 'deflection'."""
         edges = np.cumsum([self.arm, self.stations, self.tools, self.optics])
         return ("arm", "station", "tool", "optics", "deflection")[int(np.searchsorted(edges, index, side="right"))]
 
@@ -45,7 +45,7 @@ class ParameterLayout:
 
     @property
     def frame_index(self) -> np.ndarray:
-        """Placements, and what of cameras and boards is fitted: all that is not the robot's."""
+        """Indices of placements and of fitted camera and board parameters: all but the robot's."""
         placed = np.arange(self.arm, self.arm + self.stations + self.tools)
         return np.concatenate([placed, np.array(self.moving, dtype=int)])
 
@@ -62,7 +62,7 @@ class ParameterLayout:
         return np.arange(len(self.names) - self.terms, len(self.names))
 
     def find(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
-        """Return positions by name.
+        """Return the indices of named parameters.
 
         Raises:
             UsageError: for a name that does not exist.
@@ -99,7 +99,7 @@ def _unit(units: dict[str, str], term: calibrated.Term) -> str:
 
 
 def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:
-    """Return the installation moved by `change` (f,) along the parameters `free` (f,); frames move on the manifold."""
+    """Return the installation changed by `change` (f,) in the parameters `free` (f,); frames move on the manifold."""
     where = layout_counts(cell)
     full = np.zeros(sum(where))
     full[free] = change
@@ -118,20 +118,20 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
 
 
 def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
-    """Return how many parameters the arm, stations, tools, optics and deflection have."""
+    """Return the numbers of parameters of arm, stations, tools, optics and deflection."""
     frames = 6 * len(cell.stations), 6 * len(cell.tools)
     return len(cell.chain.elements), *frames, len(cell.optics), len(cell.deflection.terms)
 
 
 def parameter_values(cell: Installation) -> np.ndarray:
-    """Return the full parameter vector; frames count from their present placement, hence zeros."""
+    """Return the full parameter vector; frames have zeros: displacements from their present placement."""
     _, stations, tools, _, _ = layout_counts(cell)
     terms = np.asarray(cell.deflection.coefficients)
     return np.concatenate([cell.chain.values, np.zeros(stations + tools), cell.optics.values, terms])
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
-    """Return the positions of parameters that stay at their nominal: those in ``fix``, or all but those in ``free``.
+    """Return the indices of parameters fixed at their nominal values: those in ``fix``, or all but those in ``free``.
 
     ``free`` speaks of the arm; frames are always fitted.
     """
@@ -143,7 +143,7 @@ def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
 
 
 def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
-    """Return the standard deviations of the parameter vector that the options state; infinite elsewhere."""
+    """Return the prior standard deviations stated in the options, for the full vector; infinite where not stated."""
     if not options.prior:
         return None
     table = layout(start)

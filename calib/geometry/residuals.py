@@ -1,4 +1,4 @@
-"""What each kind of measurement says of the geometry: small residuals with their Jacobians.
+"""Residuals and Jacobians of the geometry for each kind of measurement.
 
 Each function takes what the instrument should see and returns parts; a part is r = measured - predicted with
 ∂predicted/∂x. Unknown socket points, planes and bar centres are linear (or nearly so) nuisances: they take their best
@@ -22,7 +22,7 @@ from calib.geometry.installation import Seen
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Residuals of one nature: all in one unit.
+    """Residuals of one kind with their Jacobian, all in one unit.
 
     Attributes:
         label: ``position``, ``orientation``, ``consistency``, ``distance``, ``plane`` or ``pixel``.
@@ -45,7 +45,7 @@ class Part:
 
     @property
     def height(self) -> int:
-        """How many rows it has in a least-squares problem."""
+        """Number of rows in a least-squares problem."""
         return self.value.size
 
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
@@ -61,23 +61,23 @@ class Part:
 
     @property
     def per_length(self) -> np.ndarray | float:
-        """What divides residuals in a length's stead into [m]; 1 for those that are lengths."""
+        """Divisor that converts residuals into metres (pixels: per m); 1 for residuals in metres."""
         return 1.0
 
     def sizes(self) -> np.ndarray:
-        """Return the length of each measured row's residual [m] or [rad]."""
+        """Return the norm of each measured row's residual [m or rad]."""
         return np.linalg.norm(self.value, axis=0)
 
     def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return measured rows and a weight of each, of weights (m,) per column."""
+        """Return the measured rows and the weight of each, given weights (m,) per column."""
         return self.index, weight
 
     def per_row(self) -> Part:
-        """Return the part with one column per measured row, in a unit of its nature."""
+        """Return the part with one column per measured row, in m or rad."""
         return self
 
     def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> Any:
-        """Return the errors that rows have in common, estimated from residuals at a state; None where there are none.
+        """Return the common errors of rows, estimated from residuals at a state; None if the kind has none.
 
         Args:
             sigma: (rows, m) standard deviations.
@@ -88,7 +88,7 @@ class Part:
         return None
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
-        """Return the residuals (rows, m) without what rows have in common."""
+        """Return the residuals (rows, m) without the common errors of rows."""
         return self.value
 
 
@@ -109,7 +109,7 @@ def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
 
 @parts.register
 def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
+    """Pose residual, measured against predicted: r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
     predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
     sigma = None if measured.sigma_rotation is None else measured.sigma_rotation.T
@@ -120,7 +120,7 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 @parts.register
 def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = y - p."""
+    """Position residual, measured minus predicted: r = y - p."""
     sigma = None if measured.sigma is None else measured.sigma.T
     everywhere = np.arange(len(measured))
     return [Part("position", measured.position.T - seen.point, jacobian[:, :3], sigma, 0, everywhere)]
@@ -128,7 +128,7 @@ def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Par
 
 @parts.register
 def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = L - |p_a - p_b| for the two rows of each pair."""
+    """Distance residual, measured minus predicted: r = L - |p_a - p_b| for the two rows of each pair."""
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
     length = np.linalg.norm(gap, axis=0)
@@ -150,7 +150,7 @@ def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
 
 @parts.register
 def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = mean of its group - p, and L - |mean_a - mean_b| for sockets whose distance is known."""
+    """Socket residual: mean of the group minus p, and L - |mean_a - mean_b| for known socket distances L."""
     groups, inverse, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     average = np.zeros((len(measured), len(groups)))
     average[np.arange(len(measured)), inverse] = 1.0 / counts[inverse]
@@ -175,7 +175,7 @@ def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 @parts.register
 def _plane(measured: Planes, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = -n · (p - mean), n the normal of the best plane of each group."""
+    """Plane residual: r = -n · (p - mean), n the normal of the fitted plane of each group."""
     value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
     groups = np.unique(measured.group)
     for group in groups:
@@ -193,7 +193,7 @@ def _plane(measured: Planes, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 @parts.register
 def _bar(measured: Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """r = L - |p - c|, c the best centre of each group."""
+    """Ball-bar residual: r = L - |p - c|, c the fitted centre of each group."""
     value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
     groups = np.unique(measured.group)
     for group in groups:
@@ -210,13 +210,13 @@ def _bar(measured: Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 
 def _unknowns(measured: Planes | Bars) -> int:
-    """Return how many numbers of planes or centres were eliminated: three each, or all a small group has."""
+    """Return the number of eliminated unknowns of planes or centres: three each, or all numbers of a small group."""
     _, counts = np.unique(measured.group, return_counts=True)
     return int(np.minimum(counts, 3).sum())
 
 
 def _sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:
-    """Return the point (3,) whose distances to points (3, m) come nearest to lengths (m,), by Gauss–Newton.
+    """Return the centre (3,) whose distances to points (3, m) fit the lengths (m,) best, by Gauss–Newton.
 
     The start is linear: |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).
     """
@@ -233,7 +233,7 @@ def _sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20
 
 
 def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
-    """Remove from rows (f, m) what the nuisance columns (m, k) can explain."""
+    """Return rows (f, m) with the nuisance columns (m, k) projected out."""
     q, _ = np.linalg.qr(nuisance)
     return rows - (rows @ q) @ q.T
 

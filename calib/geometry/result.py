@@ -1,4 +1,4 @@
-"""What a geometric fit returns, and how it looks row by row."""
+"""Result of a geometric fit, with residuals and weights by row."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One residual part of a fit: the block it comes from, and how it was weighed.
+    """One residual part of a fit, its block and its weights.
 
     Attributes:
         block: index into `GeometricFit.blocks`.
@@ -36,7 +36,7 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class GeometricFit:
-    """The outcome of a fit.
+    """Result of a geometric fit.
 
     Attributes:
         cell: the calibrated installation.
@@ -65,11 +65,11 @@ class GeometricFit:
 
     @property
     def calibrated(self) -> CalibratedChain:
-        """The calibrated robot of a fit without joint corrections; with some, see `calibrated_chain`."""
+        """Calibrated robot of a fit without joint corrections; for a fit with corrections see `calibrated_chain`."""
         return calibrated_chain(self)
 
     def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
-        """Return (file, row, label, size in robust sigmas, size [m or rad]) of rows that do not fit, worst first.
+        """Return (file, row, label, size in robust sigmas, size [m or rad]) of outlier rows, worst first.
 
         Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
         that an optimistic instrument does not make every row an outlier.
@@ -86,19 +86,19 @@ class GeometricFit:
         return sorted(result, key=lambda item: -item[3])
 
     def row_weights(self) -> list[np.ndarray]:
-        """Return per block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
+        """Return for each block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
         result = [np.ones(len(block.measured)) for block in self.blocks]
         for piece in self.pieces:
             np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
         return result
 
     def used_noises(self) -> list[Any]:
-        """Return per block the noise that its rows have in common; None where there is none."""
+        """Return the common noise of each block's rows; None for a block without."""
         noises = {piece.block: piece.part.noise for piece in self.pieces if piece.part.noise}
         return [noises.get(number) for number in range(len(self.blocks))]
 
     def used_sigmas(self) -> list[dict[str, float]]:
-        """Return per block the rms standard deviation used for each label [m or rad]."""
+        """Return for each block the rms standard deviation used per label [m or rad]."""
         result: list[dict[str, float]] = [{} for _ in self.blocks]
         for piece in self.pieces:
             result[piece.block][piece.part.label] = float(np.sqrt(np.mean(piece.sigma**2)))
@@ -108,7 +108,7 @@ class GeometricFit:
 def calibrated_chain(
     found: GeometricFit, rigid: GeometricFit | None = None, nominal: Chain | None = None
 ) -> CalibratedChain:
-    """Return the calibrated robot that fits of one arm make, with the covariance of its element values.
+    """Return the calibrated robot from fits of one arm, with the covariance of its element values.
 
     Args:
         found: the fit that predicts best.
@@ -122,7 +122,7 @@ def calibrated_chain(
     if not whole.deflection.terms:
         rigid = found
     if rigid is None:
-        raise UsageError("a fit with joint corrections needs the best fit without them as well")
+        raise UsageError("a fit with joint corrections also needs the best fit without corrections")
     chain = rigid.cell.chain
     own = np.flatnonzero(rigid.free < len(chain.elements))
     covariance = None

@@ -1,4 +1,4 @@
-"""How much each residual counts: sigmas stated or estimated, robust weights, priors."""
+"""Weights of residuals: stated or estimated sigmas, robust weights, priors."""
 
 from __future__ import annotations
 
@@ -22,18 +22,17 @@ START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance
 
 @dataclass(frozen=True)
 class Settings:
-    """How to fit.
+    """Settings of the fit: loss, damping, tolerance, iterations.
 
     Attributes:
-        loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual; ``auto`` is for the
-            ladder, which takes ``cauchy`` where rows are grossly wrong (`calib.geometry.model_choice.ladder`), and
-            else is ``none``.
-        loss_scale: the loss's constant, in sigmas; None for its usual one.
+        loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual; ``auto`` lets the ladder
+            of models choose ``cauchy`` for grossly wrong rows, else ``none`` (`calib.geometry.model_choice.ladder`).
+        loss_scale: the constant of the loss, in sigmas; None for its default.
         damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
-        tolerance: relative size of a column that counts as dependent.
-        limit: linearisations at most, per pass.
-        passes: how often sigmas that are not stated (and robust weights) are estimated anew; where there are images,
-            whose noise shrinks by little with each, until they settle.
+        tolerance: relative size below which a column counts as dependent.
+        limit: maximum number of linearisations per pass.
+        passes: number of re-estimations of sigmas that are not stated and of robust weights; with images, whose noise
+            decreases slowly, until they settle.
     """
 
     loss: str = "none"
@@ -51,12 +50,12 @@ class Settings:
         """
         result = replace(self, **changes)  # type: ignore[arg-type]
         if result.loss not in ("auto", *robust.LOSSES):
-            raise UsageError(f"loss '{result.loss}' is none of auto, {', '.join(robust.LOSSES)}")
+            raise UsageError(f"unknown loss '{result.loss}'; expected auto, {', '.join(robust.LOSSES)}")
         return result
 
 
 class Weigher:
-    """Holds what changes between passes: sigmas and robust weights of every part."""
+    """State of the weighing between passes: sigmas and robust weights of every part."""
 
     def __init__(
         self, settings: Settings, nominal: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
@@ -76,7 +75,7 @@ class Weigher:
         return [part for own in found for part in own]
 
     def noisy(self, found: list[Part]) -> list[Part]:
-        """Return parts with the common noise that they are whitened by."""
+        """Return parts with the common noise for whitening."""
         return [replace(part, noise=noise) if noise else part for part, noise in zip(found, self.noises)]
 
     def update(self, state: Installation, first: bool) -> None:
@@ -87,7 +86,7 @@ class Weigher:
         if rows < unknown and self.prior is None:
             refuse_data(
                 self.blocks[0].measured.file,
-                f"{rows} measured numbers cannot determine {unknown} unknowns; measure more poses, or fit a smaller "
+                f"{rows} measured numbers do not determine {unknown} unknowns; measure more poses, or fit a smaller "
                 "model ('frames' or 'offsets')",
             )
         share = max(1.0 - unknown / rows, 0.05)
@@ -103,9 +102,9 @@ class Weigher:
         ]
 
     def settle(self, solution: Solution) -> Solution | None:
-        """Return the solution in units of the sigmas its residuals give, or None where those would change the estimate.
+        """Return the solution scaled to the sigmas of its residuals, or None if these would change the estimate.
 
-        A common factor on all sigmas changes nothing but the scale, unless a prior stands against them.
+        A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """
         before, weights, noises = self.used = self.sigmas, self.weights, self.noises
         self.update(solution.state, first=False)
@@ -155,7 +154,7 @@ class Weigher:
 
 
 def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
-    """Return standard deviations (rows, m) of a part: those of the file, or one estimated from its residuals."""
+    """Return standard deviations (rows, m) of a part: those of the file, or one estimated from the residuals."""
     if part.sigma is not None:
         return part.sigma
     if start:
@@ -165,5 +164,5 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
 
 
 def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
-    """Return each row's residual in sigmas, root mean square over its components (m,), without common noise."""
+    """Return each row's residual in sigmas (m,), rms over its components, without common noise."""
     return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

@@ -149,7 +149,7 @@ def test_payload_is_a_body_of_its_own():
     wanted = rigid_body.inverse_dynamics(bodies_of(chain), merged, q, v, a)
     assert relative(found, wanted) < 1e-13
     assert relative(rigid_body.regressor(loaded, q, v, a) @ np.concatenate([chi, load_]), wanted) < 1e-13
-    with pytest.raises(RobotError, match="there already"):
+    with pytest.raises(RobotError, match="exists already"):
         with_payload(loaded, placement)
 
 

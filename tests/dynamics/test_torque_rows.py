@@ -72,7 +72,7 @@ def test_a_projection_of_stacked_rows_keeps_labels_and_refuses_slopes():
     assert np.array_equal(model(rows).regressor(q, v, a), model(BOTH).regressor(q, v, a)[:, :2])
     assert rows.numbered(N) == ("x", "y") and not rows.motors_alone and not rows.with_motors
     assert rows.of_joints(np.array([[True] * N, [True] * 4 + [False]])).tolist() == [[True, True], [False, False]]
-    with pytest.raises(CalibError, match="no slopes"):
+    with pytest.raises(CalibError, match="no derivatives"):
         rows.fold(np.zeros((7, 2, 1)), ("bodies",))
     with pytest.raises(CalibError, match="sensors behind the gear"):
         rows.target(q, None, q, v)

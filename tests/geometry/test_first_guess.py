@@ -144,7 +144,7 @@ def test_positions_on_a_line_are_refused_and_radians_under_degrees_named():
     line = np.outer(np.linspace(0.0, 1.0, len(block)), [0.3, 0.4, 0.5])
     with pytest.raises(MeasurementError, match="lie on a line"):
         install(truth.chain, [replace(block, position=line)])
-    with pytest.raises(MeasurementError, match="are the joints rad under a header that says deg"):
+    with pytest.raises(MeasurementError, match="are the joints rad, although the header states deg"):
         less = 0.3 * block.q
         seen = forward(truth.chain, less)[:, :3, 3]
         install(truth.chain, [replace(block, q=np.radians(less), position=seen)])

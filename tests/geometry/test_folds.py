@@ -134,7 +134,7 @@ def test_leaving_out_one_pose_leaves_out_each_once_and_only_of_few(truth):
     measured = [measure(truth, "position", 40, 1)]
     folds = folds_by_name("poses", measured)
     assert folds.count == 40 and sorted(folds.members[0]) == list(range(40))
-    with pytest.raises(UsageError, match="take 'random'"):
+    with pytest.raises(UsageError, match="choose 'random'"):
         folds_by_name("poses", [measure(truth, "position", 200, 1)])
     with pytest.raises(UsageError, match="transfer, regions, random, poses"):
         folds_by_name("kfold", measured)

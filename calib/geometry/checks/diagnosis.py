@@ -1,4 +1,4 @@
-"""Whether the measurements and the model belong together: set-ups that change, errors no rigid geometry explains."""
+"""Checks of measurements against the model: changes of set-up, errors that no rigid geometry explains."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ MIN_ROWS = 30  # rows below which no pattern is looked for (our choice)
 
 
 def diagnose(found: GeometricFit) -> list[Finding]:
-    """Return findings on each block: rows that look like another set-up, and residuals that are not noise."""
+    """Return findings on each block: changes of set-up between rows, and systematic residuals."""
     result: list[Finding] = []
     for block, part in _lengths(found):
         if part.value.shape[1] >= MIN_ROWS:  # pairs of rows count once
@@ -23,13 +23,13 @@ def diagnose(found: GeometricFit) -> list[Finding]:
 
 
 def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
-    """Return per block its first part, which is in metres for every kind of measurement."""
+    """Return the first residual part of each block, which is in metres for every kind of measurement."""
     first = {piece.block: piece.part.per_row() for piece in reversed(found.pieces)}
     return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 
 def _setup_change(block: Block, part: Part, max_chance: float = 1e-3, min_ratio: float = 1.6) -> list[Finding]:
-    """Compare the rows before and after every cut, by size and by ranks (Mann–Whitney): a worse run is a set-up.
+    """Find a change of set-up: compare residuals before and after every cut, by size and ranks (Mann–Whitney).
 
     `max_chance`: probability that the same rows in another order show such a change (our choice).
 

@@ -1,4 +1,4 @@
-"""Pose accuracy and repeatability after ISO 9283:1998, where a measured file holds the same pose several times.
+"""Pose accuracy and repeatability after ISO 9283:1998, from poses measured several times.
 
 For the n cycles of one commanded pose, p_j measured, p̄ their mean (the barycentre), p_c the command:
 
@@ -48,7 +48,7 @@ class Drift:
     rms: float
 
     def exceeds(self, sigma: float) -> bool:
-        """Say whether the differences are above `min_drift_sigmas` standard errors of noise of `sigma` per axis [m]."""
+        """Return whether the differences exceed `min_drift_sigmas` standard errors at noise `sigma` per axis [m]."""
         min_drift_sigmas = 3.0  # standard errors that repeated poses have to be off to be called drift
         return self.rms > (min_drift_sigmas / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
 
@@ -59,9 +59,9 @@ def noise_of_difference(sigma: float) -> float:
 
 
 def drift_between(chain: Chain, first: Sequence[PoseMeasurements], later: PoseMeasurements) -> Drift | None:
-    """Compare measurements with later ones of the same joints and tool; None where no pose was measured in both.
+    """Return the drift between measurements and later ones of the same poses; None without common poses.
 
-    What the joints differ by is taken off as the nominal arm says, at its size: the instrument's frame is not known.
+    Displacements by differing joint values (nominal arm) are subtracted by magnitude: the instrument frame is unknown.
 
     Args:
         chain: the nominal arm.
@@ -71,7 +71,7 @@ def drift_between(chain: Chain, first: Sequence[PoseMeasurements], later: PoseMe
 
 
 def drift_within(chain: Chain, measured: PoseMeasurements) -> Drift | None:
-    """Compare the poses of one series that were measured more than once, as `drift_between`; None where none was."""
+    """Return the drift within one series, as `drift_between`; None if no pose was measured more than once."""
     points = _points([measured])
     return _compared(chain, points, points, own=True)
 
@@ -122,45 +122,45 @@ class RepeatedPose:
 
 @dataclass(frozen=True)
 class RepeatedPoses:
-    """Accuracy and repeatability of poses that were measured several times: each, and mean and largest of all."""
+    """Accuracy and repeatability of poses measured several times: of each pose, and mean and maximum over all."""
 
     each: tuple[RepeatedPose, ...]
 
     @stored
     def poses(self) -> int:
-        """How many."""
+        """Number of poses."""
         return len(self.each)
 
     @stored
     def cycles(self) -> tuple[int, int]:
-        """The fewest and the most cycles of a pose."""
+        """Smallest and largest number of cycles of a pose."""
         counts = [len(one.rows) for one in self.each]
         return min(counts), max(counts)
 
     @stored
     def repeatability_mm(self) -> MeanAndMax:
-        """RP."""
+        """Position repeatability RP, mean and maximum [mm]."""
         return _mean_and_max([one.repeatability_mm for one in self.each])
 
     @stored
     def accuracy_mm(self) -> dict[str, MeanAndMax]:
-        """AP of each arm."""
+        """Position accuracy AP of each arm, mean and maximum [mm]."""
         return {arm: _mean_and_max([np.linalg.norm(getattr(one, f"{arm}_mm")) for one in self.each]) for arm in ARMS}
 
     @stored
     def orientation_repeatability_deg(self) -> MeanAndMax | None:
-        """RP of orientations, the largest of three axes."""
+        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]."""
         return _sizes([max(one.repeatability_deg) for one in self.each if one.repeatability_deg])
 
     @stored
     def orientation_accuracy_deg(self) -> dict[str, MeanAndMax | None]:
-        """AP of orientations of each arm."""
+        """Orientation accuracy AP of each arm, mean and maximum [deg]."""
         turns = {arm: [getattr(one, f"{arm}_deg") for one in self.each] for arm in ARMS}
         return {arm: _sizes([np.linalg.norm(turn) for turn in each if turn]) for arm, each in turns.items()}
 
     @stored
     def multidirectional_mm(self) -> MeanAndMax | None:
-        """VAP."""
+        """Multidirectional variation vAP of the position, mean and maximum [mm]."""
         return _sizes([one.multidirectional_mm for one in self.each if one.multidirectional_mm is not None])
 
 
@@ -175,7 +175,7 @@ def _sizes(values: Sequence[Any]) -> MeanAndMax | None:
 def repeated_poses(
     cells: tuple[Installation, Installation], measured: Sequence[PoseMeasurements], torques: Torques = None
 ) -> RepeatedPoses | None:
-    """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without any.
+    """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without such poses.
 
     Args:
         cells: the nominal and the calibrated arm, whose commands are meant.
@@ -193,7 +193,7 @@ def repeated_poses(
 
 
 def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
-    """Return for each pose measured at least `min_cycles` times the indices of its rows, in the file's order.
+    """Return the row indices of each pose measured at least `min_cycles` times, in the file's order.
 
     Rows with the very same numbers are copies of one measurement and count once. Empty for kinds without positions.
     """
@@ -215,7 +215,7 @@ def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
 
 
 def spread(points: np.ndarray) -> float:
-    """Return RP = l̄ + 3 S_l of points (n, 3) [m]."""
+    """Return the position repeatability RP = l̄ + 3 S_l of points (n, 3) [m]."""
     length = np.linalg.norm(points - points.mean(axis=0), axis=1)
     return float(length.mean() + 3.0 * length.std(ddof=1))
 
@@ -223,7 +223,7 @@ def spread(points: np.ndarray) -> float:
 def _repeated_pose(
     cells: Sequence[Installation], blocks: Sequence[Block], measured: Positions, index: np.ndarray
 ) -> RepeatedPose:
-    """Return accuracy and repeatability of one pose by its rows."""
+    """Return accuracy and repeatability of one pose from its rows."""
     points = measured.position[index]
     turns = Rotation.from_quat(measured.quaternion[index]) if isinstance(measured, Poses) else None
     own: dict[str, Any] = {}
@@ -249,7 +249,7 @@ def _numbers(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _directions(measured: Positions, index: np.ndarray) -> np.ndarray:
-    """Return where each row was approached from (k, 3), by the row before it in the file; NaN where that is not there.
+    """Return each row's direction of approach (k, 3), from the previous row of the file; NaN without that row.
 
     Both as measured: what counts is the direction, not the tenths of a millimetre.
     """
@@ -266,7 +266,7 @@ def _directions(measured: Positions, index: np.ndarray) -> np.ndarray:
 
 
 def _variation(points: np.ndarray, directions: np.ndarray) -> float:
-    """Return vAP [m] of points (k, 3) with their directions of approach (k, 3); NaN for one direction."""
+    """Return vAP [m] of points (k, 3) approached in directions (k, 3); NaN for fewer than two directions."""
     left = np.flatnonzero(~np.isnan(directions[:, 0]))
     centres = []
     while len(left):
@@ -280,7 +280,7 @@ def _variation(points: np.ndarray, directions: np.ndarray) -> float:
 
 
 class _Aside(Protocol):
-    """Rows kept from the fit, `calib.procedure.kinematic_stage.inputs.Unseen`."""
+    """Rows excluded from the fit; see `calib.procedure.kinematic_stage.inputs.Unseen`."""
 
     @property
     def block(self) -> PoseMeasurements: ...
@@ -289,7 +289,7 @@ class _Aside(Protocol):
 
 
 def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> tuple[set[str], list[str]]:
-    """Find rows with the joint values and the measured numbers of another, and unseen ones at joints of the fit.
+    """Return unseen files that mostly repeat rows of the fit, and notes on repeated rows.
 
     Args:
         fit: the fit's blocks.
@@ -306,16 +306,16 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
         before = _row_numbers(block, [mark in known for mark in marks])
         name = Path(block.file).name
         if within:
-            notes.append(f"{name}: {_rows(within)} with the numbers of another row there: counted twice?")
+            notes.append(f"{name}: {_rows(within)} identical to another row of the file: counted twice?")
         if before:
-            notes.append(f"{name}: {_rows(before)} with the numbers of a row fitted already: is the file given twice?")
+            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file: is the file given twice?")
         known.update(marks)
     # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
     max_copied_share = 0.5
     for name, aside in unseen.items():
         copied = [mark in known for mark in _marks(aside.block)]
         again = _measured_again(fit, aside.block) & ~np.array(copied, dtype=bool)
-        for chosen, words in ((copied, "with the numbers of a row of the fit"), (again, "at joints that were fitted")):
+        for chosen, words in ((copied, "identical to fitted rows"), (again, "at joint values of fitted rows")):
             if told := _row_numbers(aside.block, chosen):
                 notes.append(f"{name}: {_rows(told)} {words}: not unseen")
         same = _row_numbers(aside.block, again | copied)
@@ -325,7 +325,7 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
 
 
 def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) -> np.ndarray:
-    """Say which rows (m,) were measured at joints at which rows of the fit were measured."""
+    """Return which rows (m,) have the joint values of a row of the fit."""
     seen = [block.q for block in fit if type(block) is type(aside) and block.has_instrument]
     if not seen:
         return np.zeros(len(aside), dtype=bool)
@@ -333,7 +333,7 @@ def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) ->
 
 
 def _marks(block: PoseMeasurements) -> list[bytes]:
-    """Return for each row what it says, joint values and measured numbers, to 12 digits."""
+    """Return a key of each row: its joint values and measured numbers, rounded to 12 decimals."""
     table = np.column_stack([block.q, block.tool.astype(float), block.measured])
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 

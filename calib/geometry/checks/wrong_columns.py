@@ -1,4 +1,4 @@
-"""Are rows of this arm? Columns of joints and axes that are changed, and one factor on all lengths.
+"""Checks for changed columns (joint signs, exchanged joints, mirrored axes) and for a scale factor on all lengths.
 
 The nominal arm, base and tool placement free, explains rows as measured and with each change; what an arm's own errors
 leave is small against either.
@@ -43,7 +43,7 @@ class Scale:
 
 
 def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> Scale | None:
-    """Return the factor on the instrument's lengths; None without positions.
+    """Return the scale factor of the instrument's lengths with its sigma; None without positions.
 
     Args:
         nominal: the arm with base and tool placement fitted for it.
@@ -67,7 +67,7 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements], torques:
 
 
 def _scale(value: np.ndarray, matrix: np.ndarray, size: float) -> Scale | None:
-    """Return the last column's share in explaining `value`, the others being free: y - p = (1 - 1/s) y."""
+    """Return the scale s of y - p = (1 - 1/s) y, fitted by the last column together with all others."""
     others, last = matrix[:, :-1], matrix[:, -1]
     left, own = (x - others @ np.linalg.lstsq(others, x, rcond=1e-9)[0] for x in (value, last))
     power, count = float(own @ own), len(value) - matrix.shape[1]
@@ -82,9 +82,9 @@ def _scale(value: np.ndarray, matrix: np.ndarray, size: float) -> Scale | None:
 
 
 def length_factor(fit: GeometricFit) -> Scale | None:
-    """Return the factor by which all lengths of a fitted arm grew together; None where fewer than two were fitted.
+    """Return the common factor between fitted and nominal lengths of an arm; None for fewer than two fitted lengths.
 
-    Its sigma is that of the measurements; how much of the lengths' change it explains says whether it is one factor.
+    Its sigma follows from the measurements; the explained share of the lengths' change shows whether it is one factor.
     """
     chain, split, candidates = fit.start.chain, fit.split, fit.candidates
     if split is None or candidates is None:
@@ -116,7 +116,7 @@ Blocks = Sequence[PoseMeasurements]
 def wrong_columns(
     nominal: Installation, blocks: Blocks, torques: Sequence[np.ndarray | None], mirrored: bool = False
 ) -> Explanation | None:
-    """Return the changes of columns that let the nominal arm explain most, errors in m²; None where none counts.
+    """Return the change of columns with the smallest error of the nominal arm [m²]; None without a significant one.
 
     Args:
         nominal: the arm as it was.
@@ -148,7 +148,7 @@ def _of_joints(matrix: np.ndarray) -> Callable[[Blocks], Blocks]:
 
 
 def _mirrored(blocks: Blocks) -> Blocks:
-    """Return blocks seen in a frame of the other hand: y turned; a rotation R becomes F R F."""
+    """Return blocks in a frame of opposite handedness: y changes its sign, a rotation R becomes F R F."""
     found = []
     for block in blocks:
         if isinstance(block, Positions):
@@ -160,7 +160,7 @@ def _mirrored(blocks: Blocks) -> Blocks:
 
 
 def _least(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return what no placement of base and tool can leave less than [m²]; 0 where that is not known without a search.
+    """Return a lower bound of the mean squared error over all base and tool placements [m²]; 0 without a closed form.
 
     Positions y = B (R p + t) + b, with R, t the tip's by the joints and B, b, p the placements, are linear in B ⊗ p, B
     and b: 13 numbers per axis of y, free of each other and of other axes here.
@@ -180,7 +180,7 @@ def _least(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _left(nominal: Installation, blocks: Blocks, torques: Sequence[np.ndarray | None]) -> np.ndarray:
-    """Return the mean square that the nominal arm leaves [m²], base and tool placed anew."""
+    """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement."""
     try:
         placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, SHORT, torques).cell
     except CalibError:

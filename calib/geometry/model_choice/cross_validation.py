@@ -1,4 +1,4 @@
-"""Errors on rows a model was not fitted to, from sufficient statistics: every fold and every subset of terms is cheap.
+"""Errors on held-out rows from sufficient statistics, cheap for every fold and every subset of terms.
 
 The model is linear in its terms and, near its optimum, in the geometry: per fold the statistics WᵀW, Wᵀr of the
 training rows give the estimate, those of the held-out rows its error. Nothing is fitted to held-out rows but the
@@ -28,10 +28,10 @@ METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
 def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
-    """Return the ridge each term shares (E,): all harmonics of one joint on one element, all else stands alone.
+    """Return the ridge index of each term (E,): harmonics of one joint on one element share one, others have their own.
 
-    With a ridge for each order the evidence switches most of them off and takes the rest too large, which rows nearby
-    do not show and rows elsewhere do; `term_sizes` says how they fall with their order.
+    With a ridge per order the evidence switches most orders off and makes the rest too large, which shows only on
+    distant rows; see `term_sizes` for the decrease with the order.
     """
     keys: dict[tuple, int] = {}
     result = []
@@ -43,10 +43,9 @@ def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
 
 
 def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
-    """Return the first guess of each coefficient's size (E,); those of harmonics fall with their order.
+    """Return the first guess of each coefficient's magnitude (E,), for harmonics inverse to their order.
 
-    Our choice, of one size for all orders, a fall with the root and one with the order itself: regions left out of a
-    UR5 and of a Motoman are predicted best by the last.
+    Our choice among constant, 1 / √order and 1 / order: the last predicts held-out regions of a UR5 and a Motoman best.
     """
     return np.array([1e-4 / term.order if term.basis in ("cos", "sin") else 1e-4 for term in terms])
 
@@ -69,13 +68,13 @@ class UnseenErrors:
         return float(np.sqrt(max(self.squares.sum(), 0.0) / max(self.rows.sum(), 1)))
 
     def wins(self, other: UnseenErrors) -> bool:
-        """Say whether this is better than `other` in at least half of the folds."""
+        """Return whether the error is smaller than `other` in at least half of the folds."""
         return bool(np.sum(self.squares < other.squares) * 2 >= len(self.squares))
 
 
 @dataclass(frozen=True, eq=False)
 class FoldStatistics:
-    """Statistics of every fold for the columns [free geometry, terms], the latter condensed.
+    """Least-squares statistics of every fold for the columns [free geometry, terms], the terms condensed.
 
     Attributes:
         rigid: number of geometry columns, which come first.
@@ -101,7 +100,7 @@ class FoldStatistics:
     _chosen: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def error(self, terms: np.ndarray) -> UnseenErrors:
-        """Return the error on held-out rows of geometry + terms, whole groups of them."""
+        """Return the errors on held-out rows of geometry and `terms` (whole groups)."""
         index, chosen = self._columns(terms), self._widths(terms)
         begin = np.where(chosen > 0.0, chosen, self.coordinates.sizes[index])  # where the search begins
         squares = []
@@ -116,21 +115,21 @@ class FoldStatistics:
         return self.error(np.array([], dtype=int)).rms
 
     def ridges(self, terms: np.ndarray) -> np.ndarray:
-        """Return the prior standard deviation of each term that all rows choose; 0 where they switch it off."""
+        """Return each term's most probable prior standard deviation over all rows; 0 for a term switched off."""
         width = np.ones(int(self.groups.max(initial=-1)) + 1)
         own = self.coordinates.groups[self._columns(terms)[self.rigid :]]
         width[own] = (self._widths(terms) / self.coordinates.sizes[self._columns(terms)])[self.rigid :]
         return width[self.groups[terms]] * self.sizes[terms]
 
     def alive(self, terms: np.ndarray) -> int:
-        """Return how many of the terms the data keep."""
+        """Return the number of terms that the data do not switch off."""
         return int(np.sum(self.ridges(terms) > 0.0))
 
     def _columns(self, terms: np.ndarray) -> np.ndarray:
         return np.flatnonzero(np.isin(self.coordinates.groups, [-1, *self.groups[terms]]))
 
     def _widths(self, terms: np.ndarray) -> np.ndarray:
-        """Return the prior standard deviation of each coordinate of geometry and terms that all rows choose."""
+        """Return the most probable prior standard deviation of each coordinate of geometry and terms, over all rows."""
         key = terms.tobytes()
         if key not in self._chosen:
             index = self._columns(terms)
@@ -155,7 +154,7 @@ def fold_statistics(
     folds: Folds,
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> FoldStatistics:
-    """Gather the statistics of every fold at a fitted model, for its free parameters and `terms`.
+    """Return the statistics of every fold at a fitted model, for its free parameters and `terms`.
 
     Args:
         found: the model, fitted to all rows.
@@ -198,10 +197,10 @@ def blind_folds(
     folds: Folds,
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> np.ndarray:
-    """Return which folds cannot be judged (folds,): the other rows do not determine where the tool would be in them.
+    """Return which folds cannot be predicted (folds,): the other rows do not determine the tool position in them.
 
-    There the error that geometry and frames would have by their covariance alone, with the nominal arm's residuals
-    taken for noise and `plausible_deviation` known beforehand, is above `max_blind_error` times those residuals.
+    There the error by the covariance of geometry and frames (nominal residuals as noise, `plausible_deviation` as
+    prior) exceeds `max_blind_error` times those residuals.
 
     Args:
         nominal: the nominal arm with its frames fitted to all rows.
@@ -238,7 +237,7 @@ def blind_folds(
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Measured blocks, and how their rows are weighed: rms sigma by label, robust weights, noise of images."""
+    """Measured blocks and the weighing of their rows: rms sigma by label, robust weights, noise of images."""
 
     cell: Installation
     measured: Sequence[PoseMeasurements]
@@ -249,7 +248,7 @@ class _Rows:
     torques: Sequence[np.ndarray | None] | None
 
     def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
-        """Return statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows.
+        """Return statistics of chosen rows in metres (metric parts) and whitened, and the number of metric rows.
 
         Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
         """
@@ -283,7 +282,7 @@ class _Rows:
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return columns (f, ...) with those at `frames` projected out: rows on which these placements are fitted anew."""
+    """Return columns (f, ...) with those at `frames` projected out, as if these placements were fitted to the rows."""
     flat = columns.reshape(len(columns), -1)
     basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]

@@ -1,4 +1,4 @@
-"""How measurements are set aside to judge a model: by station, by file, by fixture, or by region of the joint space.
+"""Partitions of measurements for cross-validation: by station, file, fixture, or region of the joint space.
 
 A random split of grid data holds out neighbours of what was fitted and flatters every model; these folds ask for
 transfer.
@@ -34,7 +34,7 @@ class Folds:
 
 
 def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
-    """Return the most demanding folds the measurements allow.
+    """Return the most demanding folds that the measurements allow: by station, file, fixture or region.
 
     Two or more stations: leave one station out (its placement is fitted anew on the held-out rows). Two or more files
     without an instrument: leave one file out. Several fixtures (groups of linked sockets, planes): leave some out. Else
@@ -57,7 +57,7 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
 def divide(
     folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements], seed: int = 0, scattered: bool = False
 ) -> Folds:
-    """Return folds in which those that `blind` (count,) marks are divided: each of their regions is left out by itself.
+    """Return folds in which those marked in `blind` (count,) are divided into regions, one fold per region.
 
     What is left out as a whole has to be predicted by the rest. Where the rest does not determine the tool (it holds
     one orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
@@ -109,7 +109,7 @@ def region_folds(
 
 
 def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
-    """Return `transfer_folds`, `region_folds`, ten `random_folds`, or one fold for each of the ``poses``.
+    """Return folds by name: `transfer_folds`, `region_folds`, ten `random_folds`, or one fold per pose (``poses``).
 
     Raises:
         UsageError: for another name, or for leaving out each of more than `max_station_poses` poses.
@@ -117,7 +117,7 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
     max_station_poses = 150
     if name == "poses" and sum(len(block) for block in measured) > max_station_poses:
         raise UsageError(
-            f"folds 'poses' leaves out every pose once, for {max_station_poses} rows at most; take 'random'"
+            f"folds 'poses' hold out every pose once, for {max_station_poses} rows at most; choose 'random'"
         )
     ways = {
         "transfer": lambda: transfer_folds(measured, seed),
@@ -156,7 +156,7 @@ def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
 
 
 def _fixtures(block: Sockets) -> Folds | None:
-    """Return folds of whole fixtures, sockets tied by known distances counting as one; None for fewer than three."""
+    """Return folds of whole fixtures (sockets with known distances form one fixture); None for fewer than three."""
     root = {int(group): int(group) for group in np.unique(block.group)}
     for a, b, _ in block.links:
         if a in root and b in root:

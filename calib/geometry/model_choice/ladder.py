@@ -1,4 +1,4 @@
-"""A ladder of models, climbed as far as held-out errors fall.
+"""Model selection: nested models, each with one more effect, as long as errors on held-out rows decrease.
 
     frames → offsets → geometry → + stiffness → + bending → + coupling → + harmonics → + wobble
 
@@ -31,7 +31,7 @@ from calib.robot.chain import Chain
 
 
 def _stiffness(chain: Chain, known: bool) -> list[Term]:
-    """Return the deflection of each joint about its axis under gravity: by known torques, else by fitted moments."""
+    """Return the terms of joint deflection about the axis under gravity: by known torques, else fitted moments."""
     names = chain.names
     if known:
         return [Term(names[k], "torque", j) for j, k in enumerate(chain.moving) if chain.joints[j].kind == "revolute"]
@@ -39,7 +39,7 @@ def _stiffness(chain: Chain, known: bool) -> list[Term]:
 
 
 def _bending(chain: Chain, known: bool) -> list[Term]:
-    """Return the tilt of each joint's frame across its axis under gravity: bearings and links give way too."""
+    """Return the terms of tilt across each joint's axis under gravity, from compliant bearings and links."""
     moving = set(chain.moving.tolist())
     places = [k for k, e in enumerate(chain.elements) if e.axis[0] == "r" and k not in moving and e.owner < chain.n]
     return [term for k in places for term in _sag(chain, k)]
@@ -51,26 +51,26 @@ def _sag(chain: Chain, place: int) -> list[Term]:
 
 
 def _coupling(chain: Chain, known: bool) -> list[Term]:
-    """Return corrections of a joint by its reading and its neighbours': gear ratio, coupled transmissions."""
+    """Return the correction terms of a joint by its own and its neighbours' readings: gear ratio, coupled gears."""
     names = chain.names
     near = [(j, i) for j in range(chain.n) for i in (j - 1, j, j + 1) if 0 <= i < chain.n]
     return [Term(names[chain.moving[j]], "joint", i) for j, i in near]
 
 
 def _harmonics(chain: Chain, known: bool, max_order: int = 60) -> list[Term]:
-    """Return sin and cos of k q_j on each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
+    """Return the terms sin and cos of k q_j on each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
     return _turning(chain, [(chain.names[k], j) for j, k in enumerate(chain.moving)], max_order)
 
 
 def _wobble(chain: Chain, known: bool, max_order: int = 2) -> list[Term]:
-    """Return low harmonics of q_j on every other element of joint j: its axis wobbles as it turns."""
+    """Return low harmonics of q_j on every other element of joint j: wobble of its axis."""
     moving = set(chain.moving.tolist())
     places = [(e.name, e.owner) for k, e in enumerate(chain.elements) if k not in moving and e.owner < chain.n]
     return _turning(chain, places, max_order)
 
 
 def _turning(chain: Chain, places: list[tuple[str, int]], max_order: int) -> list[Term]:
-    """Return harmonics on elements, each with the joint that turns it; none of a prismatic joint."""
+    """Return harmonics on elements, each in the angle of its revolute joint; none for prismatic joints."""
     revolute = [(name, j) for name, j in places if chain.joints[j].kind == "revolute"]
     orders = range(1, max_order + 1)
     return [Term(name, basis, j, order) for name, j in revolute for order in orders for basis in ("cos", "sin")]
@@ -91,7 +91,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class ModelStep:
-    """One model tried.
+    """One step of the ladder: a model that was tried.
 
     Attributes:
         model: its name, e.g. ``geometry`` or ``+ harmonics``.
@@ -117,7 +117,7 @@ class ModelStep:
 
 @dataclass(frozen=True, eq=False)
 class ModelSelection:
-    """Where the ladder ended.
+    """Result of the model selection.
 
     Attributes:
         fit: the chosen model, fitted to all rows.
@@ -144,11 +144,11 @@ class ModelSelection:
 
     @property
     def cross_validated(self) -> float:
-        """The error of the chosen model on held-out rows [m]: that of the last rung kept."""
+        """The error of the chosen model on held-out rows [m]: that of the last step kept."""
         return ([rung.cross_validated for rung in self.rungs if rung.kept] or [np.inf])[-1]
 
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
-        """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
+        """Return the best fit without corrections (for a URDF), those of the given robot removed, too."""
         if not self.rigid.cell.known.terms:
             return self.rigid
         bare = polish_frames(replace(self.nominal.cell, known=Deflection()), measured, settings).cell
@@ -171,7 +171,7 @@ def select_model(
     folds: Folds | None = None,
     progress: Progress | None = None,
 ) -> ModelSelection:
-    """Fit the model the data support, or the one asked for by name.
+    """Return the model that the data support, or the one chosen by name, fitted to all rows.
 
     Args:
         cell: nominal arm, frames placed (`calib.geometry.first_guess.install`).
@@ -205,7 +205,7 @@ def select_model(
 
 @dataclass
 class _Climber:
-    """The state of one climb: what is kept so far and the rungs tried; for its fields see `select_model`."""
+    """State of one model selection: the best model so far and the steps tried; see `select_model` for its fields."""
 
     cell: Installation
     measured: Sequence[PoseMeasurements]
@@ -232,7 +232,7 @@ class _Climber:
                 self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
 
     def rigid(self, model: str) -> None:
-        """Try frames, joint offsets and the full geometry."""
+        """Try the rigid models: frames, joint offsets and full geometry."""
         cell, table = self.nominal.cell, layout(self.nominal.cell)
         choices = {
             "frames": table.frame_index,
@@ -262,7 +262,7 @@ class _Climber:
         self.stiff, self.error = self.best, error
 
     def effects(self, model: str) -> None:
-        """Try the effects one by one on top of the geometry; by name, take all up to it.
+        """Try the effects one by one on the geometry; given an effect's name, use all up to it.
 
         The geometry need not pay alone: gear errors may hide what it brings. Then both together have to. Effects whose
         fit does not come to an end, though nobody asked for them, are left out again.
@@ -292,7 +292,7 @@ class _Climber:
         found = self._final(self.full, statistics, every, where)
         status = found.solution.status
         if model == "auto" and not status.good and self.best.solution.status.good:
-            note = f"did not converge ({status.name.lower()}): left out"
+            note = f"did not converge ({status.name.lower()}): not used"
             self.rungs = [*rigid, *(replace(rung, kept=False, note=note) for rung in self.rungs[len(rigid) :])]
             return
         self.best, self.chosen, self.offered = found, " + ".join(["geometry", *kept]), tuple(every[k] for k in where)
@@ -301,7 +301,7 @@ class _Climber:
         self.rungs[last] = replace(self.rungs[last], parameters=len(found.free), corrections=corrections)
 
     def _greedy(self, statistics: FoldStatistics, place: dict[str, np.ndarray]) -> list[str]:
-        """Return the effects that pay on unseen rows, in the order they were taken up: each time the best one.
+        """Return the effects that reduce the error on unseen rows, best first (greedy selection).
 
         Args:
             place: where the terms of each effect stand among those of the statistics.
@@ -317,7 +317,7 @@ class _Climber:
                 tried[name] = statistics.error(where[name])
             best = min(waiting, key=lambda name: tried[name].rms)
             pays = tried[best].rms < error.rms * (1.0 - MIN_GAIN) and tried[best].wins(error)
-            note = "" if pays else "no better on unseen rows: left out"
+            note = "" if pays else "no better on unseen rows: not used"
             self.rungs += [
                 _rung(statistics, name, where[name], tried[name].rms, note) for name in ([best] if pays else waiting)
             ]
@@ -328,14 +328,14 @@ class _Climber:
         return kept
 
     def _both(self, kept: list[str], climbed: int) -> list[str]:
-        """Return `kept` where geometry and effects together pay more than what is chosen; else nothing is kept.
+        """Return `kept` if geometry and effects together beat the chosen model on unseen rows; else an empty list.
 
         Args:
             kept: effects that pay on the geometry.
             climbed: rungs tried before them, the geometry last.
         """
         pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - MIN_GAIN)
-        note = "pays together with what follows" if pays else "no better on unseen rows than without the geometry"
+        note = "better together with the next effects" if pays else "no better on unseen rows than without the geometry"
         for k in range(climbed - 1, climbed if pays else len(self.rungs)):
             self.rungs[k] = replace(self.rungs[k], kept=pays, note=note)
         return kept if pays else []
@@ -343,7 +343,7 @@ class _Climber:
     def _final(
         self, rigid: GeometricFit, statistics: FoldStatistics, terms: tuple[Term, ...], where: np.ndarray
     ) -> GeometricFit:
-        """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""
+        """Fit geometry and effects to all rows, each term with its most probable ridge; drop terms without effect."""
         ridge, reference = statistics.ridges(where), self.nominal.cell.chain
         picked = tuple(terms[k] for k in where[ridge > 0.0])
         cell = replace(rigid.cell, deflection=Deflection(picked, np.zeros(len(picked)), reference))
@@ -356,7 +356,7 @@ class _Climber:
         return replace(found, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
     def _terms(self, effect: str, poses_per_order: int = 8) -> list[Term]:
-        """Return an effect's terms, harmonics only up to what so many poses can identify.
+        """Return an effect's terms, harmonics up to the order that the number of poses can identify.
 
         `poses_per_order`: harmonics of order k are offered to sets of at least 8 k poses (our choice).
         """
@@ -382,6 +382,6 @@ class _Climber:
 
 
 def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:
-    """Return the step of an effect, with those before it, that leaves `rms` [m] on unseen rows; kept without a note."""
+    """Return the ladder step of an effect with error `rms` [m] on unseen rows; it is kept if `note` is empty."""
     shrunk = statistics.alive(where)
     return ModelStep(f"+ {effect}", statistics.rigid + shrunk, 1e3 * rms, not note, note, shrunk)

@@ -1,1 +1,1 @@
-"""How sure a fitted arm is: the spread its parameters leave, and the errors to expect of it anywhere."""
+"""Uncertainty of a fitted arm: covariance of its parameters, and expected errors at any pose."""

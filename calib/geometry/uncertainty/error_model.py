@@ -1,4 +1,4 @@
-"""How far off a fitted arm may be at any pose: what its parameters leave open, and what the model itself leaves.
+"""Expected position error of a fitted arm at any pose: from its parameters' covariance and from the model's errors.
 
     E |e(q)|² = κ trace J Σ Jᵀ + s(q) v_0 + v_1 d(q)² + v_2 g(q)²
 
@@ -38,7 +38,7 @@ END_SHARE = 0.2  # share of the poses at each end of a joint's range that is lef
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What makes an error at a pose likely, estimated on held-out rows.
+    """Parameters of the error model, estimated on held-out rows.
 
     Attributes:
         parameters: κ, by which the parameters' covariance counts.
@@ -72,7 +72,7 @@ class Discrepancy:
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """Predicts the size of the tool position error of a fitted installation.
+    """Prediction of the magnitude of the tool position error of a fitted installation.
 
     Attributes:
         cell: the installation.
@@ -104,7 +104,7 @@ class ErrorModel:
     def sigma_on(
         self, cell: Installation, block: Positions, torque: np.ndarray | None = None, placed_anew: bool = False
     ) -> np.ndarray:
-        """Return that sigma on measured rows (m,) [m].
+        """Return `position_sigma` on measured rows (m,) [m].
 
         Args:
             cell: the installation that predicts them: that of the fit, or one placed anew.
@@ -130,7 +130,7 @@ class ErrorModel:
         return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q, self.discrepancy.placed)
 
     def _sigma(self, own: np.ndarray, q: np.ndarray, radii: tuple[float, float] | None = None) -> np.ndarray:
-        """Return that sigma (m,) [m], where the parameters' share is known: trace J Σ Jᵀ (m,) [m²]."""
+        """Return `position_sigma` (m,) [m] from the parameters' part trace J Σ Jᵀ (m,) [m²]."""
         found, parts = self.discrepancy, _distances(q, self.learnt, np.array(self.discrepancy.levers))
         rest = unevenness(found.profile, q) * found.floor + found.far * parts[0] + found.beyond * parts[1]
         radius = np.interp(parts[0] + parts[1], found.reach, radii or found.radii)
@@ -138,7 +138,7 @@ class ErrorModel:
         return np.sqrt(found.parameters * own + rest) * radius / found.radius
 
     def _wider(self, q: np.ndarray) -> np.ndarray:
-        """Return how many times as wide intervals (m,) are outside ranges: fully from half the width of an end on."""
+        """Return the widening factors (m,) of intervals outside the ranges: in full beyond half the width of an end."""
         result = np.ones(len(q))
         for j, most in enumerate(self.discrepancy.wider):
             low, first, last, high = np.quantile(self.learnt[:, j], [0.0, END_SHARE, 1.0 - END_SHARE, 1.0])
@@ -149,12 +149,12 @@ class ErrorModel:
 
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
-    """Return which joints (m, n) of poses q (m, n) stand outside the range of the fit's (k, n) [rad or m]."""
+    """Return which joint values of q (m, n) are outside the range of the fitted poses (k, n), as a mask (m, n)."""
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
 def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
-    """Return R (p, p) with R Rᵀ the inverse of a precision of unit diagonal; of rows that are copies, too."""
+    """Return R (p, p) with R Rᵀ the inverse of a precision matrix of unit diagonal, also of a nearly singular one."""
     try:
         factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
     except np.linalg.LinAlgError:  # by rounding; Cholesky is five times as fast
@@ -164,7 +164,7 @@ def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
+    """Return squared distances (m,) [m²] of poses to the nearest fitted pose, and to the fitted values joint by joint.
 
     The latter is, joint by joint, the way to where `near_share` of the learnt poses are within reach: a few of them far
     off the others do not say how a joint is there.
@@ -183,7 +183,7 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
 
 
 def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return by how much the tip moves with each joint (n,) [m/rad or 1], rms over poses, by central differences."""
+    """Return each joint's lever at the tip (n,) [m/rad or 1], rms over poses, by central differences."""
     rows = q[np.unique(np.linspace(0, len(q) - 1, 50).astype(int))]
     result, step = np.zeros(chain.n), 1e-4
     for j in range(chain.n):
@@ -200,10 +200,10 @@ def learn_errors(
     torques: Sequence[np.ndarray | None] | None = None,
     seed: int = 0,
 ) -> ErrorModel | None:
-    """Learn what errors to expect from those on held-out rows; None without positions, or with too few.
+    """Return the error model estimated from errors on held-out rows; None for too few or no positions.
 
-    For every fold the geometry and the ridges of all effects that were taken up are found anew: ridges of all rows know
-    what was left out. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.
+    For every fold the geometry and the ridges of all chosen effects are estimated anew: ridges from all rows would
+    depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.
 
     Args:
         selected: the model and its fit of all rows.
@@ -236,7 +236,7 @@ def learn_errors(
 
 
 def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]]:
-    """Return joints, and folds that leave out both ends of their ranges, the middle staying in."""
+    """Return pairs of a joint and the folds that hold out the two ends of its range."""
     q = np.concatenate([block.q for block in measured])
     edges, result = np.cumsum([len(block) for block in measured])[:-1], []
     for j in range(q.shape[1]):
@@ -249,7 +249,7 @@ def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]
 
 
 class _Rows:
-    """The rows of a fit, linearised about its geometry without effects: all folds are judged by them."""
+    """Rows of a fit, linearised about its geometry without effects, for the evaluation of folds."""
 
     def __init__(
         self,
@@ -312,7 +312,7 @@ class _Rows:
         return sum(each[1:], each[0])
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield per fold of its rows (rows, 5): |e|², trace J Σ Jᵀ, squared distances from the rest, pose's number."""
+        """Yield each fold's rows (rows, 5): |e|², trace J Σ Jᵀ, two squared distances to other rows, pose number."""
         free, sizes, space = np.arange(len(self.prior)), self.coordinates.sizes, self.coordinates
         for fold in range(folds.count):
             inside = [np.flatnonzero(members[rows] == fold) for members, rows in zip(folds.members, self.chosen)]

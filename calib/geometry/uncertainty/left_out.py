@@ -1,4 +1,4 @@
-"""Errors on held-out rows as a prediction of future errors: what they grow with, and what holds 95 % of them.
+"""Prediction of future errors from those on held-out rows: growth of their variance, and 95 % intervals.
 
 A quantile is taken at the level (n + 1) / n · 95 % of n poses (conformal prediction; Vovk, Gammerman & Shafer 2005). As
 those rows have also chosen the variances, an interval is as much wider as it has to be to hold 95 % of a fold whose
@@ -40,12 +40,12 @@ Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]  # per joint: 
 
 
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
-    """Return s (m,) at poses q (m, n) [rad or m]; 1 where the profile is empty."""
+    """Return the factor s (m,) of the expected error at poses q (m, n) [rad or m]; 1 for an empty profile."""
     return np.exp(sum((np.interp(q[:, j], *each) for j, each in enumerate(profile)), np.zeros(len(q))))
 
 
 class Unevenness:
-    """What squared errors say of s.
+    """Estimate of the factor s from squared errors.
 
     Args:
         q: (m, n) poses [rad or m].
@@ -71,7 +71,7 @@ class Unevenness:
         self.data = gram(self.logs, self.columns)
 
     def profile(self, left_out: np.ndarray | None = None) -> Profile:
-        """Return log s by joint from all poses, or from all but some (m,) [bool]."""
+        """Return log s by joint from all poses, or without those of a mask (m,)."""
         data = self.data if left_out is None else self.data - gram(self.logs[left_out], self.columns[left_out])
         values = dict(zip(self.moving.tolist(), self._values(data)))
         return tuple(
@@ -103,7 +103,7 @@ MIN_ROWS = 5  # rows of a kind that the poses outside a fold must have to tell a
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Errors on held-out rows.
+    """Errors on held-out rows, as samples for the error model.
 
     Attributes:
         squares: (m,) |e|² [m²].
@@ -125,7 +125,7 @@ class LeftOut:
 
     @classmethod
     def of(cls, near: Sequence[np.ndarray], far: Sequence[np.ndarray], joints: Sequence[int]) -> LeftOut:
-        """Return them from arrays (rows, 5) by fold: |e|², trace J Σ Jᵀ, the two distances², number of the pose.
+        """Return the errors from arrays (rows, 5) by fold: |e|², trace J Σ Jᵀ, two squared distances, pose number.
 
         Args:
             joints: of which joint an end was left out, for each of `far`; -1 for none.
@@ -137,12 +137,12 @@ class LeftOut:
         return cls(rows[:, 0], shapes, away, rows[:, 4].astype(int), number, number < len(near), joint)
 
     def without(self, poses: np.ndarray) -> LeftOut:
-        """Return the rows of other poses."""
+        """Return the rows without those of the given poses."""
         rows = ~np.isin(self.pose, poses)
         return LeftOut(*(each[rows] for each in vars(self).values()))
 
     def scaled(self, q: np.ndarray) -> tuple[LeftOut, Profile]:
-        """Return them with the shapes of an uneven arm, every fold's by the s of the other poses, and s of all.
+        """Return the errors with shapes scaled by s, for each fold by that of the other poses; and the s of all poses.
 
         Args:
             q: (poses, n) [rad or m].
@@ -159,7 +159,7 @@ class LeftOut:
         return replace(self, shapes=shapes), found.profile()
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
-        """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the radii: sigmas that hold near, far errors."""
+        """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the 95 % radii of near and far errors."""
         fold_rounds = 100  # rounds of the search for variances without a fold's poses
         near, rounds = self.near, fold_rounds
         if not start:
@@ -171,14 +171,14 @@ class LeftOut:
         return weights.tolist(), self.quantiles(sizes)
 
     def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
-        """Return what holds 95 % of errors that are yet to come, by sizes (m,), near and far (conformal)."""
+        """Return the bounds of 95 % of future errors from magnitudes (m,), for near and far errors (conformal)."""
         poses = len(np.unique(self.pose))
         level = min(1.0, COVERED * (poses + 1) / poses)
         first, second = (float(np.quantile(sizes[of], level)) for of in (self.near, ~self.near))
         return first, second
 
     def surprise(self, weights: Sequence[float], reach: tuple[float, float]) -> tuple[float, float]:
-        """Return how much wider intervals learnt without a fold's poses have to be to hold 95 % there, near and far."""
+        """Return the factors (near, far) by which intervals without a fold's data must widen to contain 95 % of it."""
         ratio = np.ones(len(self.squares))
         for fold in np.unique(self.fold):
             rows = self.fold == fold
@@ -193,7 +193,7 @@ class LeftOut:
     def wider(
         self, weights: Sequence[float], radii: tuple[float, float], reach: tuple[float, float], q: np.ndarray
     ) -> tuple[tuple[float, float], ...]:
-        """Return how many times as wide an interval is beyond the lower and the upper end of each joint's range.
+        """Return the factors by which intervals widen beyond the lower and the upper end of each joint's range.
 
         Args:
             weights, radii, reach: of the interval, as in `calib.geometry.uncertainty.error_model.Discrepancy`.

@@ -178,7 +178,7 @@ def test_one_row_per_socket_or_bar_tells_nothing(cell, calib, columns):
     rows = ["0.1,0.2,0.3,0.4,0.5,0.6,a,0.5", "0.2,0.2,0.3,0.4,0.5,0.6,b,0.5"]
     Path("m.csv").write_text("\n".join([f"q1,q2,q3,q4,q5,q6,{columns}", *rows, ""]))
     code, _, err = calib("fit", "ur5", "m.csv", "--out", "o")
-    assert code == 3 and "determine nothing of the robot" in err
+    assert code == 3 and "determine no parameter of the robot" in err
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_to
     assert len(columns) == 3 and inputs.read_file(path, CELL.nominal, FitOptions())
     table[:, columns] *= 1e-3
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in table)]) + "\n")
-    with pytest.raises(MeasurementError, match=r"validation.csv: .*are they m under a header that says mm"):
+    with pytest.raises(MeasurementError, match=r"validation.csv: .*are they m, although the header states mm"):
         check_file(measured, chain_of(measured), path, None)
 
 
