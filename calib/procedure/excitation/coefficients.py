@@ -33,7 +33,7 @@ from trajectories.fourier import evaluate
 
 NAME = "trajectory.toml"
 SAMPLES, RUN, PLANNED = "trajectory.csv", "run.csv", "motion.csv"
-"""One period at the controller's rate, all that is played where that is more, and a planned motion."""
+"""Files of setpoints: one period at the controller's rate, the whole run if it is longer, and a planned motion."""
 
 
 Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
@@ -41,7 +41,7 @@ Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
 @dataclass(frozen=True)
 class _JointTable:
-    """[[joint]], see the module."""
+    """Entry ``[[joint]]`` of ``trajectory.toml``: a joint's coefficients, see the module."""
 
     name: Name
     q0: Annotated[float, Real()] | None = None
@@ -52,7 +52,7 @@ class _JointTable:
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """The file; keys that are none of these are left to who wrote them."""
+    """The content of ``trajectory.toml``; other keys are ignored."""
 
     family: Annotated[str, OneOf(("fourier", "bspline"))]
     period: Positive
@@ -64,7 +64,7 @@ class TrajectoryFile:
 
 @dataclass(frozen=True, eq=False)
 class Periodic:
-    """A periodic motion by its coefficients: eq. 23 of Kolyubin et al. 2019, or control points.
+    """A periodic motion, defined by its coefficients: eq. 23 of Kolyubin et al. 2019, or control points.
 
     Attributes:
         joint_names: n names.
@@ -81,7 +81,7 @@ class Periodic:
     degree: int = 5
 
     def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, v, a (N, n) at times [s]."""
+        """Return positions, velocities and accelerations q, v, a (N, n) at times [s]."""
         if self.kind == "fourier":
             q, v, a = (evaluate(self.coefficients, self.period, times, order) for order in range(3))
             return q, v, a
@@ -92,7 +92,7 @@ class Periodic:
 
 
 def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]:
-    """Return the content of ``trajectory.toml`` of a robot's motion; `limits` say what it keeps."""
+    """Return the content of ``trajectory.toml`` for a motion; `limits` are lines on the limits it respects."""
     fourier = motion.kind == "fourier"
     head: dict[str, Any] = {
         "robot": robot, "family": motion.kind, "period": motion.period, "rate": motion.rate, "repeat": motion.repeat,
@@ -108,13 +108,13 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
 
 
 def read(folder: Path) -> Periodic:
-    """Read the motion of an excitation's folder.
+    """Read the motion from the folder of `calib excite`.
 
     Raises:
-        UsageError: where there is none, or it is damaged.
+        UsageError: if the file is missing or damaged.
     """
     path = folder / NAME
-    require(path.is_file(), f"{folder} holds no {NAME}: give the folder that calib excite wrote", UsageError)
+    require(path.is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
     table = parse(TrajectoryFile, read_toml(path), str(path))
     coefficients = []
     for number, joint in enumerate(table.joint, 1):
@@ -124,7 +124,7 @@ def read(folder: Path) -> Periodic:
         if len(own) < len(stated):
             raise UsageError(f"{place}: family {table.family} needs {'points' if len(stated) == 1 else 'q0, a and b'}")
         if len(own) == 3 and not len(own[1]) == len(own[2]) == len(table.joint[0].a or ()):
-            raise UsageError(f"{place}: a and b have to be as many as joint 1's a, {len(table.joint[0].a or ())}")
+            raise UsageError(f"{place}: a and b need {len(table.joint[0].a or ())} values each, as many as joint 1's a")
         coefficients.append(np.concatenate([np.array(part, dtype=float) for part in own]))
     found = Periodic(
         tuple(joint.name for joint in table.joint), table.period, table.rate, table.repeat, table.family,

@@ -49,14 +49,14 @@ SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
 
 @dataclass(frozen=True, eq=False)
 class NamedGoal:
-    """A goal under the name it was given."""
+    """A goal of the search and the name under which it was given."""
 
     name: str
     goal: AttainmentGoal
 
 
 def objectives_of(settings: ExcitationSettings, condition: Excitation) -> tuple[tuple[Objective, float], ...]:
-    """Return what is minimised: the aim of the settings, or both condition numbers in equal parts.
+    """Return the objectives and their weights: the aim of the settings, or both condition numbers with equal weights.
 
     Args:
         condition: see `read_goals`.
@@ -69,7 +69,7 @@ def objectives_of(settings: ExcitationSettings, condition: Excitation) -> tuple[
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
     others = [text for text in (*settings.goals, *settings.hard) if text.partition("=")[0] in (*SCALINGS, *AIMS)]
     if len(others) > 1:
-        raise UsageError(f"goals {', '.join(others)}: '{aims[0]}' takes the place of the others; leave them out")
+        raise UsageError(f"goals {', '.join(others)}: '{aims[0]}' replaces the others; leave them out")
     return ((replace(condition, index=aims[0]), 1.0),)
 
 
@@ -80,7 +80,7 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
         condition: what a condition number is of: columns, rows, what is known already.
 
     Raises:
-        UsageError: for a goal that is none, or that nothing is known to reckon it with.
+        UsageError: for an unknown goal, or one that the given data do not suffice to compute.
     """
     result = []
     for weight, texts in ((None, settings.goals), (0.0, settings.hard)):
@@ -96,10 +96,10 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
 def _objective(
     name: str, value: float, given: ExcitationInputs, condition: Excitation, shortest: float | None
 ) -> tuple[Objective, float]:
-    """Return the objective of a name, and the goal to minimise it to."""
+    """Return the objective of a goal's name, and the value that it has to reach."""
     text, chain = f"{name}={value:g}", given.chain
     if name in SCALINGS:
-        require(value > 1, f"goal '{text}': a condition number is above 1", UsageError)
+        require(value > 1, f"goal '{text}': expected a condition number above 1", UsageError)
         return replace(condition, scaling=name), value
     if name == "duration":
         if shortest is None or not value > 0:
@@ -112,31 +112,31 @@ def _objective(
         return FrictionCoverage(0.1 * speeds, 0.5 * speeds, value), 0.01
     numbered = {f"joint{j + 1}": (j,) for j in range(chain.n)} | {"wrist": wrist(chain.n)}
     if name not in numbered:
-        raise UsageError(f"goal '{text}': '{name}' is none of raw, normalised, duration, coverage, wrist, joint1 …")
-    require(0 < value < 1, f"goal '{text}': the mean torque is a share of its limit, above 0 and below 1", UsageError)
+        raise UsageError(f"goal '{text}': unknown; use raw, normalised, duration, coverage, wrist, joint1 …")
+    require(0 < value < 1, f"goal '{text}': expected a share of the torque limit, above 0 and below 1", UsageError)
     return torque_slack(numbered[name], given, f"goal '{text}'"), 1.0 - value
 
 
 def wrist(n: int) -> tuple[int, ...]:
-    """Return the last two of n joints."""
+    """Return the indices of the last two of n joints."""
     return tuple(range(max(0, n - 2), n))
 
 
 def torque_slack(joints: tuple[int, ...], given: ExcitationInputs, where: str) -> TorqueSlack:
-    """Return the objective that the mean torque of some joints leaves little of their limits.
+    """Return the objective that maximises the mean torque of some joints relative to their limits.
 
     Raises:
         UsageError: where torques cannot be predicted, or have no limit.
     """
     values, limits = given.model.values, given.limits.torque
     if values is None or not np.isfinite(limits[list(joints)]).all():
-        raise UsageError(f"{where}: needs torque limits and a model or masses to predict torques with")
+        raise UsageError(f"{where}: needs torque limits, and a model or masses to predict torques")
     return TorqueSlack(joints, values, limits)
 
 
 @dataclass(frozen=True)
 class DesignCondition:
-    """Condition number of the observation matrix, in its units and with columns of unit norm.
+    """Condition numbers of the observation matrix: raw (SI units), and normalised (columns of unit norm).
 
     Where motions before count, too: of this motion alone, and of those before it.
     """
@@ -155,7 +155,7 @@ class DesignCondition:
 
 @dataclass(frozen=True)
 class _DesignSetting:
-    """What was asked for: period [s], the columns to identify, and how many instants were verified."""
+    """Settings of a design: period [s], columns to identify, and number of verified instants."""
 
     period: float
     columns: tuple[str, ...]
@@ -171,7 +171,7 @@ class _LimitMargin:
 
 @dataclass(frozen=True)
 class DesignMetrics:
-    """The content of ``metrics.json``: condition number, what was asked for, the smallest margin of each limit."""
+    """The content of ``metrics.json``: condition number, settings, and the smallest margin of each limit."""
 
     condition_number: DesignCondition
     setting: _DesignSetting
@@ -186,10 +186,10 @@ Search = Callable[..., SearchResult]
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """An exciting motion with its proof.
+    """A designed motion and the verification of its limits.
 
     Attributes:
-        inputs, settings: what it was designed for.
+        inputs, settings: of the design.
         problem: that was solved last, with the family of motions.
         found: the motion; `proof`: its margins, checked independently.
         condition: raw and normalised, of `INSTANTS` samples over the period with the model's own Coulomb sign.
@@ -225,7 +225,7 @@ class Designed:
 
     @property
     def locked(self) -> dict[str, float]:
-        """Where the joints rest that were locked, by name [rad or m]."""
+        """Positions of the locked joints, by joint name [rad or m]."""
         last = self.playback.run.q[-1]
         return {self.inputs.chain.joint_names[j]: float(last[j]) for j in self.inputs.locked}
 
@@ -268,7 +268,7 @@ def excite(
 def search_motion(
     given: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
 ) -> Designed:
-    """Search for a motion of what was read: an arm, or the platform's coordinates of a parallel robot."""
+    """Search for an exciting motion of an arm, or of the platform's coordinates of a parallel robot."""
     say = progress or (lambda words: None)
     check_playback(settings, given)
     problem, checked, notes = _excitation_problem(given, settings)
@@ -290,7 +290,7 @@ def search_motion(
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
     outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
-        say("what other periods would identify")
+        say("predicting sigmas of other periods")
         outlook, predicted = foretell(given, settings, problem, found, partial(_problem_of_period, given, settings))
     pairs = zip(problem.goals, found.values)
     reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
@@ -304,14 +304,14 @@ def search_motion(
 
 
 def _problem_of_period(given: ExcitationInputs, settings: ExcitationSettings, period: float) -> ExcitationProblem:
-    """Return the problem of another period [s], which is kept."""
+    """Return the problem with another, fixed period [s]."""
     return _excitation_problem(given, replace(settings, period=period, shortest=None))[0]
 
 
 def _excitation_problem(
     given: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the problem of both condition numbers within the limits, the constraints to verify, and notes."""
+    """Return the optimisation problem (condition numbers, limits), the constraints to verify, and notes."""
     search, checked, notes = _constraints(given.model, given.limits)
     condition, smooth = _condition_objective(given, settings), given.model.smooth
     objectives = objectives_of(settings, condition)
@@ -324,7 +324,7 @@ def _excitation_problem(
 
 
 def _stretch(settings: ExcitationSettings) -> tuple[float, float]:
-    """Return the factors on the period that the search may take."""
+    """Return the smallest and the largest factor by which the search may scale the period."""
     if settings.shortest is None:
         return 1.0, 1.0
     if settings.shortest > settings.period:
@@ -333,7 +333,7 @@ def _stretch(settings: ExcitationSettings) -> tuple[float, float]:
 
 
 def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tuple[SearchResult, ExcitationProblem]:
-    """Return a motion whose period is a whole number of a controller's samples, and the problem of that period."""
+    """Return the motion, its period rounded to whole controller samples, and the problem with that period."""
     if not problem.free_period:
         return found, problem
     whole = problem.family.period * rate
@@ -342,7 +342,7 @@ def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tupl
 
 
 def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
-    """Return the condition number of the identifiable columns, earlier motions included."""
+    """Return the objective: condition number of the identifiable columns, including earlier motions."""
     known = None if given.prior is None else given.prior.per_sample(settings.samples, settings.repeat * settings.period)
     return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.columns)
 
@@ -350,7 +350,7 @@ def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) 
 def _searched(
     problem: ExcitationProblem, named_goals: list[NamedGoal], starts: int, search: Search, say: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Search without goals, or for the goals: with a first run that proposes some for the condition numbers."""
+    """Search for a motion; with goals, a first run proposes those of the condition numbers."""
     if not named_goals:
         return search(problem, starts=starts), problem
     goals = tuple(one.goal for one in named_goals)
@@ -372,7 +372,7 @@ def _searched(
 
 
 def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
-    """Return the condition numbers of `INSTANTS` samples over the period, Coulomb friction not smoothed.
+    """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
     """
@@ -392,7 +392,7 @@ def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, 
 
 
 def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
-    """Return the family of motions, and the one of few harmonics that its search begins with."""
+    """Return the family of motions, and one of fewer harmonics for the first stage of the search."""
     fixed = {j: value for j, value in given.locked.items() if value is not None}
     resonance, most = given.limits.resonance, settings.harmonics
     if most is None:
@@ -410,13 +410,13 @@ def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fami
         return full, few if most > COARSE else None
     if settings.family == "bspline":
         return bspline_family(counts.tolist(), settings.period, held=fixed, rate=settings.rate), None
-    raise UsageError(f"family '{settings.family}' is none of fourier, bspline")
+    raise UsageError(f"family '{settings.family}' is unknown; use fourier or bspline")
 
 
 def _constraints(
     dynamics: ExcitedModel, limits: MotionLimits
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return what the search keeps, and what is verified: the torque with the model's own Coulomb sign."""
+    """Return the constraints of the search, and those to verify (torque with the model's own Coulomb sign)."""
     if dynamics.values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()
@@ -441,7 +441,7 @@ def _front(
     count: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
-    """Sweep the first torque goal (default: the wrist) between what this motion has and what it can reach alone."""
+    """Return trade-offs: the first torque goal (default: wrist) is varied from its present to its best value."""
     goals = (one.goal.objective for one in named_goals)
     slack = next((one for one in goals if isinstance(one, TorqueSlack)), None)
     slack = slack or torque_slack(wrist(given.chain.n), given, "front")

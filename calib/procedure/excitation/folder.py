@@ -29,7 +29,7 @@ from trajectories.timing.time_scaling import ACTIVE
 
 DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
-"""Files by which an earlier run's folder is known."""
+"""Files that identify the folder of an earlier run."""
 REHEARSAL = "rehearsal.csv"
 FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
 ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, prediction.NAME, "front.csv", "approach.csv", REHEARSAL, *FIGURES)
@@ -39,12 +39,12 @@ MESSAGES = 100.0  # points per second of the ROS message, whose controllers inte
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for a designed motion, or that holds one of its inputs."""
+    """Raise an error, before any work, if a folder cannot take a designed motion or contains one of its inputs."""
     check_target(out, ALL, DESIGN, "excitation", inputs)
 
 
 def check_plan_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for a planned motion, or that holds one of its inputs."""
+    """Raise an error, before any work, if a folder cannot take a planned motion or contains one of its inputs."""
     check_target(out, ALL, PLAN, "plan", inputs)
 
 
@@ -100,7 +100,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
 
 def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:
-    """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller, below what limits the motion."""
+    """Write t, q, v, a and, if known, tau in SI units, a row per controller sample, below the limits as comments."""
     bounds.check(track)
     parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
     header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
@@ -108,14 +108,14 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
 
 
 def _write_besides(played: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
-    """Write approach and rehearsal, where asked for."""
+    """Write the setpoints of approach and rehearsal, if requested."""
     for name, track in (("approach.csv", played.approach), (REHEARSAL, played.rehearsal)):
         if track is not None:
             _write_setpoints(track, bounds, folder / name)
 
 
 def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every: int = 1) -> None:
-    """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), one sample of `every`."""
+    """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), every `every`-th sample."""
     bounds.check(track)
     message = joint_trajectory(track, [joint.name for joint in bounds.joints], every)
     files.write(folder / "trajectory.json", to_json(message))  # which has no place for remarks
@@ -123,7 +123,7 @@ def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, every:
 
 
 def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
-    """Return one period at `rate` [Hz], by default the controller's, both ends included; without torques."""
+    """Return the setpoints of one period at `rate` [Hz] (default: the controller's), both ends included, no torques."""
     count = max(round(designed.period * (rate or designed.settings.rate)), 1)
     times = np.arange(count + 1) * (designed.period / count)
     motion = dense_motion(designed.family, designed.found.x, times, designed.found.factor)
@@ -166,7 +166,7 @@ def design_lines(designed: Designed) -> list[str]:
     columns, prior = len(designed.inputs.columns.names), designed.inputs.prior
     together = [] if prior is None else [
         f"together with {', '.join(prior.names)} ({prior.seconds:.1f} s), which alone has "
-        f"{cond.raw_before:.4g} raw, {cond.normalised_before:.4g} normalised; this motion alone "
+        f"{cond.raw_before:.4g} raw, {cond.normalised_before:.4g} normalised; this motion alone has "
         f"{cond.raw_alone:.4g} and {cond.normalised_alone:.4g}"
     ]  # fmt: skip
     result = [
@@ -176,7 +176,7 @@ def design_lines(designed: Designed) -> list[str]:
         *together,
         *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
         f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
-        f"every limit is kept, at {designed.proof.instants} instants and between them; smallest margins:",
+        f"all limits are respected, at {designed.proof.instants} instants and between them; smallest margins:",
     ]
     for name, one in designed.proof.worst.items():
         how = "bound" if one.proved else "estimate"
@@ -215,8 +215,8 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
 def plan_lines(planned: Planned) -> list[str]:
     """Return the lines that `calib plan` prints: duration, margins, limits, notes."""
     words = [
-        f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; some limit is within {ACTIVE:.0%} of being "
-        f"reached for {_active_share(planned):.1%} of the time, none is crossed at "
+        f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; closer than {ACTIVE:.0%} to a limit for "
+        f"{_active_share(planned):.1%} of the time; all limits are respected at "
         f"{_verified(planned)} instants",
         "smallest margins:",
     ]
@@ -224,17 +224,17 @@ def plan_lines(planned: Planned) -> list[str]:
         words.append(f"  {name:12} {one.margin:.4g} {one.unit} ({one.at})")
     if planned.sigma is not None:
         free = ", ".join(f"{x:.3g}" for x in planned.sigma)
-        words.append(f"limits of torque narrowed for the model's uncertainty, one sigma of each joint: {free} N m")
+        words.append(f"torque limits are reduced for the model's uncertainty; one sigma of each joint: {free} N m")
     if planned.shaped is not None:
         words.append(f"path shape optimised: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
     if planned.deviation is not None:
-        words.append(f"the tool stays on its straight lines to {1e6 * planned.deviation[0]:.2g} µm")
+        words.append(f"largest deviation of the tool from its straight lines: {1e6 * planned.deviation[0]:.2g} µm")
     return [*words, *planned.bounds.lines(), *(f"note: {note}" for note in planned.notes)]
 
 
 @dataclass(frozen=True)
 class _PlanMargin:
-    """Margin to a limit: of the joint nearest to it, and of each joint as a share."""
+    """Margin to a limit: of the joint closest to it, and of each joint as a share of the limit."""
 
     margin: float
     unit: str
@@ -244,7 +244,7 @@ class _PlanMargin:
 
 
 def _active_share(planned: Planned) -> float:
-    """Return the share of the time for which a limit is all but reached."""
+    """Return the share of the time during which the motion is close to a limit."""
     seconds = [one.duration for one in planned.timings]
     return float(np.average([one.active_share for one in planned.timings], weights=seconds))
 
@@ -254,7 +254,7 @@ def _verified(planned: Planned) -> int:
 
 
 def _margins(planned: Planned) -> dict[str, _PlanMargin]:
-    """Return the smallest margin of every limit, by name."""
+    """Return the smallest margin to each limit, by name."""
     used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
     left = {name: 1.0 - shares.max(axis=0) for name, shares in used.items()}  # shares of the limits
     result = {}

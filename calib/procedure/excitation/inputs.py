@@ -31,7 +31,7 @@ SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures
 
 @dataclass(frozen=True, eq=False)
 class ExcitedModel:
-    """The dynamic model to excite, and its parameters as far as they are known, which predict torques.
+    """The dynamic model to excite, with known parameter values to predict torques.
 
     Attributes:
         smooth: base model with the Coulomb sign smoothed for the search; `exact` with the model's own smoothing.
@@ -67,7 +67,7 @@ class IdentifiableColumns:
 
 @dataclass(frozen=True, eq=False)
 class PriorMotions:
-    """Motions that were recorded, or designed, before.
+    """Information from earlier motions, recorded or designed.
 
     Attributes:
         names: of the files or folders.
@@ -80,17 +80,17 @@ class PriorMotions:
     information: np.ndarray
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
-        """Return the information in units of one of `count` samples that stand for `duration` seconds of new motion."""
+        """Return the information per sample, if `count` samples represent `duration` seconds of new motion."""
         return self.information * (count / duration)
 
 
 @dataclass(frozen=True, eq=False)
 class ExcitationInputs:
-    """The robot an excitation is designed for.
+    """Inputs of a design: robot, limits, model, locked joints, and earlier motions.
 
     Attributes:
         chain, limits, model: the arm, what it must keep, and the dynamics to excite.
-        locked: joints that rest, and where; None: where the search likes it.
+        locked: joint index -> its fixed value; None: the search chooses it.
         columns: that the motion can identify.
         prior: motions that count already; None without any.
     """
@@ -119,7 +119,7 @@ def read_inputs(
         limits: see `calib.procedure.excitation.limits`.
 
     Raises:
-        UsageError, MeasurementError: for a file that is none, or belongs to another robot.
+        UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
     """
     chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
@@ -142,7 +142,7 @@ def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimit
         own = [known[one.shape][one.acts[0][0]] if one.shape in known else 0.0 for one in terms]
         values = np.concatenate([standard_parameters(chain), own])
         if not known:
-            notes = ("friction is not known (no model, no [friction]): torques are predicted without it",)
+            notes = ("friction is unknown (no model, no [friction]): torques are predicted without it",)
     return _dynamics(IdentificationModel(bodies_of(chain), terms), values, bool(known), notes)
 
 
@@ -152,7 +152,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     table = read_table(folder)
     try:
         found = from_table(chain, table)
-        require(found.model.torque_rows.has_bodies, "rows 'drive' hold no information on the bodies", ValueError)
+        require(found.model.torque_rows.has_bodies, "rows 'drive' contain no information on the bodies", ValueError)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         theirs = description.read(folder / ROBOT)
         if theirs.n != chain.n:
@@ -177,7 +177,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     made = _dynamics(model, values, any(one.shape == "sign" for one, _ in kept))
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
-        notes.append(f"{folder}/covariance.csv does not fit the design's columns: the torque has no margin from it")
+        notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
 
 
@@ -194,7 +194,7 @@ def _dynamics(
 
 
 def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
-    """Return the covariance of the named columns; None where the file has others."""
+    """Return the covariance of the named columns; None if the file has other columns."""
     found = read_covariance(folder)
     if found is None or not set(names) <= set(found[0]):
         return None
@@ -203,10 +203,10 @@ def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
-    """Return the joints that rest: at the value said (``joint4=0.5``, rad or m), or where the search likes it (None).
+    """Return the locked joints: index -> stated value (``joint4=0.5``, rad or m), or None if the search chooses it.
 
     Raises:
-        UsageError: for a joint that is not there, a value beyond its limits, or when none is left to move.
+        UsageError: for an unknown joint, a value beyond its limits, or if all joints are locked.
     """
     known = {f"{word}{j + 1}": j for word in ("joint", "q") for j in range(chain.n)}
     known |= {name: j for j, name in enumerate(chain.joint_names)}
@@ -214,7 +214,7 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
     for text in [part.strip() for word in texts for part in word.split(",")]:
         name, _, amount = (part.strip() for part in text.partition("="))
         if name not in known:
-            raise UsageError(f"lock {text}: '{name}' is no joint; there are {', '.join(chain.joint_names)}")
+            raise UsageError(f"lock {text}: '{name}' is not a joint; joints: {', '.join(chain.joint_names)}")
         j = known[name]
         try:
             value = float(amount) if amount else None
@@ -226,14 +226,14 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
                 f"lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
             )
         found[j] = value
-    require(len(found) != chain.n, "lock: every joint is locked; nothing is left to move", UsageError)
+    require(len(found) != chain.n, "lock: all joints are locked; leave at least one free", UsageError)
     return found
 
 
 def identifiable(
     model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None
 ) -> IdentifiableColumns:
-    """Return which columns of a model a motion with these joints locked, and those before, can identify."""
+    """Return the columns that a motion with locked joints, together with earlier motions, can identify."""
     names = model.exact.names
     if not locked:
         return IdentifiableColumns(None, None, names)
@@ -243,20 +243,20 @@ def identifiable(
     still = ", ".join(chain.joint_names[j] for j in locked)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
-        f"held: {still}; torques of held joints are left out (stiction); {len(kept)} of {len(names)} "
-        f"columns are identifiable ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
+        f"locked: {still}; torques of locked joints are not used (stiction); {len(kept)} of {len(names)} "
+        f"columns are identifiable ({len(gone)} are regrouped or have no effect: {', '.join(gone[:12])}"
         f"{', ...' if len(gone) > 12 else ''})"
     )
     return IdentifiableColumns(kept, sigmas, tuple(names[k] for k in kept), (note,) if gone else ())
 
 
 def read_prior(paths: Sequence[str], model: ExcitedModel, chain: Chain) -> PriorMotions | None:
-    """Return the information of recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None without any.
+    """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
 
     Recordings are filtered and differentiated as `calib identify` does it.
 
     Raises:
-        UsageError, MeasurementError: for what is neither, or belongs to another robot.
+        UsageError, MeasurementError: for a path that is neither, or belongs to another robot.
     """
     if not paths:
         return None
@@ -270,7 +270,7 @@ def read_prior(paths: Sequence[str], model: ExcitedModel, chain: Chain) -> Prior
 
 
 def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return all periods of a designed motion, at 50 samples a second at least."""
+    """Return q, v, a of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz]."""
     found = coefficients.read(folder)
     if found.joint_names != tuple(chain.joint_names):
         raise UsageError(

@@ -61,7 +61,7 @@ PLACE = "in the limits file (--limits, or [dynamics] limits in session.toml)"
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """Largest moduli (n,) of a motion's speeds, accelerations and torques; infinite: none.
+    """Limits (n,) of a motion's speed, acceleration and torque magnitudes; infinite: not limited.
 
     Attributes:
         robot: its file or name, for messages; joints: n of them.
@@ -98,7 +98,7 @@ class MotionBounds:
             found = f" ({', '.join(wrong)} is no limit)" if wrong else ""
             other = "" if what == "speed" else "; efforts count where masses are known or a model is named (--model)"
             raise UsageError(
-                f"{self.robot}: nothing limits the {what} of {names}{found}, and no motion is written without; state "
+                f"{self.robot}: no limit for the {what} of {names}{found}; without it no motion is written; state "
                 f"it {self.place.format(advice)}{other}"
             )
 
@@ -107,7 +107,7 @@ class MotionBounds:
         return "all joints" if len(names) == len(self.joints) else ", ".join(names)
 
     def lines(self) -> list[str]:
-        """Return what limits the motion, a line per kind: for the heads of files."""
+        """Return the limits of the motion as text, a line per kind, for the heads of files."""
         result = []
         for order, (kind, most) in enumerate(
             (("velocity", MAX_SPEED), ("acceleration", MAX_ACCELERATION), ("torque", MAX_TORQUE)), 1
@@ -121,7 +121,7 @@ class MotionBounds:
         return result
 
     def check(self, track: Setpoints) -> None:
-        """Refuse a track that is beyond its limits of speed and acceleration, or beyond what any joint can do.
+        """Raise an error if a track exceeds its limits of speed or acceleration, or those of any real joint.
 
         Light links and high torque limits allow accelerations that no robot has.
 
@@ -136,8 +136,8 @@ class MotionBounds:
             j = int(np.argmax(peak / limit))
             if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
                 raise UsageError(
-                    f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, beyond "
-                    f"{limit[j]:.4g}, and it is not written; state a limit {self.place.format(example)}"
+                    f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, above "
+                    f"{limit[j]:.4g}; it is not written; state a limit {self.place.format(example)}"
                 )
 
 
@@ -153,7 +153,7 @@ STATED_IN = {
 @strict
 @dataclass(frozen=True)
 class PointTable:
-    """[[point]], see the module."""
+    """Entry ``[[point]]`` of the limits file, see the module."""
 
     name: Name
     joint: Annotated[int, Whole()] = 0
@@ -163,7 +163,7 @@ class PointTable:
 @strict
 @dataclass(frozen=True)
 class FrictionTable:
-    """[friction], see the module."""
+    """Table ``[friction]`` of the limits file, see the module."""
 
     Fv: Annotated[tuple[NotNegative, ...], Spread()] | None = None
     Fc: Annotated[tuple[NotNegative, ...], Spread()] | None = None
@@ -172,7 +172,7 @@ class FrictionTable:
 @strict
 @dataclass(frozen=True)
 class FrequencyTable:
-    """[frequency], see the module."""
+    """Table ``[frequency]`` of the limits file, see the module."""
 
     resonance: Annotated[float, Real(above=0, quantity="frequency")] | None = None
 
@@ -180,7 +180,7 @@ class FrequencyTable:
 @strict
 @dataclass(frozen=True)
 class LimitsFile(ConstraintsFile):
-    """The limits file; values per joint are read by their joint's unit."""
+    """The content of a limits file; values per joint are in the unit of the joint."""
 
     velocity: Mapping[str, Numeric] = field(default_factory=dict)
     acceleration: Mapping[str, Numeric] = field(default_factory=dict)
@@ -193,12 +193,12 @@ class LimitsFile(ConstraintsFile):
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Limits of a motion: constraints, bounds of each joint, torque limits and what is known of friction.
+    """Limits of a motion: constraints, bounds and torque limits of each joint, and friction if stated.
 
     Attributes:
         constraints: all but torque.
         bounds: of speed, acceleration and torque, each joint's.
-        torque: (n,) limits [N m or N], whether a model predicts torques or not; infinite where there is none.
+        torque: (n,) limits [N m or N], also without a model that predicts torques; infinite: not limited.
         margin, deviations: of the torque limit; `margin` None where the file does not say.
         friction: (2, n) Fv and Fc; None where the file does not say.
         resonance: [rad/s] or None.
@@ -216,27 +216,27 @@ class MotionLimits:
 
     @property
     def positions(self) -> BoxLimit:
-        """The joint limits; infinite where there are none."""
+        """The joint position limits; infinite: not limited."""
         free = np.full(len(self.torque), np.inf)
         own = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
         return next(own, BoxLimit(0, -free, free))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
-        """Yield the constraints of places that N states break: with words, and the state where by most."""
+        """Yield each violated constraint on positions, a message, and the index of the worst of N states."""
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
                 continue
             values = limit.values(motion)
             k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
             if values[k, column] > 0:
-                words = f"{limit.name} ({limit.labels[column]}) is broken by {values[k, column]:.3g} {limit.unit}"
+                words = f"{limit.name} ({limit.labels[column]}) is violated by {values[k, column]:.3g} {limit.unit}"
                 yield limit, words, k
 
 
 def read_motion_limits(
     given: Tables | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
 ) -> MotionLimits:
-    """Return the limits of a motion from a limits file and the robot; by default those of poses (`limits_of`).
+    """Return the limits of a motion from limits file and robot; defaults are those of poses (`limits_of`).
 
     Args:
         given: the file, or its tables; None for the robot's own limits and the defaults alone.
@@ -291,7 +291,7 @@ def read_motion_limits(
 
 
 def located(error: NothingFeasible) -> NothingFeasible:
-    """Return the error with the place where a user can change the limit that no motion keeps."""
+    """Return the error, extended by the place in the limits file where the violated limit can be changed."""
     if error.constraint not in STATED_IN:
         return error
     place = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
@@ -299,22 +299,22 @@ def located(error: NothingFeasible) -> NothingFeasible:
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:
-    """Refuse to keep torque limits (n,) by bodies that cannot exist.
+    """Raise an error if torque limits (n,) would be checked with physically inconsistent masses or inertias.
 
     Raises:
         UsageError: naming them.
     """
     if np.isfinite(torque).any() and (wrong := impossible_bodies(chain)):
         raise UsageError(
-            f"robot '{chain.name}': {'; '.join(wrong)}: torques predicted from such bodies keep no limit; correct the "
-            "masses in the robot's file, take its <inertial> tags out, or name an identified model (--model)"
+            f"robot '{chain.name}': {'; '.join(wrong)}: torques predicted with them are wrong; correct the "
+            "masses in the robot's file, or name an identified model (--model)"
         )
 
 
 def _bounds(
     chain: Chain, robot: str, stated: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
 ) -> MotionBounds:
-    """Return the bounds of a motion's joints; by default accelerations that nothing else limits have some.
+    """Return the bounds of a motion's joints; accelerations without any limit get a default one.
 
     Args:
         sizes: (n,) largest velocities, accelerations, torques.
@@ -331,10 +331,10 @@ def _bounds(
 
 
 def _unchecked(path: str | None) -> str:
-    """Return what nothing keeps the motion from."""
+    """Return the hazards that no limit checks."""
     if path is None:
-        return "collisions and floor are NOT checked, the tool may pass the table: state them in a limits file"
-    return f"collisions are NOT checked: {path} has no [collision] (its floor = … keeps off the floor)"
+        return "collisions and floor are NOT checked: state obstacles and floor in a limits file"
+    return f"collisions are NOT checked: {path} has no [collision]; add it, with floor = … at least"
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,7 +349,7 @@ class Points:
         return self._places(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the slopes (N, n) of Σ G · points."""
+        """Return the gradient (N, n) of Σ G · points with respect to q."""
         walked = sweep(self.chain, q)
         points, result = self._places(q, walked.poses()), np.zeros(q.shape)
         for k, joint in enumerate(self.joints):
@@ -366,7 +366,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class _PoseLimit:
-    """A constraint of pose selection, kept along a motion."""
+    """A constraint of pose selection, applied along a motion."""
 
     of: PoseConstraint
     name: str
@@ -387,7 +387,7 @@ class _PoseLimit:
 
 
 def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionConstraint]:
-    """Return the workspace of tip and named points, and what else a pose must keep."""
+    """Return the constraints: workspace of the tip and of named points, and the other ones of poses."""
     radius, (lowest, highest) = stated.target.axis_distance, stated.target.heights
     result: list[MotionConstraint] = []
     if radius is not None or lowest is not None:
@@ -406,7 +406,7 @@ def _per_joint(
     stated: Mapping[str, Any], where: str, chain: Chain, default: np.ndarray | None = None,
     quantities: tuple[str, str] = ("", ""),
 ) -> np.ndarray:  # fmt: skip
-    """Return limits (n,) of a table with joints' names, q1 …, ``all`` and ``share``; infinite where nothing is stated.
+    """Return limits (n,) from a table with joint names, q1 …, ``all`` and ``share``; infinite if not stated.
 
     Args:
         quantities: of a revolute joint's limit, and of a prismatic one's.

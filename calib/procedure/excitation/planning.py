@@ -59,7 +59,7 @@ def read_waypoints(
     upper: np.ndarray,
     start: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """Return waypoints (m, n) [rad or m].
+    """Return waypoints as joint values (m, n) [rad or m], from a file or from arrays.
 
     Args:
         given: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
@@ -68,7 +68,7 @@ def read_waypoints(
         start: (n,) where the robot stands: the first place is reached near it; else near the middle of the limits.
 
     Raises:
-        UsageError: for a place out of reach: which one, and how far.
+        UsageError: for a waypoint out of reach, with its number and the distance.
     """
     if not isinstance(given, Path):
         targets = Targets.of(given)
@@ -94,7 +94,7 @@ def read_waypoints(
 def _reached(
     goal: Goal, target: np.ndarray, near: np.ndarray, others: np.ndarray, targets: Targets, k: int
 ) -> np.ndarray:
-    """Return joint values (n,) at a target (1, 4, 4): from where the arm is, else of many tries the nearest to it."""
+    """Return joint values (n,) at a target (1, 4, 4): solved from the present pose, else the nearest of many tries."""
     q = inverse.nearest(goal, target, near[None], inverse.reach(goal, target, near[None]))
     left = inverse.differences(goal, q, target)
     if np.abs(left).max() <= MAX_ERROR:
@@ -123,7 +123,7 @@ PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint
 @strict
 @dataclass(frozen=True)
 class _DrivesFile:
-    """The file of ``calib plan --drives``: [drives] with any of Ia, Fv, Fc, off, one per joint (SI, joint side)."""
+    """The file of ``calib plan --drives``: [drives] with any of Ia, Fv, Fc, off per joint (SI, joint side)."""
 
     drives: Mapping[str, PerJoint] = field(default_factory=dict)
 
@@ -142,7 +142,7 @@ class Planned:
         limits, lower, upper: what the motion keeps, margins of torque taken off.
         timings: one per path: a single one through all waypoints, or one per tool line.
         track: the motion at the controller's rate.
-        margins: (n,) to the joint limits [rad or m]; None where the path is none of joints.
+        margins: (n,) to the joint limits [rad or m]; None if the path is not a joint path.
         deviation: (2,) of the tool from its lines [m, rad]; None for joint paths.
         shaped: what the outer loop found; None without one.
         approach, rehearsal: tracks; None where not asked for.
@@ -193,10 +193,10 @@ def plan(
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
     say = progress or (lambda words: None)
-    words = "shorten changes the path between waypoints; straight lines (--line) leave nothing to change"
+    words = "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
     require(not (settings.shorten and settings.lines), words, UsageError)
     if settings.payloads and model is None:
-        raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
+        raise UsageError(f"payloads {', '.join(settings.payloads)}: need an identified model; name it (--model)")
     chain, source = load_rigid(robot, waypoints if isinstance(waypoints, Path) else None, base, tip)
     known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
@@ -237,17 +237,17 @@ def plan(
 
 
 def _read_drives(given: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
-    """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
+    """Read drive parameters (n,) from TOML: ``[drives]`` with Ia, Fv, Fc, off as needed (SI, joint side)."""
     stated, where = read(_DrivesFile, given, "drives")
     check_keys(stated.drives, DRIVES, f"{where}: drives")
     return {key: np.array(numbers(value, chain.n, f"{where}: drives.{key}")) for key, value in stated.drives.items()}
 
 
 def _check_places(path: JointPath, known: MotionLimits) -> None:
-    """Refuse a path that breaks the workspace or comes too near to something (limits file), at 500 places.
+    """Raise an error if a path violates workspace or clearance (limits file) at one of 500 places.
 
     Raises:
-        UsageError: what is broken, where, and by how much.
+        UsageError: with the violated constraint, the place, and the excess.
     """
     s = np.linspace(0, path.length, 500)
     still = np.zeros((len(s), path.n))
@@ -258,9 +258,9 @@ def _check_places(path: JointPath, known: MotionLimits) -> None:
 def _law(
     chain: Chain, folder: Path | None, payloads: Sequence[str], drives: Tables | None, known: MotionLimits
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
-    """Return the dynamics: identified, or the robot's inertias with stated drives; None without any."""
+    """Return the dynamics: identified model, or the robot's inertias with stated drives; None if neither is given."""
     if folder is not None:
-        require(drives is None, "model and drives both say what the drives are; take one of them away", UsageError)
+        require(drives is None, "model and drives both state drive parameters; leave one of them out", UsageError)
         law, unsure = _identified(chain, folder, payloads)
         return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
     try:
@@ -276,20 +276,20 @@ def _law(
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     model = IdentificationModel(bodies_of(chain), standard([" ".join(DRIVES)] * chain.n, linear=linear))
     missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]
-    note = f"{' and '.join(missing)} not known (no model, no drives): planned without, a real robot needs more torque"
+    note = f"{' and '.join(missing)} unknown (no model, no drives): planned without; the real robot needs more torque"
     law = of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()]))
     return law, (note,) if missing else (), None
 
 
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
-    """Return an identified model with the payloads that are on board, and its uncertainty."""
+    """Return an identified model including the attached payloads, and its uncertainty."""
     refuse_currents(folder, "a motion plan")
     arm, dynamics = read_dynamics(folder)
     require(arm.n == chain.n, f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}", UsageError)
     model = dynamics.model
     known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):
-        raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(known) or 'none'}")
+        raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it has {', '.join(known) or 'none'}")
     if not model.torque_rows.has_bodies:
         return of_standard(model, dynamics.values), None  # which says why that cannot be
     values = np.array(dynamics.values)
@@ -298,7 +298,7 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
 
 
 def _guarded(bounds: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
-    """Return the limits with a margin (n,) of torque left free."""
+    """Return the limits, the torque limits reduced by a margin (n,)."""
     if (margin >= bounds.torque).any():
         j = int(np.argmax(margin / bounds.torque))
         raise UsageError(

@@ -29,7 +29,7 @@ BLOCK_ROWS = 4000
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """What a controller is to run.
+    """Setpoints for a controller: run, approach and rehearsal.
 
     Attributes:
         run: the approach, where there is one, and `repeat` periods.
@@ -46,7 +46,7 @@ class Playback:
 
 
 def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> None:
-    """Refuse, before the search, what could not be played."""
+    """Raise an error, before the search, if the motion could not be played with these settings."""
     if settings.start is not None:
         _check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
 
@@ -70,7 +70,7 @@ def play(family: Family, found: SearchResult, given: ExcitationInputs, settings:
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
-    """Return the track with the torques the model predicts, where it knows its parameters."""
+    """Return the track with the torques that the model predicts; unchanged if its parameters are unknown."""
     if dynamics.values is None:
         return track
     return replace(track, tau=_torque(dynamics.exact, dynamics.values, track))
@@ -85,7 +85,7 @@ def _torque(model: BaseModel, values: np.ndarray, track: Setpoints) -> np.ndarra
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
-    """Return a note where a track needs more torque than there is: slow motion can, where speed helped the arm up."""
+    """Return a note if a track exceeds the torque limits; a slower motion can, if inertia forces lifted the arm."""
     if track is None or track.tau is None:
         return ()
     share = (np.abs(track.tau) / limits.torque).max(axis=0)
@@ -98,7 +98,7 @@ def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Ch
 def approach_to(
     start: Sequence[float], goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
 ) -> tuple[Setpoints, tuple[str, ...]]:
-    """Return the way from a pose to the start of a motion, a straight line in joint space, and what a user should know.
+    """Return the approach from a pose to the start of a motion, a straight line in joint space, and notes.
 
     Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
 
@@ -106,7 +106,7 @@ def approach_to(
         start: (n,) where the robot stands [rad or m]; goal: (n,).
 
     Raises:
-        UsageError: for a start beyond the joint limits, or a way too near to something.
+        UsageError: for a start beyond the joint limits, or an approach that violates a clearance.
     """
     here = np.asarray(start, dtype=float)
     boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
@@ -123,7 +123,7 @@ def approach_to(
     parts = (found.times, found.q, found.v, found.a, np.zeros(found.q.shape))
     notes = []
     for limit, broken, k in known.broken(SampledMotion(*(x[rows] for x in parts))):
-        words = f"on the straight way from start, {broken} at t = {found.times[rows[k]]:.3g} s"
+        words = f"on the straight approach, {broken} at t = {found.times[rows[k]]:.3g} s"
         if isinstance(limit, Clearance):
             raise UsageError(f"{words}: move the robot to another pose first, or drive to the start by hand")
         notes.append(f"{words}: watch the approach, or start from another pose")
@@ -131,7 +131,7 @@ def approach_to(
 
 
 def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
-    """Refuse a pose (n,) that the robot cannot be in."""
+    """Raise an error if joint values (n,) are wrong in number or beyond the joint limits."""
     limits = known.positions
     require(start.shape == (chain.n,), f"start: expected {chain.n} joint values, found {start.size}", UsageError)
     for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):

@@ -59,7 +59,7 @@ class MotionPrediction:
 
 
 class PredictedSigma(NamedTuple):
-    """A row of ``prediction.csv``: a parameter, its value where known, and its predicted sigma by the motion as run."""
+    """A row of ``prediction.csv``: a parameter, its value if known, and the sigma predicted for the motion as run."""
 
     name: str
     unit: str
@@ -91,7 +91,7 @@ def foretell(
     found: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return the predicted sigmas of torques and of parameters; None where a joint has no torque limit.
+    """Return the predicted sigmas of torques and parameters; None if a joint has no torque limit.
 
     Args:
         given, settings, problem, found: the robot, what was asked for, what was solved, and the motion.
@@ -125,7 +125,7 @@ def foretell(
 
 
 def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
-    """Return regressors (TASK_STATES, n, c) of typical states."""
+    """Return the regressors (TASK_STATES, n, c) at random typical states."""
     box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
     low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)
     speeds = np.array([joint.velocity for joint in given.chain.joints])
@@ -144,7 +144,7 @@ def _prediction(
     given: ExcitationInputs, noise: np.ndarray, task: np.ndarray, family: Family, x: np.ndarray, factor: float,
     repeat: float,
 ) -> tuple[MotionPrediction, np.ndarray]:  # fmt: skip
-    """Return the information of `repeat` periods of a motion, and the sigmas (c,) of the parameters."""
+    """Return the prediction for `repeat` periods of a motion, and the sigmas (c,) of the parameters."""
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     counted = np.ones(given.chain.n) if given.columns.sigmas is None else given.columns.sigmas
@@ -160,7 +160,7 @@ def _prediction(
 
 
 def _band(motion: SampledMotion, period: float) -> float:
-    """Return the band [Hz] that identification compares torques in: twice f_dyn (`calib.data.signals.bandwidth`)."""
+    """Return the band [Hz] in which identification compares torques: twice f_dyn (`calib.data.signals.bandwidth`)."""
     power = np.abs(np.fft.rfft(motion.a, axis=0)) ** 2
     total = np.cumsum(power, axis=0)
     lines = np.argmax(total >= SHARE * total[-1], axis=0)[total[-1] > 0]
@@ -174,7 +174,7 @@ def _shortened(
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
-    """Return a motion of a shorter period, searched from the same path made so small that its speeds stay."""
+    """Return a motion of a shorter period; the search starts from the same path, shrunk to keep its speeds."""
     try:
         other = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
@@ -192,7 +192,7 @@ def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
 
 
 def lines(one: MotionOutlook) -> list[str]:
-    """Return the predicted σ of torques in words: from this motion, and from others of other lengths."""
+    """Return the predicted σ of torques as text, for this motion and for motions of other lengths."""
     others = ", ".join(f"{100 * each.torque_sigma_share:.2g} % from {each.seconds:g} s" for each in one.by_period)
     return [
         f"predicted σ of torques, typical task: {100 * one.own.torque_sigma_share:.2g} % of the limits from "
@@ -202,8 +202,8 @@ def lines(one: MotionOutlook) -> list[str]:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse, before any work is done, a folder without a prediction."""
-    require((folder / NAME).is_file(), f"{folder} holds no {NAME}: give the folder that calib excite wrote", UsageError)
+    """Raise an error, before any work is done, if a folder contains no prediction."""
+    require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
 @dataclass(frozen=True)
@@ -212,10 +212,10 @@ class _Predicted:
 
 
 def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> str:
-    """Return a line that compares the sigmas an excitation's folder predicted with those an identification states.
+    """Return a line that compares the predicted sigmas (folder of `calib excite`) with the identified ones.
 
     Raises:
-        UsageError: where the folder holds no prediction, or one of other parameters.
+        UsageError: if the folder contains no prediction, or one of other parameters.
     """
     check_folder(folder)
     noise = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction.noise_share
@@ -231,6 +231,6 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
     found = sigma_ratio(predicted, stated, residual=residual, assumed=noise)
     if found is None:
         raise UsageError(
-            f"{folder} predicts none of the {len(stated)} parameters identified: it belongs to another robot"
+            f"{folder} contains none of the {len(stated)} identified parameters: it belongs to another robot"
         )
     return sentence(found)

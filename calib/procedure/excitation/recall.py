@@ -49,19 +49,19 @@ class AveragedMotion:
 
 
 def inputs(folder: Path, log: str) -> list[str | Path]:
-    """Return what is read to find the motion of `folder` in a log, which nothing may be written over."""
+    """Return the input files of `find`, which outputs must not overwrite."""
     return [folder, folder / coefficients.NAME, folder / METRICS, log]
 
 
 def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
-    """Find the motion of an excitation's folder in a log.
+    """Return the designed motion of `folder` as found in a log, averaged over its periods.
 
     Args:
         log: a recording, with a cut if wanted (``log.npz@0:90``).
         skip: whole periods to leave out at the beginning: transients, a robot that warms up.
 
     Raises:
-        UsageError, MeasurementError: for a folder or a log that is none, and where the motion is not in the log.
+        UsageError, MeasurementError: for an unreadable folder or log, and if the log does not contain the motion.
     """
     require(skip >= 0, f"--skip {skip}: expected a number of periods, 0 or more", UsageError)
     motion = coefficients.read(folder)
@@ -104,7 +104,7 @@ def lines(averaged: AveragedMotion) -> list[str]:
     unit = "N m" if averaged.kind == "torque" else "A"
     result = [
         f"{found.periods} whole periods of {averaged.motion.period:g} s in {averaged.file}, from {start:.3f} s "
-        f"on; each explains {min(found.likeness):.2%} of the motion at least",
+        f"on; each matches at least {min(found.likeness):.2%} of the motion",
         f"{'joint':14} {'off command':>14} {'noise of q':>12} {f'noise of {unit}':>14} {'of the mean':>12}",
     ]
     noise, effort = np.sqrt(averages["q"].pooled), np.sqrt(averages["effort"].pooled)
@@ -115,7 +115,7 @@ def lines(averaged: AveragedMotion) -> list[str]:
 
 
 def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:
-    """Return the longest part without gaps, on a grid of which a period holds a whole number of samples."""
+    """Return the longest part without gaps, resampled to a whole number of samples per period."""
     own = 1.0 / float(np.median(np.diff(recording.t)))
     rate = max(1, round(period * own)) / period
     sampled = resample(recording, rate=rate)

@@ -15,10 +15,10 @@ COARSE = 5  # harmonics that a search begins with (our choice)
 
 
 def split_goal(text: str) -> tuple[str, float]:
-    """Return name and number of a goal, ``wrist=0.1``.
+    """Return name and value of a goal such as ``wrist=0.1``.
 
     Raises:
-        UsageError: for a name that no goal has, and for no number.
+        UsageError: for an unknown name, or a missing number.
     """
     name, _, amount = text.partition("=")
     try:
@@ -26,7 +26,7 @@ def split_goal(text: str) -> tuple[str, float]:
     except ValueError:
         raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
     if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
-        raise UsageError(f"goal '{text}': '{name}' is none of {', '.join(GOALS)}, joint1 …")
+        raise UsageError(f"goal '{text}': '{name}' is unknown; use {', '.join(GOALS)}, joint1 …")
     return name, value
 
 
@@ -50,33 +50,33 @@ Start = tuple[Annotated[float, Real(infinite=True, quantity="1")], ...]  # joint
 @checked
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """How an exciting motion is designed and played.
+    """Settings of designing and playing an exciting motion.
 
     Without goals the logarithms of both condition numbers are minimised in equal parts.
 
     Attributes:
         goals: raw=35, normalised=6 (condition numbers), wrist=0.1 or joint6=0.1 (mean torque as a share of the limit,
-            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; logdet, smallest: that
-            index in place of the condition numbers; repeatable
-        hard: a goal that must be met; repeatable
-        period: T0 of the motion [s], at most
-        shortest: what the search may shorten the period to [s]; default: it is kept
-        harmonics: frequencies per joint; control points of splines; default 12, or as many as stay below resonance
-        family: of the motion's functions of time
-        drives: terms of each drive to identify, where no identified model has its own
+            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; logdet or smallest: this
+            index instead of the condition numbers; repeatable
+        hard: a goal that must be reached; repeatable
+        period: largest period of the motion [s]
+        shortest: shortest period that the search may use [s]; default: the period is fixed
+        harmonics: frequencies per joint, or control points of splines; default 12, or as many as are below resonance
+        family: functions of time that describe the motion
+        drives: drive terms to identify, if no identified model states them
         rate: of the controller [Hz]
         samples: instants over the period at which the search evaluates
         starts: random starts of the search
         evaluations: most evaluations per start
         seed: reproduces everything random
-        front: motions on the front of normalised condition number and first torque goal; 0: none
-        start: joint values with commas [rad or m]: an approach from there
+        front: number of trade-offs between normalised condition number and first torque goal; 0: none
+        start: joint values with commas [rad or m]; adds an approach from there
         repeat: periods to run one after the other
-        slower: factor of a slow rehearsal, written beside the motion; 1: none
-        existing: a recording (log.npz@0:9.4 cuts), or folder of an earlier design, that counts already; repeatable
-        lock: joints that stay: joint4, or joint4=0.5 [rad or m]; repeatable
-        noise: torques that no parameter explains, as a share of their limits; for predicted sigmas alone
-        outlook: look at what other periods would identify
+        slower: factor of a slow rehearsal, written next to the motion; 1: none
+        existing: a recording (log.npz@0:9.4 cuts) or folder of an earlier design, to complement; repeatable
+        lock: a joint that does not move: joint4, or joint4=0.5 [rad or m]; repeatable
+        noise: torque residual as a share of the torque limits; for predicted sigmas only
+        outlook: predict the sigmas of other periods, too
     """
 
     goals: tuple[Goal, ...] = ()
@@ -107,16 +107,16 @@ DEFAULT_DESIGN = ExcitationSettings()
 @checked
 @dataclass(frozen=True)
 class PlanSettings:
-    """How a motion through waypoints is planned.
+    """Settings of planning a motion through waypoints.
 
     Attributes:
-        payloads: label of an identified payload on board; repeatable
-        lines: the tool runs straight from waypoint to waypoint, and rests at each
+        payloads: label of an attached, identified payload; repeatable
+        lines: the tool moves straight from waypoint to waypoint, and stops at each
         rate: of the controller [Hz]
-        shorten: timings to spend on a faster shape between waypoints (`trajectories.timing.shape`); 0: none
-        stray: how far that shape may leave the spline, per joint [rad or m]
-        start: joint values with commas [rad or m]: an approach from there
-        slower: factor of a slow rehearsal, written beside the motion; 1: none
+        shorten: number of timings to search for a faster path between waypoints (`trajectories.timing.shape`); 0: none
+        stray: largest deviation of that path from the spline, per joint [rad or m]
+        start: joint values with commas [rad or m]; adds an approach from there
+        slower: factor of a slow rehearsal, written next to the motion; 1: none
     """
 
     payloads: tuple[str, ...] = ()

@@ -61,7 +61,7 @@ MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "fr
 MARGIN, JOINT_MARGIN = 0.01, 0.01  # [m], share of a joint's range: where the file does not tell (our choice)
 DEFAULTS = ("self-collision", "floor", "joint-margin", "view")
 UNKNOWN = "unknown"
-VIEW_UNCHECKED = "whether the camera sees the board"
+VIEW_UNCHECKED = "the camera's view of the board"
 CELL = ("instrument", "box", "obstacles")
 
 Metres = Annotated[float, Real(quantity="length")]
@@ -85,7 +85,7 @@ _PAIR = {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": ["numb
 
 
 def _directions(value: Any) -> Any:
-    """Make a single direction, or the name of an axis, a list of one."""
+    """Return directions as a list; a single direction or an axis name becomes a list of one."""
     value = AXES.get(value, value) if isinstance(value, str) else value
     single = isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple)
     return [value] if single else value
@@ -94,7 +94,7 @@ def _directions(value: Any) -> Any:
 @strict
 @dataclass(frozen=True)
 class TargetTable:
-    """[target], see the module."""
+    """Table ``[target]`` of the constraints file, see the module."""
 
     height: Annotated[float | tuple[float, ...], OneOrMany(Real(quantity="length"))] | None = None
     axis_distance: Distance | None = None
@@ -106,7 +106,7 @@ class TargetTable:
 
     def __post_init__(self) -> None:
         if not self.facing or not all(map(np.any, self.facing)):
-            raise ValueError("facing: [0, 0, 0] is no direction")
+            raise ValueError("facing: [0, 0, 0] is not a direction")
         if isinstance(self.height, tuple):
             rising(self.height, "height")
 
@@ -119,7 +119,7 @@ class TargetTable:
 @strict
 @dataclass(frozen=True)
 class PlacedTable:
-    """What stands somewhere: xyz and rpy, or a matrix."""
+    """A table with a placement: xyz and rpy, or a matrix."""
 
     xyz: Point | None = None
     rpy: Turns | None = None
@@ -134,7 +134,7 @@ class PlacedTable:
 @strict
 @dataclass(frozen=True)
 class InstrumentTable(PlacedTable):
-    """[instrument], see the module."""
+    """Table ``[instrument]`` of the constraints file, see the module."""
 
     roll: Span | None = None
     pitch: Span | None = None
@@ -150,7 +150,7 @@ class InstrumentTable(PlacedTable):
 @strict
 @dataclass(frozen=True)
 class CollisionTable:
-    """[collision], see the module."""
+    """Table ``[collision]`` of the constraints file, see the module."""
 
     margin: Distance = MARGIN
     radius: Annotated[float, Real(above=0, quantity="length")] | None = None
@@ -161,7 +161,7 @@ class CollisionTable:
 @strict
 @dataclass(frozen=True, kw_only=True)
 class ObstacleTable(PlacedTable):
-    """[[obstacle]], see the module."""
+    """Entry ``[[obstacle]]`` of the constraints file, see the module."""
 
     kind: Annotated[str, OneOf(("box", "sphere", "cylinder"))]
     size: Size
@@ -169,7 +169,7 @@ class ObstacleTable(PlacedTable):
 
 
 def _span_or_margin(value: Any) -> Any:
-    """Take a list of two numbers or texts with units, or one (the margin)."""
+    """Check that a value is a range (two numbers or texts with units) or a single margin, and return it."""
     pair = isinstance(value, list | tuple) and len(value) == 2
     parts = value if pair else (value,)
     if not all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in parts):
@@ -189,7 +189,7 @@ Place = Annotated[Any, Checked(_place_or_unknown, {"anyOf": [{"type": "object"},
 @strict
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """[camera], see the module; what is ``unknown`` leaves unchecked whether the board is seen."""
+    """Table ``[camera]``, see the module; with ``unknown`` keys the camera's view of the board is not checked."""
 
     mounting: Annotated[str, OneOf((IN_HAND, TO_HAND, UNKNOWN))]
     lens: Name
@@ -202,7 +202,7 @@ class CameraTable:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Keys that are unknown, without which the camera's view cannot be checked."""
+        """Keys stated as unknown, which the check of the camera's view needs."""
         names = ("mounting", "lens", "board", "carried", "stands")
         return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 
@@ -210,7 +210,7 @@ class CameraTable:
 @strict
 @dataclass(frozen=True)
 class ConstraintsFile:
-    """The constraints file."""
+    """The content of a constraints file."""
 
     joints: Mapping[
         str, Annotated[Any, Checked(_span_or_margin, {"anyOf": [_PAIR, {"type": ["number", "string"]}]})]
@@ -224,7 +224,7 @@ class ConstraintsFile:
 
 
 def beside(path: Path) -> dict[str, Path]:
-    """Return the files that a constraints file names, by name: a camera's lens and its board."""
+    """Return the files named in a constraints file, by name: camera lens and board."""
     camera = read(ConstraintsFile, path, "", MOTION)[0].camera
     names = () if camera is None else (camera.lens, camera.board)
     return {name: path.parent / name for name in names if name != UNKNOWN}

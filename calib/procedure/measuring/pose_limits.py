@@ -1,4 +1,4 @@
-"""Where the arm may go while it is measured: the limits that a constraints file, the cell and the defaults come to.
+"""Limits on the arm's poses during measurement, from the constraints file, the cell and the defaults.
 
 With no file, and wherever it says nothing else, poses keep a share of each joint's range to its limits, distance
 between the arm's own links, and the floor that the arm stands on: `Limits.checked` says what was kept, and
@@ -49,7 +49,7 @@ DISTANCES = 3  # distances that a constraint holds: the smallest ones, so that t
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Where poses may lie: joint limits (n,), constraints of the target, collisions and lines of sight.
+    """Limits of poses: joint limits (n,), constraints of the target, collisions and lines of sight.
 
     Attributes:
         collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None without one.
@@ -57,8 +57,8 @@ class Limits:
         sight: lines of sight; None where nothing is asked.
         camera: the view of a camera (`calib.rooms.camera.camera_view.CameraView`), where that is the instrument.
         views: what it takes to be seen by it.
-        checked: what is kept, in words.
-        unchecked: what cannot be, since nobody has stated it, in words.
+        checked: names of the checked limits.
+        unchecked: names of the limits that are not checked, since nobody has stated them.
         notes: what else a user should know.
     """
 
@@ -75,7 +75,7 @@ class Limits:
     views: tuple[PoseConstraint, ...] = ()
 
     def space(self, seen: Observation, sight: bool = True) -> SearchSpace:
-        """Return the continuous problem of choosing poses by what an instrument would see.
+        """Return the continuous problem of choosing poses for an observation Jacobian within these limits.
 
         Args:
             seen: all targets' rows.
@@ -127,7 +127,7 @@ def read_limits(
 def _with_camera(
     limits: Limits, stated: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
 ) -> Limits:
-    """Return limits with the camera's view of the board added, where camera and board are known well enough."""
+    """Return the limits with the camera's view of the board added, if camera and board are known."""
     unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     if stated.unknown:
         return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))
@@ -180,7 +180,7 @@ def limits_of(
 
 
 def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
-    """Return in words what poses (motions where they are not `seen`) are not held against."""
+    """Return the names of the limits that are not checked, for poses or (not `seen`) for motions."""
     table, collision = stated.instrument or InstrumentTable(), stated.collision or CollisionTable()
     placed = bool(table.stated)
     missing = {
@@ -206,7 +206,7 @@ def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
 def _joints(
     spans: Mapping[str, Any], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return lower and upper limits (n,), and what to say of ranges that limit nothing."""
+    """Return lower and upper joint limits (n,), and notes on stated ranges without effect."""
     notes = []
     lower, upper = (side.copy() for side in cell.chain.sampling_limits())
     limited = np.isfinite(cell.chain.lower) & np.isfinite(cell.chain.upper)
@@ -224,13 +224,13 @@ def _joints(
         low, high = _span(span, place, "length" if cell.chain.joints[j].unit == "m" else "angle")
         turns, own = cell.chain.joints[j].unit != "m", (cell.chain.lower[j], cell.chain.upper[j])
         if far := turns and max(-low, high) > MAX_TURN:
-            notes.append(f'{place}: {low:g} to {high:g} rad; in degrees? Then write ["{low:g} deg", "{high:g} deg"]')
+            notes.append(f'{place}: {low:g} to {high:g} rad; if in degrees, write ["{low:g} deg", "{high:g} deg"]')
         if low <= own[0] and high >= own[1] and not far and (low, high) != own:
             notes.append(
-                f"{place}: {low:g} to {high:g} limits nothing: the joint's own range is {own[0]:g} to {own[1]:g}"
+                f"{place}: {low:g} to {high:g} has no effect: the joint's own range is {own[0]:g} to {own[1]:g}"
             )
         lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
-        require(lower[j] < upper[j], f"{place}: nothing is left between {lower[j]:g} and {upper[j]:g}", UsageError)
+        require(lower[j] < upper[j], f"{place}: the range {lower[j]:g} to {upper[j]:g} is empty", UsageError)
     return lower, upper, tuple(notes)
 
 
@@ -266,7 +266,7 @@ def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> lis
 
 
 def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
-    """Return the lines of sight: cone and range where they are stated, and past the arm.
+    """Return the lines of sight: cone and range if stated, not blocked by the arm.
 
     An instrument with roll and pitch alone is a camera whose view these state.
     """
@@ -284,7 +284,7 @@ def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) 
 def _collision(
     stated: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
 ) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-    """Return the model of collisions, what it keeps in words, and notes."""
+    """Return the collision model, the names of its checks, and notes."""
     table, chain = stated.collision or CollisionTable(), cell.chain
     floor = (None if "floor" in absent else chain.floor) if table.floor is None else table.floor
     obstacles = [
@@ -303,11 +303,11 @@ def _collision(
             model, shapes, notes = place(None)
         except RobotError:
             raise UsageError(f"{where}: {error}") from error
-        notes = (*notes, f"the floor is NOT kept: every posture is below {floor:g} m; state it under [collision]")
+        notes = (*notes, f"the floor is NOT checked: all postures are below {floor:g} m; state it in [collision]")
         floor = None
     if model.excluded:
         pairs = listing((" with ".join(pair) for pair in model.excluded), 3)
-        notes = (*notes, f"not watched, since no posture parts them: {pairs}")
+        notes = (*notes, f"collision pairs ignored, since they touch in nearly all postures: {pairs}")
     kept = [*([f"self-collision ({shapes})"] if within else [])]
     kept += [] if floor is None or "floor" in idle else [f"floor at {floor:g} m"]
     kept += ["walls of the cell"] if not {wall.name for wall in walls} <= idle else []
@@ -321,7 +321,7 @@ def _collision(
 def _never_act(
     table: CollisionTable, obstacles: Sequence[Obstacle], walls: Sequence[Wall], cell: Installation, where: str
 ) -> tuple[set[str], tuple[str, ...]]:
-    """Return the names of what stands beyond the arm's reach, and what to say of it.
+    """Return the names of the objects beyond the arm's reach, and a note on each.
 
     Raises:
         UsageError: for what stands `MAX_REACHES` times as far, and for links thicker than the arm is long.
@@ -330,7 +330,7 @@ def _never_act(
     tool = float(np.linalg.norm(cell.tools[:, :3, 3], axis=1).max(initial=0.0))
     reach = cell.chain.stretched_length() + slides + tool
     if table.radius is not None and table.radius > reach:
-        words = f"links of radius {table.radius:g} m in an arm that reaches {reach:.3g} m; in mm?"
+        words = f"links of radius {table.radius:g} m in an arm of {reach:.3g} m reach; is it in mm?"
         raise UsageError(f"{where}: collision.radius: {words}")
     base = np.zeros((1, 3))
     away = {} if table.floor is None else {"floor": -table.floor}
@@ -338,11 +338,11 @@ def _never_act(
     away |= {one.name: float(signed_distance(one, base)[0][0]) for one in obstacles}
     beyond = {name: distance for name, distance in away.items() if distance > BODY * reach + table.margin}
     words = [
-        f"{name}: {distance:.3g} m from the arm's base, which reaches {reach:.3g} m: it can never act; in mm?"
+        f"{name}: {distance:.3g} m from the base, the arm reaches {reach:.3g} m: it has no effect; is it in mm?"
         for name, distance in beyond.items()
     ]
     for said, distance in zip(words, beyond.values()):
-        require(distance <= MAX_REACHES * reach, f"{where}: {said} Lengths are in m", UsageError)
+        require(distance <= MAX_REACHES * reach, f"{where}: {said} Write lengths in m", UsageError)
     return set(beyond), tuple(words)
 
 
@@ -355,7 +355,7 @@ def _model(
     within: bool,
     floor: float | None,
 ) -> tuple[Any, str, tuple[str, ...]]:
-    """Return the model of collisions, what stands for the links in words, and notes."""
+    """Return the collision model, the name of its link shapes, and notes."""
     from calib.robot import capsules, collision
 
     chain, notes = cell.chain, ()
@@ -364,12 +364,12 @@ def _model(
         try:
             model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, **around)
             if model.missing:
-                notes = (f"collision meshes not found, left out: {', '.join(model.missing[:3])}",)
+                notes = (f"collision meshes not found, their shapes are not checked: {', '.join(model.missing[:3])}",)
             return model, "the URDF's collision shapes", notes
         except RobotError as error:
             if "no usable <collision> shape" not in str(error):
                 raise
-            notes = (f"{error.args[0].partition(';')[0]}: capsules stand for its links",)
+            notes = (f"{error.args[0].partition(';')[0]}: capsules are used as link shapes",)
     radius = capsules.usual_radius(chain) if table.radius is None else table.radius
     return capsules.from_chain(chain, radius, floor, obstacles, **around), f"capsules of radius {radius:g} m", notes
 

@@ -32,7 +32,7 @@ WORST = 0.95
 
 @dataclass(frozen=True, eq=False)
 class SelectionPrediction:
-    """What a selection predicts.
+    """The prediction for a selection: robot, number of poses, and sigmas of the parameters.
 
     Attributes:
         joints: (n,) of the robot, by name.
@@ -47,15 +47,15 @@ class SelectionPrediction:
     sigmas: Array
 
     def check_robot(self, joints: Sequence[str]) -> None:
-        """Refuse, before any work is done, the selection of another robot."""
+        """Raise an error, before any work is done, if the selection belongs to another robot."""
         if self.joints != tuple(joints):
             ours, theirs = ", ".join(joints), ", ".join(self.joints)
-            raise UsageError(f"the selection is one of another robot: its joints are {theirs}, here they are {ours}")
+            raise UsageError(f"the selection belongs to another robot: its joints are {theirs}, here {ours}")
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction(SelectionPrediction):
-    """What a fit of m poses will know, and where the tool will be known how well.
+    """Predicted accuracy of a fit to m poses: sigmas of the parameters, and of the tool's position.
 
     Attributes:
         points, spread: (s, 3), (s,) where the tool is at typical poses, and sigma of its position there [m]; infinite
@@ -67,17 +67,17 @@ class Prediction(SelectionPrediction):
 
     @property
     def rms(self) -> float:
-        """Over typical poses [m]."""
+        """Sigma of the tool's position, rms over typical poses [m]."""
         return float(np.sqrt(np.mean(self.spread**2)))
 
     @property
     def worst(self) -> float:
-        """What 95 % of typical poses stay below [m]."""
+        """Sigma of the tool's position, 95 % quantile over typical poses [m]."""
         return float(np.quantile(self.spread, WORST)) if np.isfinite(self.spread).all() else float("inf")
 
 
 def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
-    """Return what measurements with Jacobians (m, rows, p) will know of a tool at typical poses (s, n).
+    """Return the prediction for Jacobians (m, rows, p), with the tool's sigma at typical poses (s, n).
 
     Args:
         seen: the observation Jacobian they come from.
@@ -106,7 +106,7 @@ def by_count(
     before: np.ndarray | None = None,
     counts: ArrayLike = COUNTS,
 ) -> tuple[Prediction, ...]:
-    """Return what other numbers of poses would know, chosen greedily among candidates (N, rows, p).
+    """Return predictions for other numbers of poses, chosen greedily among candidates (N, rows, p).
 
     Args:
         seen, typical: see `predicted`.
@@ -130,7 +130,7 @@ def by_count(
 
 
 def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, str]]:
-    """Return pairs of words and numbers: what is known of the tool and of the parameters, and with more poses."""
+    """Return the rows (label, values) of a table: sigmas of tool and parameters, and with other numbers of poses."""
     if not np.isfinite(one.rms):
         return [("predicted σ of the tool's position", "none: not all parameters are identifiable from these poses")]
     rows = [("predicted σ of the tool's position", f"{1e3 * one.rms:.3g} mm rms, {1e3 * one.worst:.3g} mm at 95 %")]
@@ -150,40 +150,40 @@ def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, st
 
 
 def beside(poses: Path) -> Path:
-    """Return where the prediction of a CSV of chosen poses lies."""
+    """Return the path of the prediction that belongs to a CSV of chosen poses."""
     return poses.parent / (poses.stem + SUFFIX)
 
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:
-    """Write what a selection predicts next to its CSV."""
+    """Write the prediction for a selection next to its CSV, and return its path."""
     return files.write_json(
         beside(poses), {each.name: getattr(prediction, each.name) for each in fields(SelectionPrediction)}
     )
 
 
 def read(selection: Path) -> SelectionPrediction:
-    """Read what a selection predicts.
+    """Read the prediction for a selection.
 
     Args:
         selection: the CSV that `calib select` wrote, or a folder with the prediction of one (``2-poses`` of a session).
 
     Raises:
-        UsageError: where there is none, or several, or it cannot be read.
+        UsageError: if no prediction, or more than one, is found, or it cannot be read.
     """
     path = selection
     if not selection.is_dir():
         path = beside(selection)
     else:
         found = sorted(selection.glob(f"*{SUFFIX}"))
-        require(len(found) <= 1, f"{selection} holds {len(found)} predictions: name one CSV of poses", UsageError)
+        require(len(found) <= 1, f"{selection} contains {len(found)} predictions: name one CSV of poses", UsageError)
         path = found[0] if found else selection / f"*{SUFFIX}"
-    words = f"there is no {path}: give the CSV that calib select wrote, its prediction next to it, or their folder"
+    words = f"{path} not found; give the CSV written by calib select, its prediction file, or the folder of both"
     require(path.is_file(), words, UsageError)
     return read_json(path, "choose the poses again", SelectionPrediction)
 
 
 def compared_with_fit(prediction: SelectionPrediction, fit: GeometricFit) -> Finding | None:
-    """Return how the σ that a fit estimates compare with those predicted when its poses were chosen."""
+    """Return a finding on the ratio of the fit's σ to those predicted at pose selection; None without common names."""
     names = layout(fit.cell).names
     estimated = {names[k]: float(sigma) for k, sigma in zip(fit.free, fit.estimate.sigma)}
     return sigma_ratio(dict(zip(prediction.names, prediction.sigmas)), estimated)
@@ -195,7 +195,7 @@ def sigma_ratio(
     residual: float | None = None,
     assumed: float | None = None,
 ) -> Finding | None:
-    """Return estimated over predicted σ of parameters, by name; None where they have no name in common.
+    """Return a finding on the ratios of estimated to predicted σ of parameters; None without common names.
 
     Args:
         predicted, estimated: name -> σ.

@@ -1,4 +1,4 @@
-"""A measuring run: poses in the order of least time, ways between them that keep clear, and how long it all takes.
+"""A measuring run: poses in the fastest order, collision-free paths between them, and the duration.
 
 Moves are straight in joint space, as a controller's joint moves are, held against the arm, the floor and obstacles at
 places so dense that no point of the arm goes further than the clearance between two of them. Where a straight move does
@@ -52,7 +52,7 @@ Ways = dict[tuple[int, int], np.ndarray]  # by the numbers of two poses, the sma
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run through m poses.
+    """A run through m poses: order, paths between poses, and times.
 
     Attributes:
         order: (m,) the poses' numbers in the order they are visited.
@@ -74,7 +74,7 @@ class Run:
 
     @property
     def found_ways(self) -> Ways:
-        """The clear ways, by the numbers of the poses as they came."""
+        """The collision-free paths, by the numbers of their two poses in input order."""
         pairs = enumerate(pairwise(self.order))
         return {
             _pair(one, two): self.ways[k] if one < two else self.ways[k][::-1]
@@ -103,7 +103,7 @@ def plan_run(
     progress: Progress | None = None,
     found: Ways | None = None,
 ) -> Run:
-    """Order poses q (m, n) [rad or m], and find the ways between them.
+    """Return the run through poses q (m, n) [rad or m]: their order, and the paths between them.
 
     Where an order is left with a pair that no clear way was found for, the ways found so far serve: from one pose to
     another by way of third ones.
@@ -119,7 +119,7 @@ def plan_run(
     say, (velocity, acceleration) = progress or (lambda words: None), _speeds(chain, settings.speed)
     seconds = partial(move_times, velocity=velocity, acceleration=acceleration)
     room = _room(chain, limits, velocity)
-    say("which moves keep clear")
+    say("checking moves for collisions")
     cost = np.where(_clear_at_places(room, q), 1.0, BLOCKED) * seconds(q[:, None], q)
     known = dict[tuple[int, int], np.ndarray | None]()
     for (one, two), own in (found or {}).items():
@@ -130,7 +130,7 @@ def plan_run(
         order = tour(cost)
         fresh = [pair for pair in map(_pair, order[:-1], order[1:]) if known.get(pair) is None]
         for number, (one, two) in enumerate(fresh, 1):
-            say(f"way {number} of {len(fresh)}")
+            say(f"path {number} of {len(fresh)}")
             own = way(room, q[one], q[two], seed=seed + number, most=tries)
             known[one, two] = own
             cost[one, two] = cost[two, one] = FORBIDDEN if own is None else seconds(own[:-1], own[1:]).sum()
@@ -151,7 +151,7 @@ def plan_run(
 
 
 def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the same poses (m, n) with each revolute joint on one turn, cut where the fewest poses are passed.
+    """Return the poses (m, n) with each revolute joint within one turn, its ends in the largest gap between poses.
 
     A joint with more than one turn can stand everywhere on two; the cut is the middle of the largest gap between the
     poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
@@ -172,7 +172,7 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
-    """Return the fastest order where moves may pass other poses, and its ways; pairs without any way are left out."""
+    """Return the fastest order, if moves may pass other poses, and its paths; unconnected pairs are left out."""
     direct = np.full(cost.shape, np.inf)
     for one, two in clear:
         direct[one, two] = direct[two, one] = cost[one, two]
@@ -190,7 +190,7 @@ def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
 
 
 def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the postures (k, n) within limits that are that of q (n,), its revolute joints on all turns."""
+    """Return the postures (k, n) within limits that differ from q (n,) by whole turns of revolute joints."""
     values = []
     for j, joint in enumerate(chain.joints):
         other = q[j] + 2 * np.pi * np.arange(-3, 4) if joint.kind == "revolute" else q[j : j + 1]
@@ -202,7 +202,7 @@ def way_to(
     chain: Chain, limits: Any, settings: RunSettings, postures: np.ndarray, others: np.ndarray, *, straight: bool,
     seed: int = 0,
 ) -> tuple[int, np.ndarray] | None:  # fmt: skip
-    """Return a clear way (k, n) to one of some postures (p, n) from one of others (m, n), and from which; None: none.
+    """Return a clear path (k, n) from one of m poses to one of p postures, and the start's index; None: not found.
 
     The moves of least time are tried, for each of the `MAX_NEIGHBOURS` nearest postures: straight ones from the
     `MAX_NEIGHBOURS` nearest of the others, or with via-points from the nearest.
@@ -222,7 +222,7 @@ def _pair(one: int, two: int) -> tuple[int, int]:
 
 
 def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
-    """Return (m, m) whether straight moves are clear at `PLACES` places: an estimate, to find an order by."""
+    """Return (m, m) flags: straight moves clear at `PLACES` places (an estimate for ordering the poses)."""
     one, two = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
     places = q[one] + share * (q[two] - q[one])
@@ -233,22 +233,22 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
 
 
 def lines(run: Run, settings: RunSettings) -> list[str]:
-    """Return lines on a run: duration, ways around obstacles, and poses without a clear way."""
+    """Return the lines on a run: duration, paths around obstacles, and poses without a clear path."""
     minutes, before = run.seconds / 60, run.found / 60
     found = [
         f"run: {len(run.order)} poses in {minutes:.1f} min at {settings.speed:.0%} of the joints' speed, "
-        f"{settings.dwell:g} s at each pose ({before:.1f} min in their original order, by straight moves)"
+        f"{settings.dwell:g} s at each pose ({before:.1f} min in their original order with straight moves)"
     ]
     if run.around:
-        found.append(f"{run.around} of {len(run.ways)} ways lead around something: drive their via-points, too")
+        found.append(f"{run.around} of {len(run.ways)} paths lead around an obstacle: drive their via-points, too")
     if run.blocked:
         pairs = ", ".join(f"{k + 1} to {k + 2}" for k in run.blocked)
-        found.append(f"NO clear way was found from pose {pairs}: drive there by hand, or leave a pose out")
+        found.append(f"NO clear path was found from pose {pairs}: jog the robot there, or leave the pose out")
     return found
 
 
 def write_run(path: Path, run: Run, chain: Chain) -> Path:
-    """Write a run as the head of this module says; its poses are numbered in the order they are visited."""
+    """Write the file of a run (format: see the module), its poses numbered in visiting order."""
     factors = [180.0 / np.pi if joint.kind == "revolute" else 1.0 for joint in chain.joints]
     units = ["deg" if joint.kind == "revolute" else "m" for joint in chain.joints]
     header = ["t", "pose", *(f"{joint.name} [{unit}]" for joint, unit in zip(chain.joints, units))]
@@ -271,7 +271,7 @@ def write_run(path: Path, run: Run, chain: Chain) -> Path:
 
 
 def is_run(path: Path) -> bool:
-    """Return whether a CSV file holds a run."""
+    """Return whether a CSV file contains a run."""
     with path.open(encoding="utf-8", errors="replace") as file:
         return file.readline().startswith("t,pose,")
 
@@ -280,7 +280,7 @@ def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.
     """Return a run's file as times (N,) [s] and joint values (N, n) [rad or m] at `rate` [Hz], for a rehearsal.
 
     Raises:
-        MeasurementError: where it lacks a joint.
+        MeasurementError: if a joint's column is missing.
     """
     table = read_table(path)
     names = [
@@ -299,7 +299,7 @@ def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _room(chain: Chain, limits: Any, velocity: np.ndarray) -> Room:
-    """Return where ways may go: half the clearance is kept at places no further apart than it, for any point."""
+    """Return the collision test of paths: half the clearance is required at places at most one clearance apart."""
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
 
@@ -317,7 +317,7 @@ MAX_STRAIGHT_TRIES, MAX_VIA_TRIES = 200, 4
 
 @dataclass(frozen=True, eq=False)
 class Exchange:
-    """What poses are replaced from, and judged by.
+    """Candidates to replace poses, and the index that judges them.
 
     Attributes:
         jacobian: q (m, n) -> whitened observation Jacobians (m, rows, p).
@@ -332,13 +332,13 @@ class Exchange:
     index: Index
 
     def value(self, q: np.ndarray) -> tuple[float, float]:
-        """Return the index of poses (m, n) with those before, and log det(WᵀW) / p."""
+        """Return the index and log det(WᵀW) / p of poses (m, n), together with earlier ones."""
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
         return observability(rows, self.index), float(log_det(flat.T @ flat)) / rows.shape[2]
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
-        """Return the candidates' numbers (N,), best first: by the index they give together with poses (m, n)."""
+        """Return the candidates' indices (N,), sorted by the index that they give together with poses (m, n)."""
         rows, trials = self._rows(q), self.jacobian(self.candidates)
         flat = rows.reshape(-1, rows.shape[2])
         matrices = flat.T @ flat + trials.transpose(0, 2, 1) @ trials
@@ -352,7 +352,7 @@ class Exchange:
 
 @dataclass(frozen=True, eq=False)
 class Drivable:
-    """Poses and their run.
+    """Reachable poses, and the run through them.
 
     Attributes:
         q: (m, n) in the order they came, each revolute joint on the turn it is driven on [rad or m].
@@ -370,13 +370,13 @@ class Drivable:
 
     @property
     def words(self) -> str:
-        """Which poses of the run were replaced, counted from 1 in its order; "" where none was."""
+        """Text on the replaced poses, counted from 1 in the order of the run; "" if none."""
         if not self.replaced:
             return ""
         numbers = ", ".join(f"{k}" for k, place in enumerate(self.run.order, 1) if place in self.replaced)
         poses = f"pose{'s' if len(self.replaced) > 1 else ''} {numbers}"
         before, after = self.value
-        return f"{poses} replaced: no clear way to what stood there (index {before:.5g} → {after:.5g})"
+        return f"{poses} replaced, since no clear path led to the original (index {before:.5g} → {after:.5g})"
 
 
 def drivable(
@@ -388,7 +388,7 @@ def drivable(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Drivable:
-    """Plan the run through poses q (m, n), those replaced that no clear way leads to on any turn of their joints.
+    """Plan the run through poses q (m, n), and replace the poses that no clear path reaches on any joint turn.
 
     Args:
         chain, limits, settings, seed, progress: see `calib.procedure.measuring.run.plan_run`.
@@ -400,7 +400,7 @@ def drivable(
         run = plan_run(chain, q, limits, settings, seed, say, ways)
         if last or not run.cut_off:
             break
-        say(f"{len(run.cut_off)} poses that no clear way leads to")
+        say(f"{len(run.cut_off)} poses without a clear path")
         q, fresh, ways = _rejoined(chain, q, run, exchange, limits, settings, seed)
         replaced |= fresh
     (before, log_before), (after, log_after) = exchange.value(first), exchange.value(q)
@@ -410,7 +410,7 @@ def drivable(
 def _rejoined(
     chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: Any, settings: RunSettings, seed: int
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
-    """Return reachable poses (m, n), the candidates among them by place, and all clear ways."""
+    """Return reachable poses (m, n), the replacements (place -> candidate), and all clear paths."""
     q, found, ways = q.copy(), dict[int, int](), run.found_ways
     joined = [k for k in range(len(q)) if k not in run.cut_off]
     for place in run.cut_off:

@@ -1,4 +1,4 @@
-"""How a measuring run is driven."""
+"""Settings of a measuring run: speed and dwell time."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,11 +10,11 @@ from calib.config_types import Real
 @checked
 @dataclass(frozen=True)
 class RunSettings:
-    """How a run is driven.
+    """Settings of a run: speed and dwell time.
 
     Attributes:
-        speed: share of the joints' largest speeds that the run is driven at.
-        dwell: seconds that each pose takes to settle and be measured.
+        speed: speed of the run, as a share of the joints' largest speeds.
+        dwell: time at each pose to settle and measure [s].
     """
 
     speed: Annotated[float, Real(above=0.0, most=1.0, unit="of the joints' speeds")] = 0.3

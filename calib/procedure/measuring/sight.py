@@ -1,4 +1,4 @@
-"""Whether an instrument sees its targets: cone of acceptance, range, and no link of the arm in between.
+"""Lines of sight from an instrument to its targets: cone of acceptance, range, and no link of the arm in between.
 
 With several targets (reflectors on one plate, each with a direction of its own) a pose counts if one of them is seen,
 and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
@@ -20,14 +20,14 @@ from poses.space import PoseConstraint, constraint_gradient
 BEAM = 0.01
 """Least distance of a link from the line of sight [m]: about the radius of a tracker's beam. Our choice."""
 DISTANCES = 2
-"""Links that are looked at per line of sight: the nearest ones. Our choice; where two change places, both are there."""
+"""Number of nearest links checked per line of sight. Our choice; if two exchange their ranks, both are included."""
 SEEN = 1e-6
-"""What a constraint may be broken by where a target still counts as seen."""
+"""Largest constraint violation at which a target still counts as seen."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Behind:
-    """What links of the arm take from a line of sight: `BEAM` less the distances of the nearest, (m, `DISTANCES`).
+    """Constraint (m, `DISTANCES`) of links near a line of sight: `BEAM` minus the distances of the nearest links.
 
     Attributes:
         arm: with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
@@ -67,17 +67,17 @@ class Sight:
     targets: tuple[tuple[PoseConstraint, ...], ...]
 
     def constraints(self) -> tuple[PoseConstraint, ...]:
-        """Return what a pose has to keep: all that the only target needs, or all that the best of several needs."""
+        """Return the constraints of a pose: all of a single target, or all of the best of several targets."""
         if len(self.targets) == 1:
             return self.targets[0]
         return (PoseConstraint("line of sight to one of the targets", self._best, self._best_gradient),)
 
     def visible(self, q: np.ndarray) -> np.ndarray:
-        """Return (m, T) which targets are seen at poses q (m, n)."""
+        """Return flags (m, T): targets seen at poses q (m, n)."""
         return self._values(q).max(axis=2) <= SEEN
 
     def _values(self, q: np.ndarray) -> np.ndarray:
-        """Return what each target breaks (m, T, k)."""
+        """Return the constraint violations (m, T, k) of each target."""
         return np.stack([np.concatenate([c.function(q) for c in parts], axis=1) for parts in self.targets], axis=1)
 
     def _best(self, q: np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class SeenOnly:
-    """An observation Jacobian (`calib.geometry.observability.Observation`) whose unseen targets' rows are zero."""
+    """An observation Jacobian (`calib.geometry.observability.Observation`) with zero rows for targets not seen."""
 
     of: Observation
     sight: Sight
@@ -105,7 +105,7 @@ class SeenOnly:
         return self.of(q) * self._mask(q)
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n); which targets are seen does not change in a small step."""
+        """Return Σ G[i] · ∂J[i]/∂q (m, n), for an unchanged set of seen targets."""
         return self.of.product(q, G * self._mask(q))
 
     def _mask(self, q: np.ndarray) -> np.ndarray:
@@ -120,7 +120,7 @@ def sight_of(
     span: tuple[float, float],
     arm: Any | None,
 ) -> Sight | None:
-    """Return what it takes to see the targets of an arm; None where nothing is asked.
+    """Return the lines of sight to the targets of an arm; None if no condition is stated.
 
     Args:
         cell: the arm with its T targets.
@@ -147,7 +147,7 @@ def sight_of(
 
 
 def _beside(arm: Any, chain: Chain, target: Target) -> np.ndarray:
-    """Return the indices of links that can block the view: those not next to the target in every posture."""
+    """Return the indices of the links that can block the view: those not next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
     place = target(q)[1]
     distances = arm.beam(q, place, np.zeros((len(q), 3, chain.n)), place + 1e-6)[0]

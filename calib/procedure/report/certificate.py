@@ -1,6 +1,6 @@
-"""The certificate: a first sheet to be filed, the sections it sums up, and what every certificate says besides.
+"""The certificate: a summary sheet, the sections it summarises, and notes common to all certificates.
 
-It is written as HTML, one file without any outside reference, for the screen and for paper.
+It is written as HTML, one self-contained file for screen and print.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ CONVENTIONS = (
     "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
     "Quaternions are x y z w; roll-pitch-yaw is R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.",
     "A station is the pose of the arm's base in the instrument's frame, a tool that of the target in the tip's frame.",
-    "Nominal errors are those of the nominal arm with station and tool fitted on the same rows, so that arms are "
-    "compared and not installations.",
-    "rms is the root mean square of the error vector's length over poses, not per axis; ± is its standard error: what "
-    "another set of as many poses would change.",
+    "Nominal errors are those of the nominal arm with station and tool fitted on the same rows, so that only the "
+    "arms are compared.",
+    "rms is the root mean square of the error vector's length over poses, not per axis; ± is its standard error over "
+    "sets of as many poses.",
 )
 LIMITATIONS = (
-    "Sigmas state what the measurements' noise leaves open under the chosen model; they do not cover effects that no "
-    "parameter of the model holds (see the residual plots for trends).",
-    "The figures hold for the region, payload and temperature of the measured poses.",
+    "Sigmas are the uncertainty from measurement noise under the chosen model; they do not cover unmodelled "
+    "effects (see the residual plots for trends).",
+    "The figures are valid for the region, payload and temperature of the measured poses.",
 )
 
 
@@ -100,7 +100,7 @@ def certificate(
 
 
 def _fitting(section: Section) -> Section:
-    """Return a section whose reason fits the first sheet; the whole of a longer one comes first among its blocks."""
+    """Return a section with its reason shortened to fit the first sheet; the full text becomes its first block."""
     short = _shortened(section.reason, MAX_REASON_LETTERS)
     if short == section.reason:
         return section
@@ -108,38 +108,38 @@ def _fitting(section: Section) -> Section:
 
 
 def _shortened(text: str, most: int) -> str:
-    """Return a text cut at a word, with an ellipsis, where it is longer than `most` letters."""
+    """Return a text, cut at a word with an ellipsis if it is longer than `most` letters."""
     return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
 
 
 def file_row(name: str, role: str, path: Path) -> FileRow:
-    """Return how a certificate lists a file that it rests on: name, what it is, bytes, SHA-256."""
+    """Return the entry of a file in the certificate: name, content, bytes, SHA-256."""
     return name, role, str(path.stat().st_size), files.fingerprint(path)
 
 
 def unseen_role(role: str, seen: bool, judged: str) -> str:
-    """Return what a file of validation is: whether what is `judged` has seen its rows."""
+    """Return the role of a validation file: unseen or not by what is `judged`."""
     return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
 
 
 def tolerance(millimetres: float | None, found: FitMetrics) -> str:
-    """Return what a verdict of pass means, and of which deliverable, in words."""
+    """Return a text on the condition of verdict pass, and on the rated deliverable."""
     of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
     if not millimetres:
-        return f"none was given: pass means better than the nominal robot on unseen poses, or nothing to gain{of}"
+        return f"not stated: pass means better than the nominal robot on unseen poses, or no gain possible{of}"
     return f"{millimetres:g} mm rms on unseen poses{of}"
 
 
 @cache
 def versions() -> str:
-    """Return the toolkit's version and those of what its numbers depend on."""
+    """Return the versions of the toolkit and of the libraries that its results depend on."""
     names = ("armature-calib", "numpy", "scipy")
     known = ", ".join(f"{name} {metadata.version(name)}" for name in names)
     return f"{known}, Python {platform.python_version()}"
 
 
 def issued(now: datetime | None = None) -> str:
-    """Return when, and by which version, a page is made."""
+    """Return date and toolkit version of a page as text."""
     when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
     return f"{when}, armature-calib {metadata.version('armature-calib')}"
 
@@ -150,14 +150,14 @@ def render(page: Page) -> str:
 
 
 def filled(package: str, file: str, **values: Any) -> str:
-    """Return the template in a file of a package with values, in the style of all pages."""
+    """Return a package's template, filled with values in the common style of pages."""
     style = resources.files("calib.procedure.report").joinpath("certificate.css").read_text(encoding="utf-8")
     return _template(package, file).render(**values, style=style)
 
 
 @cache
 def _template(package: str, file: str) -> jinja2.Template:
-    """Return a template, compiled once for a process that writes many pages."""
+    """Return the compiled template of a file, cached within a process."""
     import jinja2  # slow to load, and not needed to write the rest
 
     source = resources.files(package).joinpath(file).read_text(encoding="utf-8")
@@ -167,7 +167,7 @@ def _template(package: str, file: str) -> jinja2.Template:
 
 
 def write_fit(outcome: Outcome, folder: Path, plots: bool = True, page: bool = True) -> None:
-    """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder.
+    """Write ``report.json``, figures, and the certificate of a fit (without a session) into its folder.
 
     Args:
         plots: whether there are to be figures; the certificate is written without them, too.
@@ -187,7 +187,7 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, page: bool = T
 
 
 def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None = None) -> Page:
-    """Return the certificate of a fit alone, without a session around it; of its inputs the files are named."""
+    """Return the certificate of a fit without a session; it lists the input files if `inputs` are given."""
     rows, named = [], []
     if inputs is not None:
         measured = ", ".join(path.name for path in _measured(inputs))
@@ -207,7 +207,7 @@ def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None =
 
 
 def _measured(inputs: Inputs) -> dict[Path, str]:
-    """Return the files that were fitted and judged on, and what they are."""
+    """Return the files for fit and validation, each with its role."""
     found = {Path(block.file): "measured" for block in inputs.fit if block.file}
     for unseen in inputs.unseen.values():
         if not unseen.held_out and unseen.block.file:

@@ -28,7 +28,7 @@ Layer = Callable[..., None]  # draws onto the axes of a panel, whose scales are 
 
 
 def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
-    """Return the function that takes all but the axes of a drawing function, and returns the layer it draws.
+    """Return a function that makes a layer from a drawing function's arguments, without its axes.
 
     What it returns can be pickled, which the cache of drawn pictures needs.
     """
@@ -45,7 +45,7 @@ def line(
     axes: Axes, x: Any, y: Any, form: str = "-", colour: str = AFTER, width: float = 0.9, size: float = 3.5,
     hollow: bool = False, label: str = "", spread: Any = None,
 ) -> None:  # fmt: skip
-    """Draw a curve or points (k,), in matplotlib's letters (``-``, ``o``, ``o-``); long curves are thinned.
+    """Draw a curve or points (k,) in a matplotlib format (``-``, ``o``, ``o-``); long curves are thinned.
 
     Args:
         spread: (k,) half lengths of error bars; None: none.
@@ -77,7 +77,7 @@ def level(
     axes: Axes, at: float, colour: str = MARK, form: str = "--", upright: bool = False, words: str = "",
     height: float = 0.98,
 ) -> None:  # fmt: skip
-    """Draw a line across the panel, horizontal or upright; words at an upright one stand at this height."""
+    """Draw a horizontal or vertical line across the panel, with a label; at a vertical line at the given height."""
     (axes.axvline if upright else axes.axhline)(at, color=colour, linewidth=0.8, linestyle=form)
     right = not upright or axes.transAxes.inverted().transform(axes.transData.transform((at, at)))[0] < 0.6
     axes.annotate(
@@ -93,13 +93,13 @@ def text(
     axes: Axes, words: str, x: float, y: float, offset: tuple[float, float] = (4, 4), colour: str = INK,
     size: float = 7.0, across: str = "left", along: str = "baseline",
 ) -> None:  # fmt: skip
-    """Write words at a point, moved by an offset [pt]."""
+    """Draw a text at a point, shifted by an offset [pt]."""
     axes.annotate(words, (x, y), offset, textcoords="offset points", color=colour, fontsize=size, ha=across, va=along)
 
 
 @layer
 def dots(axes: Axes, x: Any, y: Any, values: Any, most: float, unit: str = "") -> None:
-    """Draw points (k,) coloured by their values (k,) up to `most`; a scale explains them where there is a `unit`."""
+    """Draw points (k,) coloured by their values (k,) up to `most`, with a colour bar if `unit` is given."""
     order = np.argsort(values)  # the largest on top
     x, y, values = (np.asarray(each)[order] for each in (x, y, values))
     drawn = axes.scatter(x, y, SIZE, values, cmap="cividis_r", vmin=0.0, vmax=most, edgecolors=QUIET, linewidths=0.25)
@@ -112,7 +112,7 @@ def heat(
     axes: Axes, values: Any, unit: str = "", extent: tuple[float, float, float, float] | None = None,
     limits: tuple[float, float | None] = (0.0, None), colours: str = "cividis_r", written: bool = False,
 ) -> None:  # fmt: skip
-    """Draw a map (rows, columns) of values with its scale, row 0 above; NaN stays white.
+    """Draw a colour map of values (rows, columns) with a colour bar, row 0 at the top, NaN white.
 
     Args:
         extent: left, right, bottom, top; by default cell k is at k.
@@ -131,14 +131,14 @@ def heat(
 
 @layer
 def histogram(axes: Axes, counts: Any, edges: Any, colour: str = AFTER) -> None:
-    """Draw counts (k,) between edges (k + 1,)."""
+    """Draw a histogram of counts (k,) between edges (k + 1,)."""
     axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 @layer
 def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
-    """Draw values (k,) at a place of the y axis: quartiles and median, 5th and 95th percentile, points beyond."""
+    """Draw a box plot of values (k,) at a place of the y axis: quartiles and median, 5th and 95th percentile, points beyond."""
     axes.boxplot(
         [values], positions=[place], orientation="horizontal", whis=(5, 95), widths=0.56, patch_artist=True,
         manage_ticks=False, boxprops={"facecolor": colour, "linewidth": 0}, whiskerprops={"color": QUIET},
@@ -154,7 +154,7 @@ def _scale(axes: Axes, drawn: Any, unit: str, **options: Any) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Layers over two axes.
+    """A panel of a chart: layers over two axes.
 
     Attributes:
         layers: drawn in their order.
@@ -185,7 +185,7 @@ class Panel:
     ticks: int = 0
 
     def draw(self, axes: Axes) -> None:
-        """Draw the panel."""
+        """Draw the panel's layers, labels and limits on matplotlib axes."""
         axes.set(title=self.title, xlabel=self.x, ylabel=self.y)
         for axis, names, limits in ((axes.xaxis, self.xnames, self.xlim), (axes.yaxis, self.ynames, self.ylim)):
             if limits:
@@ -215,7 +215,7 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Panels row by row.
+    """A figure as a value: panels, row by row.
 
     Attributes:
         panels: at least one.
@@ -233,7 +233,7 @@ class Chart:
 
 
 def figure(chart: Chart) -> Figure:
-    """Return a chart drawn by matplotlib, without a window."""
+    """Return the matplotlib figure of a chart, without a window."""
     with style.styled(quiet_titles=bool(chart.title)):
         rows = -(-len(chart.panels) // chart.columns)
         result, axes = style.sheet(rows, chart.columns, chart.width, chart.height, 0.25 if chart.title else 0.0)
@@ -247,12 +247,12 @@ def figure(chart: Chart) -> Figure:
 
 
 def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
-    """Return charts by name, drawn."""
+    """Return the matplotlib figures of charts, by name."""
     return {name: figure(chart) for name, chart in charts.items()}
 
 
 def picture(chart: Chart, caption: str) -> Picture:
-    """Return a chart for a page; one that was drawn before is taken again: a certificate shows what its steps drew."""
+    """Return a chart as a picture for a page; a chart drawn before is taken from the cache."""
     return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH)
 
 

@@ -1,4 +1,4 @@
-"""The figures of the dynamics: of an identification's outcome for its folder, and of what a folder keeps for a page."""
+"""Figures of the dynamics: of an identification's outcome, and of the files of its folder for a page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,7 +44,7 @@ def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -> Chart:
-    """Draw the torques of one file, measured and predicted (N, rows)."""
+    """Return the chart of one file's torques, measured and predicted (N, rows)."""
     kind = "fitted" if case.name in outcome.fit else "repeat" if case.name in outcome.repeated else "unseen"
     found = {**outcome.fit, **outcome.validation}[case.name].raw
     title = f"{case.name} ({kind}): {found.total:.3g} % of the torque unexplained"
@@ -54,7 +54,7 @@ def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutco
 
 
 def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
-    """Draw the autocorrelations of the residuals below the band, of the file that judges."""
+    """Return the chart of the residuals' autocorrelations below the band, for the file that decides the verdict."""
     name = next(iter(outcome.validation or outcome.fit))
     found = {**outcome.fit, **outcome.validation}[name]
     title = f"{name}: autocorrelation of the residuals at {found.rate:.3g} Hz, dashed: white noise"
@@ -62,7 +62,7 @@ def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
 
 
 def _friction(outcome: IdentificationOutcome) -> Chart:
-    """Draw each joint's friction over its velocity: what the rigid model leaves of the first file, and the model's."""
+    """Return the chart of friction over velocity: first file's torques minus the rigid model, and friction model."""
     found, case = outcome.found, outcome.inputs.cases[0]
     model = found.dynamics.model
     terms = list(zip(model.columns, found.dynamics.values[model.inertial :]))
@@ -97,7 +97,7 @@ def torques(
     t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, rows: Sequence[str], units: Sequence[str], title: str,
     errors: Sequence[float] | np.ndarray = (),
 ) -> Chart:  # fmt: skip
-    """Return measured and predicted torque of every row over time, and the residual.
+    """Return the chart of measured torques, predicted torques and residuals over time.
 
     Args:
         t: (N,) [s].
@@ -124,7 +124,7 @@ def torques(
 def autocorrelations(
     found: Sequence[Whiteness | None], rows: Sequence[str], title: str = "", width: float = PAGE_WIDTH
 ) -> Chart:
-    """Return the autocorrelation of every row's residual, with the bounds of white noise.
+    """Return the chart of the autocorrelation of each row's residual, with the bounds of white noise.
 
     Args:
         found: of each torque row; None of rows that are too short to say.
@@ -152,7 +152,7 @@ def autocorrelations(
 
 
 def from_folder(folder: Path) -> dict[str, Picture]:
-    """Return the figures that an identification's folder gives, by name; none of a robot without a fit."""
+    """Return the figures of geometry against dynamics from an identification's folder, by name; empty without a fit."""
     result: dict[str, Picture] = {}
     rows = [
         row for row in _read(TwoGeometries, folder / GEOMETRIES) if row.essential == "yes" and row.calibrated != 0.0
@@ -160,16 +160,16 @@ def from_folder(folder: Path) -> dict[str, Picture]:
     if rows:
         words = (
             "Essential parameters identified from the same torques on the nominal (CAD) and on the calibrated geometry "
-            "(as Fig. 7 of Kolyubin et al. 2019). Above: relative to the calibrated one, bars two sigmas (nominal: of "
-            "torque noise; calibrated: with the geometry's uncertainty). Below: how far the nominal one's estimate "
-            "is off, in the calibrated one's sigmas."
+            "(as Fig. 7 of Kolyubin et al. 2019). Above: values relative to the calibrated one, bars two sigmas (nominal: "
+            "of torque noise; calibrated: with the geometry's uncertainty). Below: difference of the two estimates, "
+            "in sigmas of the calibrated one."
         )
         result["geometries"] = picture(_geometries(rows), words)
     known = [row for row in _read(GeometricEffect, folder / EFFECTS) if row.sigma is not None]
     if known:
         words = (
-            "Which geometric errors matter for the dynamics: what one standard deviation of each does to the parameter "
-            "it moves most, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
+            "Effect of geometric errors on the dynamics: largest parameter shift caused by one standard deviation of "
+            "each error, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
         result["geometry_effects"] = picture(_effects(known[:MAX_ELEMENTS]), words)
@@ -177,7 +177,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
-    """Return each parameter on both geometries with error shown, and the difference in sigmas."""
+    """Return the chart of each parameter on both geometries with error bars, and of the differences in sigmas."""
     table = np.array([(row.nominal, row.sigma_nominal, row.calibrated, row.sigma_calibrated) for row in rows])
     nominal, s_nominal, own, s_own = table.T
     x, percent = np.arange(len(rows)), 100.0 / np.abs(own)
@@ -194,19 +194,19 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
         Panel(above, y="from calibrated [%]", xnames=[""] * len(rows), grid="y", symlog=1.0),
         Panel([shown], y="difference [σ]", xnames=[row.name for row in rows], grid="y", symlog=2.0),
     ]
-    title = f"{int(moved.sum())} of {len(rows)} parameters move by two sigmas with the geometry"
+    title = f"{int(moved.sum())} of {len(rows)} parameters change by two sigmas with the geometry"
     return Chart(panels, 4.2, title=title)
 
 
 def _effects(rows: Sequence[GeometricEffect]) -> Chart:
-    """Return the ranked geometric errors by the largest shift they cause."""
+    """Return the chart of geometric errors, ranked by the largest parameter shift they cause."""
     size = np.array([row.shift_sigma or 0.0 for row in rows])
     layers = [
         bars(size, [AFTER if one > MIN_SHIFT else QUIET for one in size]), level(MIN_SHIFT, upright=True),
         *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
     ]  # fmt: skip
     labels = [f"{row.element} ({small(row.sigma or 0.0, row.unit, digits=2)})" for row in rows]
-    title = f"{int((size > MIN_SHIFT).sum())} of these {len(rows)} geometric errors matter"
+    title = f"{int((size > MIN_SHIFT).sum())} of {len(rows)} geometric errors have an effect"
     limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))
     panel = Panel(layers, title, "shift [σ of torque noise]", xlim=limits, ynames=labels)
     return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF_WIDTH)
@@ -219,7 +219,7 @@ def _read(kind: type[T], path: Path) -> tuple[T, ...]:
 def draw_dynamics(
     found: DynamicReport, folder: Path, excitation: Path | None, joints: Sequence[Joint]
 ) -> dict[str, Pictures]:
-    """Return the figures of the dynamics by name, as a page shows them; those that the data do not give are empty.
+    """Return the pictures of the dynamics for a page, by name; empty lists if data are missing.
 
     Args:
         folder: of the identification.
@@ -242,26 +242,26 @@ def draw_dynamics(
 
 
 def _judged(unseen: UnseenReport) -> list[Picture]:
-    """Return the error of every row [%], and the residuals' autocorrelations, of the recording that judges."""
+    """Return the pictures of each row's error [%] and of the autocorrelations, for the recording that decides."""
     _, proof, where = proof_of(unseen)
     fitted, left = (np.nan_to_num(one.raw.joints) for one in (next(iter(unseen.fit.values())), proof))
     shown = [
         bars(fitted, BEFORE, shift=-0.19, thick=0.36, label="training motion"),
         bars(left, AFTER, shift=0.19, thick=0.36, label="unseen motion"),
     ]
-    title = f"at most {max(left, default=0.0):.3g} % left"
+    title = f"at most {max(left, default=0.0):.3g} % unexplained"
     panel = Panel(shown, x="torque unexplained [%]", ynames=unseen.rows, grid="x")
     width = PAGE_WIDTH if len(unseen.rows) > MAX_HALF_PAGE_ROWS else HALF_WIDTH
     errors = Chart([panel], 0.8 + 0.21 * len(unseen.rows), width=width, title=title)
     name, looked = next(iter((unseen.validation or unseen.fit).items()))
     drawn = autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
-    shares = f"Share of each torque that the model leaves, on the training motion and on {where}."
+    shares = f"Unexplained share of each torque, on the training motion and on {where}."
     rest = f"Autocorrelation of the residuals below the band on {name}; dashed: white noise."
     return [picture(errors, shares), picture(drawn, rest)]
 
 
 def _torques(unseen: UnseenReport) -> list[Picture]:
-    """Return measured and predicted torques of each unseen recording, or of those fitted."""
+    """Return the pictures of measured and predicted torques of unseen recordings, or else of fitted ones."""
     seen = "unseen" if unseen.validation else "fitted"
     result = []
     for curves in unseen.curves:
@@ -274,11 +274,11 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
 
 
 def _significance(found: DynamicReport) -> Picture:
-    """Return how many sigmas each parameter is from zero; below two it is not significant."""
+    """Return the picture of each parameter's distance from zero in sigmas; below two it is not significant."""
     known = [row for row in found.estimate if row.sigma]
     share = np.array([max(abs(row.value) / max(row.sigma or 0.0, 1e-300), 0.1) for row in known])
     shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)
     title = f"{int((share > 2).sum())} of {len(known)} parameters differ from zero by two sigmas"
     limits, names = (0.1, 2.0 * float(share.max(initial=2.0))), [row.name for row in known]
     chart = Chart([Panel([shown, level(2.0)], title, y="|value| / σ", ylim=limits, log="y", xnames=names)], 2.3)
-    return picture(chart, "How far each parameter is from zero, in its σ; grey: not significant.")
+    return picture(chart, "Distance of each parameter from zero, in its σ; grey: not significant.")

@@ -1,4 +1,4 @@
-"""The dynamics in a report: what the console says of an identification and what stands on the certificate."""
+"""The dynamics section of reports, for the console output of an identification and for certificates."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ SHOWN = 8  # geometric errors listed
 WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 ERROR_NOTE = (
     "Error: 100 ‖τ - τ̂‖ / ‖τ‖ of the torque as recorded; in band: both low-passed to the band of the motion; moving, "
-    "standing: as recorded, where the joint moves or stands. What of the torque lies above that band (noise, ripple) "
-    "no model of q, v, a explains. ACF outside: share of the residual's autocorrelations beyond the 95 % bounds of "
+    "standing: as recorded, where the joint moves or stands. Torque above that band (noise, ripple) is explained "
+    "by no model of q, v, a. ACF outside: share of the residual's autocorrelations beyond the 95 % bounds of "
     "white noise; 5 % if it is white."
 )
 EFFECTS = (
     Column("geometric error", "{0.element}", number=False),
     Column("sigma", lambda one: small(one.sigma, one.unit)),
     Column("moves most", "{0.parameter}", number=False),
-    Column("by, in its sigma of torque", "{0.shift_sigma:.2f}"),
+    Column("shift [its σ of torque noise]", "{0.shift_sigma:.2f}"),
     Column("parameters moved", "{0.parameters_moved}"),
     Column("torque rms [N m]", lambda one: f"{one.torque_rms or 0.0:.2g}"),
 )
@@ -56,7 +56,7 @@ FED_FORWARD = {
 
 
 class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; RSD in percent; no σ where nothing was measured."""
+    """A row of ``estimate.csv``; RSD in percent; σ is None if not measured."""
 
     name: str
     expression: str
@@ -68,7 +68,7 @@ class IdentifiedParameter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DynamicReport:
-    """What an identification and its validation left behind.
+    """The stored results of an identification and its validation.
 
     Attributes:
         metrics: of the identification.
@@ -84,10 +84,10 @@ class DynamicReport:
 
 
 def read(folder: Path) -> DynamicReport:
-    """Read what the steps identify and predict have left.
+    """Read the results of the steps identify and predict.
 
     Raises:
-        UsageError: where it is missing or made by another version.
+        UsageError: if it is missing or made by another version.
     """
     effects = folder / geometry_tables.EFFECTS
     try:
@@ -103,7 +103,7 @@ def read(folder: Path) -> DynamicReport:
 
 
 def read_lines(inputs: IdentificationInputs) -> list[str]:
-    """Return robot and recordings as they were read, in sentences."""
+    """Return lines on the robot and the recordings, as read."""
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
@@ -120,7 +120,7 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
 
 
 def outcome_section(outcome: IdentificationOutcome) -> Section:
-    """Return what an identification came to as the console says it: ladder, model, errors, tracking, verdict."""
+    """Return the console's section on an identification: ladder, model, errors, tracking, verdict."""
     found = record_of(outcome)
     chain, torques = outcome.inputs.chain, outcome.found.settings.torque_rows
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
@@ -159,7 +159,7 @@ def certificate_section(
     blocks.append(Text("The model", _model_sentences(metrics)))
     blocks.append(Text("What the motion identifies", _identifiability(found)))
     blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
-    note = "R marks parameters into which others are regrouped; in full in 8-dynamics/estimate.csv."
+    note = "R marks parameters into which others are regrouped; complete table: 8-dynamics/estimate.csv."
     blocks += [*pictures("parameters"), table("Identified parameters", PARAMETERS, found.estimate, note)]
     if metrics.loop:
         blocks.append(Text("Closed loop", _loop_sentences(metrics.loop)))
@@ -170,7 +170,7 @@ def certificate_section(
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
-    """Return name and errors of the recording that judges (the worst unseen one, else the fitted one), and on what."""
+    """Return name, errors and kind of motion of the deciding recording: the worst unseen one, else the fitted one."""
     where = "unseen motion" if unseen.proofs else "the training motion"
     sets = unseen.proofs or unseen.fit
     name, found = max(sets.items(), key=lambda item: item[1].raw.total)
@@ -178,7 +178,7 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
 
 
 def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure]:
-    """Return the errors of the torque that the verdict rests on, of the worst unseen recording."""
+    """Return the torque errors that decide the verdict, of the worst unseen recording."""
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
@@ -197,12 +197,12 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
 
 
 def percent(value: float) -> str:
-    """Return a share in percent with three digits; a dash where there is none."""
+    """Return a percentage with three digits as text; a dash if not finite."""
     return _number(value, " %")
 
 
 def _rsd(percent: float) -> str:
-    """Return an RSD [%] in words where its size says no more."""
+    """Return an RSD [%] as text; "above 1000 %" if larger."""
     return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
@@ -210,7 +210,7 @@ def _error_table(
     training: Mapping[str, Score], unseen: Mapping[str, Score], rows: Sequence[str],
     units: Sequence[str],
 ) -> Table:  # fmt: skip
-    """Return errors of the torque per row, of every recording.
+    """Return the table of torque errors, per row and recording.
 
     Args:
         training, unseen: recordings by name.
@@ -240,7 +240,7 @@ def _error_table(
 def _interval_blocks(
     unseen: Mapping[str, Score], rows: Sequence[str], units: Sequence[str]
 ) -> list[Block]:  # fmt: skip
-    """Return how many errors are within the 95 % interval that the model states, per row of unseen recordings."""
+    """Return the coverage of the predicted 95 % intervals, per row of unseen recordings."""
     cells: list[Sequence[str]] = []
     strong = set()
     for name, one in unseen.items():
@@ -258,7 +258,7 @@ def _interval_blocks(
 
 
 def _friction_table(metrics: ModelMetrics) -> Table:
-    """Return the friction models tried, with their error on time left out, of all rows and of each."""
+    """Return the table of friction models with their error on held-out time, of all rows and of each."""
     rows, strong = [], set()
     for step in metrics.ladder:
         if step.kept:
@@ -270,51 +270,51 @@ def _friction_table(metrics: ModelMetrics) -> Table:
     each = [str(j + 1) for j in range(max((len(step.joints_percent) for step in metrics.ladder), default=0))]
     rows = [(*row[:-1], *[""] * (len(each) + 4 - len(row)), row[-1]) for row in rows]
     header = ("friction", "p", "total", *each, "kept at joints")
-    title = "Ladder of friction models: relative error on time left out [%]"
+    title = "Ladder of friction models: relative error on held-out time [%]"
     return Table(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), range(1, 3 + len(each)))
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return how many parameters there are, by which method they were found, and which the data do not identify."""
+    """Return sentences on the model: number of parameters, method, and eliminated parameters."""
     lines = []
     for one in metrics.ripple:
         others = ("" if wave.gear == one.joint else f" of joint {wave.gear}" for wave in one.waves)
         waves = (f"{wave.order_per_turn:g}{other}" for wave, other in zip(one.waves, others))
         lines.append(
             f"ripple at joint {one.joint}, orders {', '.join(waves)} per turn: explains "
-            f"{100 * one.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on time blocks left out; "
+            f"{100 * one.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out time blocks; "
             "not part of the covariance"
         )
     for step in metrics.ladder:
         if step.model == "+ coupling":
             at = step.kept_at_joints
             lines += [f"joints {i} and {j} are coupled: a motor turns with both" for i, j in zip(at[::2], at[1::2])]
-    lines.append(f"method {metrics.method}: takes for granted that {metrics.method_assumes}")
+    lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
     count, columns = metrics.parameters, metrics.counts
     base = count.standard - columns.without_effect - columns.regrouped
     raw, normalised = metrics.condition_number.raw, metrics.condition_number.normalised
     condition = ", with unit columns ".join(f"{x:.0f}" if np.isfinite(x) else "infinite" for x in (raw, normalised))
     lines.append(
         f"{count.standard} standard parameters: {columns.without_effect} without effect, {columns.regrouped} "
-        f"regrouped, {base} base; {count.base - base} of richer friction; condition {condition}"
+        f"regrouped, {base} base; {count.base - base} additional friction parameters; condition {condition}"
     )
     if metrics.elimination or count.essential < count.base:
         gone = ", ".join(
             f"{one.name} ({_rsd(one.rsd)})" if np.isfinite(one.rsd) else one.name for one in metrics.elimination
         )
-        lines.append(f"{count.essential} essential parameters; left out, with their RSD: {gone or 'none'}")
+        lines.append(f"{count.essential} essential parameters; removed, with their RSD: {gone or 'none'}")
     return lines
 
 
 def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[Block]:
-    """Return which geometric errors matter for the dynamics: a summary, and the worst of them."""
+    """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest ones."""
     found = metrics.geometry
     if found is None:
         return []
     lines, tilt = [found.summary], found.moved_by_1_mrad_of_tilt
     if found.propagated and tilt.sigmas > geometry_tables.MIN_SHIFT:
         lines.append(
-            f"not part of it is how level the base stands: 1 mrad against gravity would move {tilt.parameter} by "
+            f"a tilt of the base is not included: 1 mrad against gravity would change {tilt.parameter} by "
             f"{tilt.sigmas:.2g} of its sigma of torque noise"
         )
     known = [one for one in effects if one.matters == "yes" and None not in (one.sigma, one.shift_sigma)]
@@ -325,28 +325,28 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
 
 
 def _loop_sentences(loop: LoopMetrics) -> list[str]:
-    """Return how the simulated loop went and what it says of least squares."""
+    """Return sentences on the closed-loop simulation, and on the bias of least squares."""
     lines, test = list(loop.notes), loop.durbin_wu_hausman
     if test is None:
         return lines
     whose = f"the test of least squares by {loop.instruments}, not this estimate: " if loop.beside else ""
     lines.append(
-        f"{whose}closed loop simulated, {loop.rounds} rounds; simulated against recorded motion "
-        f"{_joints(loop.distance_percent)} % apart, torque {_joints(loop.simulated_torque_error_percent)} %"
+        f"{whose}closed loop simulated, {loop.rounds} rounds; difference of simulated and recorded motion "
+        f"{_joints(loop.distance_percent)} %, torque {_joints(loop.simulated_torque_error_percent)} %"
     )
     strength = "weak" if loop.instruments_weak else "strong"
     lines.append(
         f"instruments: full rank, Cragg-Donald {_number(loop.cragg_donald)} ({strength}), least share of a column "
         f"explained {100 * loop.least_partial_r2:.3g} %"
     )
-    said = "no bias of least squares is seen"
+    said = "no bias of least squares is detected"
     if test.least_squares_biased:
         little = loop.largest_shift_sigma < MAX_SHIFT_SIGMAS
-        said = "least squares is biased, surely but by little" if little else "least squares is biased"
+        said = "least squares is biased, significantly but slightly" if little else "least squares is biased"
     if not loop.explains:
-        said = "of a loop that explains less than the model does: it says nothing"
+        said = "no result, since the simulated loop explains less than the model does"
     if not loop.valid:
-        said += ", but these instruments are not to be trusted"
+        said += ", but the instruments are unreliable"
     p = f"p = {test.p:.2g}" if test.p > 0.0 else "p < 1e-300"
     degrees = ", ".join(f"{one:g}" for one in test.degrees)
     lines.append(
@@ -365,9 +365,9 @@ def _number(value: float, unit: str = "") -> str:
 
 
 def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Block]:
-    """Return how far the simulated robot strays with the model fed forward, and what that means."""
+    """Return the blocks on the simulated tracking errors with the model as feedforward."""
     if failure:
-        why = f"tracking with the model fed forward was not simulated: {failure}"
+        why = f"tracking with the model as feedforward was not simulated:  {failure}"
         return [Text("Tracking, simulated", [why])]
     if not replays:
         return []
@@ -378,27 +378,24 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Bl
         rows += [(FED_FORWARD[key], *map(_number, 1e3 * rms)) for key, rms in one.rms.items()]
     joints = [str(j + 1) for j in range(len(first.inertia_added))]
     lines = []
-    gain = f": feeding the model forward divides the tracking error by {first.feedback_over_model:.3g}"
+    gain = f": feedforward of the model reduces the tracking error by a factor of {first.feedback_over_model:.3g}"
     if first.inertia_added.any():
         shown = " ".join(f"{x:.2g}" for x in first.inertia_added)
         lines.append(
-            f"the identified model is no possible robot: it is simulated with motor inertia added, {shown} kg m² (kg); "
-            "compare the rows, do not trust their size"
+            f"the identified model is physically inconsistent: simulated with motor inertia added, {shown} kg m² (kg); "
+            "compare the rows only relatively"
         )
         gain = ""
     default = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
     control = "the controller of [loop]" if first.stated else default
-    motion = "motion the fit has not seen" if first.unseen else "the motion of the fit itself, which flatters"
-    lines.append(
-        f"the simulated robot is the identified model, disturbed by the torque it left unexplained; {control}; "
-        f"{motion}{gain}"
-    )
+    motion = "unseen motion" if first.unseen else "the training motion, which gives too small errors"
+    lines.append(f"the simulated robot is the identified model plus the unexplained torque; {control}; {motion}{gain}")
     title = "Tracking, simulated: rms of q - reference [mrad or mm]"
     return [Table(title, ("fed forward", *joints), rows, numbers=range(1, 1 + len(joints))), Text("", lines)]
 
 
 def _identifiability(found: DynamicReport) -> list[str]:
-    """Return what the motion identifies and what not, in sentences."""
+    """Return sentences on the parameters that the motion identifies, and on the residuals."""
     lines = []
     weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:
@@ -407,11 +404,11 @@ def _identifiability(found: DynamicReport) -> list[str]:
     coloured = [row for row, white in zip(found.unseen.rows, proof.whiteness) if white and white.outside > WHITE]
     if coloured:
         lines.append(
-            f"What is left on {where} is not white in {', '.join(coloured)}: something the model does not hold is in "
-            "it, and σ, which takes it for noise, is too small there."
+            f"The residual on {where} is not white in {', '.join(coloured)}: it contains unmodelled effects, "
+            "so that σ is too small there."
         )
     elif any(proof.whiteness):
-        lines.append(f"What is left on {where} cannot be distinguished from white noise.")
+        lines.append(f"The residual on {where} cannot be distinguished from white noise.")
     return lines
 
 

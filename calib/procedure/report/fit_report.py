@@ -1,4 +1,4 @@
-"""What a certificate of a fit is made from: plain numbers in ``report.json``, so that it can be printed again later."""
+"""The data of a fit's certificate: plain numbers in ``report.json``, from which it can be written again."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FittedParameter(NamedTuple):
 
 
 class _CorrelatedPair(NamedTuple):
-    """Two parameters that go together."""
+    """Two correlated parameters."""
 
     first: str
     second: str
@@ -51,7 +51,7 @@ class _CorrelatedPair(NamedTuple):
 
 @dataclass(frozen=True)
 class _CorrelationMatrix:
-    """Of those parameters that go together most."""
+    """Correlation matrix of the most correlated parameters."""
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
@@ -83,7 +83,7 @@ class RowErrors:
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of a fit as JSON holds it.
+    """The outcome of a fit, as stored in JSON.
 
     Attributes:
         robot: its name; base and tip links.
@@ -117,14 +117,14 @@ class Report:
     images: tuple[ImageCoverage, ...] = ()
 
     def with_unseen(self, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
-        """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
+        """Return the report, extended by unseen rows (`rows_of`) and updated verdict, reason and warnings."""
         metrics = replace(self.metrics, **vars(found))
         fresh = {one.name for one in sets}
         return replace(self, metrics=metrics, sets=(*(one for one in self.sets if one.name not in fresh), *sets))
 
 
 def collect(outcome: Outcome) -> Report:
-    """Return what a certificate needs of a fit."""
+    """Return the report of a fit's outcome, for its certificate."""
     chain, fit = outcome.inputs.chain, outcome.selection.fit
     table, names = estimate_table(fit, outcome.selection.nominal.cell), layout(fit.cell)
     groups = {name: names.group(k) for k, name in enumerate(names.names)}
@@ -153,7 +153,7 @@ def collect(outcome: Outcome) -> Report:
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
-    """Return one set of rows: sizes of errors, and where they were measured if there is one error per row."""
+    """Return the errors of one set of rows, with joint values and target positions if each row has one error."""
     nominal, calibrated, alone = (
         {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
         for found in (*comparison.errors, comparison.alone)
@@ -167,7 +167,7 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
 
 
 def _points(comparison: Comparison) -> np.ndarray:
-    """Return where the targets were, in the arm's base (rows, 3) [m]."""
+    """Return the target positions (rows, 3) [m] in the arm's base frame."""
     cell, points = comparison.cells[1], []
     for block in prepare(cell, comparison.blocks, comparison.torques):
         point = predict(cell, block).point.T
@@ -178,7 +178,7 @@ def _points(comparison: Comparison) -> np.ndarray:
 
 
 def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> _CorrelationMatrix:
-    """Return those parameters that go together most, and their correlation matrix."""
+    """Return the most correlated parameters and their correlation matrix."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     matrix = covariance / np.outer(sigma, sigma)
     off = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
@@ -198,18 +198,18 @@ def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
 
 
 def _plain(values: np.ndarray) -> tuple[Any, ...]:
-    """Return numbers with seven digits, which is more than any figure shows, in tuples."""
+    """Return numbers rounded to seven digits, as nested tuples."""
     rounded = np.array([float(f"{value:.7g}") for value in np.ravel(values)]).reshape(np.shape(values))
     return tuple(rounded.tolist()) if rounded.ndim == 1 else tuple(map(tuple, rounded.tolist()))
 
 
 def write(report: Report, path: Path) -> None:
-    """Write a report as JSON."""
+    """Write a fit's report as JSON."""
     files.write_json(path, report)
 
 
 def read(path: Path) -> Report:
-    """Read what `write` has left.
+    """Read a fit's report from JSON.
 
     Raises:
         UsageError: where it is missing or made by another version.

@@ -1,6 +1,6 @@
-"""The figures of a geometric calibration, of a `Report` or of plain arrays [m, rad], as `Chart`s with captions.
+"""Figures of a geometric calibration, from a `Report` or from arrays [m, rad], as `Chart`s with captions.
 
-Before is light and after is dark everywhere, so that a greyscale print still distinguishes them.
+Before is light and after is dark, so that a greyscale print distinguishes them.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ PALE = "#c3ccd6"  # of changes below two sigmas
 def error_histogram(
     before: np.ndarray, after: np.ndarray, nature: str = "position", noise: float | None = None
 ) -> Chart:
-    """Return the sizes of errors before and after, each with its rms; `noise` marks what the instrument alone gives.
+    """Return the histogram of errors before and after, each with its rms; `noise` marks the instrument's error.
 
     Args:
         before, after: (m,) [m] or [rad].
@@ -58,7 +58,7 @@ def residuals_by_joint(
     prismatic: Sequence[bool],
     nature: str = "position",
 ) -> Chart:
-    """Return errors against each joint (small multiples): a trend that stays is something no parameter describes.
+    """Return the chart of errors over each joint value; a remaining trend is an unmodelled effect.
 
     Args:
         q: (m, n) [rad or m].
@@ -98,7 +98,7 @@ def residuals_by_joint(
 def error_map(
     points: np.ndarray, sizes: np.ndarray, words: str = "at most {} remain", expected: np.ndarray | None = None
 ) -> Chart:
-    """Return where in the workspace errors remain, seen from above and from the side; below, what was expected.
+    """Return the map of remaining errors in the workspace, from above and from the side, and of expected errors.
 
     Args:
         points: (m, 3) target positions in the arm's base [m].
@@ -112,7 +112,7 @@ def error_map(
     most = min(float(every.max()), 1.5 * float(np.percentile(every, 99)))  # few far off do not hide the rest
     titles = (
         (f"from above: {words.format(f'{top:.3g} mm')}", "from the side"),
-        ("from above: 95 % are expected within", ""),
+        ("from above: expected 95 % radius", ""),
     )
     panels = [
         Panel(
@@ -128,12 +128,12 @@ def error_map(
 
 
 def predicted_map(points: np.ndarray, sigma: np.ndarray) -> Chart:
-    """Return the predicted σ (m,) [m] of the tool's position at points (m, 3) [m] of the workspace."""
+    """Return the map of the tool position's predicted σ (m,) [m] at points (m, 3) [m] of the workspace."""
     return error_map(points, sigma, words="predicted σ up to {}")
 
 
 def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) -> Chart:
-    """Return where in its images a camera saw corners, and their reprojection error; where none was seen stays white.
+    """Return the maps of corner counts and reprojection errors in a camera's images; white: no corners.
 
     Args:
         size: width and height of the images [px].
@@ -153,7 +153,7 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
 
 
 def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
-    """Return calibrated minus nominal with bars of two sigmas, lengths in mm and angles in mrad side by side.
+    """Return the chart of calibrated minus nominal values with bars of two sigmas, lengths [mm] and angles [mrad].
 
     Args:
         rows: fitted parameters; those in other units are left out.
@@ -178,7 +178,7 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
 
 
 def singular_values(values: np.ndarray, rank: int) -> Chart:
-    """Return the singular values of the scaled observation matrix, largest first, and the gap behind the rank.
+    """Return the chart of singular values of the scaled observation matrix, and of the gap after the rank.
 
     Args:
         values: (p,), falling.
@@ -202,7 +202,7 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
 
 
 def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
-    """Return the cross-validated error of every model tried: the search ends where the gain ends.
+    """Return the chart of cross-validated errors of the models tried, up to the one without further gain.
 
     Args:
         steps: models with such an error; the last one kept, without a note, is the model chosen.
@@ -219,7 +219,7 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
     if noise:
         layers.append(level(1e3 * noise, INK, ":", words="instrument"))
     limits = 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max()
-    ends = (f"{steps[k].model.removeprefix('+ ')} is where the gain ends: {errors[k]:.3g} mm" for k in last)
+    ends = (f"{steps[k].model.removeprefix('+ ')} is the last step with a gain: {errors[k]:.3g} mm" for k in last)
     panel = Panel(
         layers, next(ends, ""), "model, parameters", "cross-validated error [mm]", ylim=limits, log="y",
         xnames=[f"{step.model}\n{step.parameters}" for step in steps], grid="y",
@@ -228,7 +228,7 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
 
 
 def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
-    """Return the correlations (p, p) of parameters by their names (p,)."""
+    """Return the map of the parameters' correlations (p, p), with their names (p,)."""
     off = np.abs(correlation - np.diag(np.diag(correlation)))
     matrix = heat(correlation, limits=(-1.0, 1.0), colours="PuOr", written=len(names) <= 10)
     # long names widen the figure, and never overlap
@@ -238,7 +238,7 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
 
 
 def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: str) -> Chart:
-    """Return a predicted σ over the effort of measuring, both logarithmic; the plan in hand is marked.
+    """Return the chart of predicted σ over measuring effort, both logarithmic, with the present plan marked.
 
     Args:
         others: pairs of effort and sigma; own: the same of the plan.
@@ -252,7 +252,7 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         text("this plan", *own),
     ]
     panel = Panel(
-        layers, "predicted, before anything is moved", along, across, (0.8 * low[0], 1.25 * high[0]),
+        layers, "predicted before measuring", along, across, (0.8 * low[0], 1.25 * high[0]),
         (0.7 * low[1], 1.4 * high[1]), log="xy", grid="both",
     )  # fmt: skip
     return Chart([panel], 2.4, width=HALF_WIDTH)
@@ -262,12 +262,12 @@ Captioned = tuple[Chart, str]  # with what it shows, in a sentence
 
 
 def draw(report: Report) -> dict[str, Picture]:
-    """Return the figures of a report as pictures by name, drawn once."""
+    """Return the pictures of a report, by name."""
     return {name: picture(*found) for name, found in captioned(report).items()}
 
 
 def captioned(report: Report) -> dict[str, Captioned]:
-    """Return the charts of a report by name; those that the data do not give are left out."""
+    """Return the charts of a report with captions, by name; charts without data are omitted."""
     result: dict[str, Captioned] = {}
     proof = next((rows for rows in report.sets if rows.unseen), report.sets[0])
     label = f"{proof.poses} {'unseen' if proof.unseen else 'fitted'} poses ({proof.name})"
@@ -279,10 +279,10 @@ def captioned(report: Report) -> dict[str, Captioned]:
     rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
     if len(rungs) > 1:
         chart = ladder(rungs, report.noise.get("position"))
-        result["ladder"] = chart, "Models tried, by their cross-validated error. Filled: kept; open: left out."
+        result["ladder"] = chart, "Models tried, by their cross-validated error. Filled: kept; open: rejected."
     if report.singular_values:
         chart = singular_values(np.array(report.singular_values), report.rank)
-        words = "Singular values of the scaled observation matrix: filled ones carry a parameter, open ones none."
+        words = "Singular values of the scaled observation matrix: filled: of identifiable parameters, open: not identifiable."
         result["singular_values"] = chart, words
     if proof.q:
         nature = "position" if "position" in proof.calibrated else "distance"
@@ -290,14 +290,17 @@ def captioned(report: Report) -> dict[str, Captioned]:
         chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature)
         result["joints"] = chart, f"Errors against each joint, {label}: a trend is an unmodelled effect."
         chart = error_map(np.array(proof.points), after, expected=np.array(proof.expected))
-        below = "; below: 95 % are expected within." if proof.expected else "."
+        below = "; below: radius expected to contain 95 % of the errors." if proof.expected else "."
         result["map"] = chart, f"Remaining error over the workspace, {label}{below}"
     for count, seen in enumerate(report.images, 1):
         chart = image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
-        words = f"Where in the image corners were seen, and how well they are predicted there ({seen.file})."
+        words = f"Number of corners and reprojection error over the image ({seen.file})."
         result["coverage" if count == 1 else f"coverage_{count}"] = chart, words
     if arm := [row for row in report.parameters if row.group == "arm"]:
-        result["parameters"] = parameter_changes(arm), "What the fit changed in the arm. Grey: less than two sigmas."
+        result["parameters"] = (
+            parameter_changes(arm),
+            "Changes of the arm's parameters by the fit. Grey: less than two sigmas.",
+        )
     if len(report.correlated.names) > 1:
         chart = correlation_map(report.correlated.names, np.array(report.correlated.matrix))
         result["correlations"] = chart, "The most strongly correlated parameters."

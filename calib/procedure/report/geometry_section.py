@@ -1,4 +1,4 @@
-"""The geometry in a report: what the console says of a fit and what stands on its certificate, from the same values."""
+"""The geometry section of reports, for the console output of a fit and for its certificate."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -51,26 +51,26 @@ REPEATED = (
     Column("cycles", lambda at: str(len(at[1].rows))),
     Column("AP nominal [mm]", lambda at: f"{np.linalg.norm(at[1].nominal_mm):.3f}"),
     Column("AP calibrated [mm]", lambda at: f"{np.linalg.norm(at[1].calibrated_mm):.3f}"),
-    Column("x, y, z of it [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
+    Column("AP calibrated x, y, z [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
     Column("RP [mm]", "{0[1].repeatability_mm:.3f}"),
     Column("RP a, b, c [deg]", lambda at: ", ".join(f"{value:.4f}" for value in at[1].repeatability_deg)),
     Column("vAP [mm]", lambda at: _numbered(at[1].multidirectional_mm, 3)),
 )
 ISO_NOTE = (
-    "After ISO 9283: AP is the barycentre of a pose's cycles minus the command (what the arm's model says of these "
-    "joints; station and tool as fitted), RP the mean distance from the barycentre plus three standard deviations, vAP "
-    "the largest distance between barycentres approached from different directions. The norm asks for 5 poses of 30 "
-    "cycles. Five poses are too few to state an accuracy: makers judge it by 100 and more, once each, as the errors on "
-    "unseen poses do; repeated poses state the repeatability, below which no calibration can get."
+    "After ISO 9283. AP: barycentre of a pose's cycles minus the command (pose by the arm's model, with station and "
+    "tool as fitted). RP: mean distance from the barycentre plus three standard deviations. vAP: largest distance "
+    "between barycentres approached from different directions. The norm requires 5 poses of 30 cycles. Five poses are "
+    "too few to state an accuracy (makers use 100 or more): see the errors on unseen poses. "
+    "Repeatability is the lower limit of what calibration can reach."
 )
 ALONE_NOTE = (
-    "A URDF cannot hold the joint corrections of the chosen model: robot.urdf is the best geometry without them, and "
-    "its errors are listed, too; robot_for_corrections.urdf with joint_corrections.csv has those of the calibrated arm."
+    "A URDF cannot contain the joint corrections of the chosen model: robot.urdf is the best geometry without them "
+    "(its errors are listed, too); robot_for_corrections.urdf with joint_corrections.csv describes the calibrated arm."
 )
 
 
 def read_lines(inputs: Inputs) -> list[str]:
-    """Return robot and measurements as they were read, in sentences."""
+    """Return lines on the robot and the measurements, as read."""
     chain = inputs.chain
     lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}"]
     for block in inputs.fit:
@@ -85,7 +85,7 @@ def read_lines(inputs: Inputs) -> list[str]:
 
 
 def outcome_section(metrics: FitMetrics) -> Section:
-    """Return what a fit came to as the console says it: ladder, errors, repeated poses, what to know, verdict."""
+    """Return the console's section on a fit: ladder, errors, repeated poses, findings, verdict."""
     blocks: list[Block] = [_ladder_table(metrics), _error_table(metrics)]
     sizes = [f"{label}: {_rms_words(found)}" for label, found in _sets(metrics)]
     blocks.append(Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
@@ -106,21 +106,21 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
     blocks: list[Block] = [_error_table(metrics), *iso9283_tables(metrics)]
     blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
     blocks.append(_pictures("What remains", drawn, ("joints", "map")))
-    blocks.append(_pictures("What the camera saw", drawn, [name for name in drawn if name.startswith("coverage")]))
+    blocks.append(_pictures("Image coverage", drawn, [name for name in drawn if name.startswith("coverage")]))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
     blocks.append(Text("Identifiability", _identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks.append(_parameter_table(report))
     if metrics.outliers:
-        note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
-        blocks.append(table("Rows that do not fit", OUTLIERS, metrics.outliers, note, most=MAX_OUTLIERS))
+        note = "Rows beyond 4 robust sigmas. They are part of the fit; a robust loss, if chosen, reduces their weight."
+        blocks.append(table("Outliers", OUTLIERS, metrics.outliers, note, most=MAX_OUTLIERS))
     blocks.append(Text("Notes", metrics.warnings))
     return Section("Geometry", blocks, metrics.verdict, metrics.reason, _key_figures(report))
 
 
 def _key_figures(report: Report) -> list[KeyFigure]:
-    """Return the errors that the verdict rests on, before and after.
+    """Return the errors that decide the verdict, before and after calibration.
 
     Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
     """
@@ -160,7 +160,7 @@ def _key_figures(report: Report) -> list[KeyFigure]:
 
 
 def _left_out(metrics: FitMetrics) -> KeyFigure | None:
-    """Return the errors of both arms by cross-validation; None where they did not judge (`validation.judge`)."""
+    """Return the cross-validated errors of both arms; None if they did not decide the verdict (`validation.judge`)."""
     found, nominal = metrics.findings, metrics.fit.nominal.main
     if found is None or found.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
         return None
@@ -169,7 +169,7 @@ def _left_out(metrics: FitMetrics) -> KeyFigure | None:
     allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else ""
     alone = metrics.fit.judged(metrics.deliverable) is metrics.fit.urdf_alone
     after = _size(1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated), "mm")
-    return KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "rows left out in turn", allowed)
+    return KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "cross-validated rows", allowed)
 
 
 def _size(value: float, unit: str) -> str:
@@ -182,7 +182,7 @@ def _errors(rows: ComparedRows, arm: str, key: str) -> ErrorStatistics | None:
 
 
 def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
-    """Return the sets of rows with what they are called."""
+    """Return the sets of rows, each with its label."""
     unseen = [
         (f"{'unseen' if found.unseen else 'NOT unseen'}: {name}, {found.poses} poses", found)
         for name, found in metrics.validation.items()
@@ -191,7 +191,7 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
 
 
 def _error_table(metrics: FitMetrics) -> Table:
-    """Return errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
+    """Return the table of errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
     sets = _sets(metrics)
     rows: list[Sequence[str]] = []
     strong = set()
@@ -202,7 +202,7 @@ def _error_table(metrics: FitMetrics) -> Table:
                 strong.add(len(rows))
             cells = [f"{size:.4f}" for size in (numbers.mean, numbers.rms, numbers.p95, numbers.max)]
             rows.append((words if arm == "nominal" else "", ARMS[arm], *cells))
-    notes = ["Distances of pairs do not depend on where instrument and tool are placed."]
+    notes = ["Distances of pairs do not depend on the placement of instrument and tool."]
     notes += [ALONE_NOTE] * any(found.urdf_alone for _, found in sets)
     header = ("error", "arm", "mean", "rms", "95 %", "max")
     return Table(
@@ -221,19 +221,19 @@ def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistic
 
 
 def _ladder_table(metrics: FitMetrics) -> Table:
-    """Return the models tried with their error on held-out rows."""
+    """Return the table of the models tried, with their errors on held-out rows."""
     note = f"Chosen: {metrics.model}, {parameter_words(metrics)}."
     return table("Ladder of models", LADDER, metrics.ladder, note, lambda step: step.kept)
 
 
 def _counted(step: ModelStep) -> str:
-    """Return how many parameters a model has: of the geometry, and the small joint corrections as well."""
+    """Return a model's number of parameters as text: of the geometry, plus joint corrections."""
     rigid = step.parameters - step.corrections
     return f"{rigid} + {step.corrections}" if step.corrections else str(rigid)
 
 
 def parameter_words(metrics: FitMetrics) -> str:
-    """Return how many parameters a fit has, of what kind: a ridge lets corrections outnumber the poses."""
+    """Return the number of a fit's parameters by kind, as text; with a ridge, corrections may outnumber poses."""
     last = [step for step in metrics.ladder if step.kept][-1:]
     corrections = last[0].corrections if last else 0
     words = f"{metrics.fit.parameters - corrections} geometric parameters (base and tool placement included)"
@@ -241,7 +241,7 @@ def parameter_words(metrics: FitMetrics) -> str:
 
 
 def error_words(metrics: FitMetrics) -> str:
-    """Return the rms errors on the fitted poses in a line."""
+    """Return the rms errors on the fitted poses as text."""
     return f"{_rms_words(metrics.fit)} on {metrics.fit.poses} fitted poses"
 
 
@@ -251,7 +251,7 @@ def _rms_words(rows: ComparedRows) -> str:
 
 
 def _parameter_table(report: Report) -> Table:
-    """Return the fitted parameters; of many joint corrections only the arm and the frames are printed."""
+    """Return the table of fitted parameters; if there are many joint corrections, without them."""
     shown = [row for row in report.parameters if len(report.parameters) <= MAX_ROWS or row.group != "deflection"]
     rows = []
     for row in shown:
@@ -261,7 +261,7 @@ def _parameter_table(report: Report) -> Table:
         change = f"{factor * (row.value - row.nominal):+{digits}}"
         rows.append((row.name, printed, *numbers, change, f"{factor * row.sigma:.2g}", relative_sigma(row.rsd)))
     left = len(report.parameters) - len(shown)
-    note = f"{left} joint corrections stand in joint_corrections.csv." if left else ""
+    note = f"{left} joint corrections are listed in joint_corrections.csv." if left else ""
     if report.kept:
         note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
     header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
@@ -269,26 +269,26 @@ def _parameter_table(report: Report) -> Table:
 
 
 def outlier_sentences(metrics: FitMetrics) -> list[str]:
-    """Return in a sentence how many rows do not fit, and the worst of them; none where all fit."""
+    """Return a sentence on the number of outliers and the worst ones; empty without outliers."""
     if not metrics.outliers:
         return []
     count = len({(each.file, each.row) for each in metrics.outliers})
     worst = "; ".join(each.words for each in metrics.outliers[:MAX_NAMED_OUTLIERS])
     more = "; ..." if len(metrics.outliers) > MAX_NAMED_OUTLIERS else ""
     loss = metrics.findings.loss if metrics.findings else ""
-    how = "kept in the fit" if loss in ("", "none") else f"weighed down by the {loss} loss"
+    how = "kept in the fit" if loss in ("", "none") else f"weight reduced by the {loss} loss"
     return [f"{count} rows beyond 4 robust sigma, {how}: {worst}{more}"]
 
 
 def _identifiability(report: Report) -> list[str]:
-    """Return which parameters are identifiable from the poses, in sentences."""
+    """Return sentences on identifiable and correlated parameters."""
     values, rank, lines = report.singular_values, report.rank, []
     unclear, fitted = report.metrics.not_identifiable, report.metrics.fit.parameters
     if values and not unclear:
         lines.append(f"All {len(values)} candidate parameters are identifiable.")
     if values and fitted < rank:
         lines.append(
-            f"{fitted} of them are fitted: the others are less certain than an arm of this kind may be off, so "
+            f"{fitted} of them are fitted: the others have sigmas above manufacturing tolerances, so "
             "they keep their nominal values."
         )
     lines += [f"{line[0].upper()}{line[1:]}" for line in unclear]
@@ -305,13 +305,13 @@ def _pictures(title: str, drawn: Mapping[str, Picture], names: Sequence[str]) ->
 
 
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:
-    """Return for each set of rows with repeated poses their accuracy and repeatability."""
+    """Return a sentence on accuracy and repeatability for each set of rows with repeated poses."""
     sets = {"fitted": metrics.fit, **metrics.validation}
     return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
 
 
 def iso9283_tables(metrics: FitMetrics) -> list[Table]:
-    """Return accuracy and repeatability after ISO 9283, one table for each set of rows in which poses were repeated."""
+    """Return the tables of accuracy and repeatability after ISO 9283, one per set of rows with repeated poses."""
     result = []
     for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
         if iso := found.iso9283:

@@ -1,4 +1,4 @@
-"""Pictures of an exciting motion: q, v, a, τ with their limits, the tool's path, the search, and the front."""
+"""Figures of a designed or planned motion: q, v, a, τ with their limits, the tool's path, the search, and the front."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 
 
 def _motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
-    """Return series of every joint, a line per joint and a column per series, with their limits dashed.
+    """Return the chart of series of every joint, a row per joint and a column per series, limits dashed.
 
     Args:
         times: (N,) [s].
@@ -59,12 +59,12 @@ def _motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence
                 continue
             gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
             if gap < nearest:
-                nearest, title = gap, f"{quantity} of {joint.name} comes nearest to its limit (dashed)"
+                nearest, title = gap, f"{quantity} of {joint.name} comes closest to its limit (dashed)"
     return Chart(panels, 0.7 + 0.75 * len(joints), len(series), title=title)
 
 
 def _motion_figure(designed: Designed) -> Chart:
-    """Return q, v, a and τ of every joint over one period, with their limits dashed."""
+    """Return the chart of q, v, a and τ of every joint over one period, limits dashed."""
     motion, model, limits = _motion(designed), designed.inputs.model, designed.inputs.limits
     boxes = {limit.order: (limit.lower, limit.upper) for limit in limits.constraints if isinstance(limit, BoxLimit)}
     none = np.full(designed.inputs.chain.n, np.inf)
@@ -78,7 +78,7 @@ def _motion_figure(designed: Designed) -> Chart:
 
 
 def _path_figure(designed: Designed) -> Chart:
-    """Return the tool's path from above and from the side."""
+    """Return the chart of the tool's path from above and from the side."""
     tool = sweep(designed.inputs.chain, _motion(designed).q).position
     panels = [
         Panel(
@@ -94,7 +94,7 @@ def _path_figure(designed: Designed) -> Chart:
 
 
 def _history_figure(designed: Designed) -> Chart:
-    """Return the improving feasible motions of the best start."""
+    """Return the chart of the objective over the search, for the best start."""
     history = np.asarray(designed.found.history, dtype=float)
     title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
     curve = line(np.arange(len(history)), history)
@@ -102,7 +102,7 @@ def _history_figure(designed: Designed) -> Chart:
 
 
 def _front_figure(front: Front) -> Chart:
-    """Return the trade-off the engineer chooses from; open points are beaten by others."""
+    """Return the chart of trade-offs between two goals; open points are dominated by others."""
     good = front.values[front.best]
     good, rest = good[np.argsort(good[:, 1])], front.values[~front.best]
     points = [line(good[:, 1], good[:, 0], "o-", size=4.0), line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
@@ -145,7 +145,7 @@ def write_plan(planned: Planned, folder: Path) -> None:
 
 
 def _plan_figure(planned: Planned) -> Chart:
-    """Return q, v, a and τ of every joint with their limits dashed."""
+    """Return the chart of q, v, a and τ of every joint, limits dashed."""
     track, limits = planned.track, planned.limits
     rows: list[Limited] = [(track.q, planned.lower, planned.upper), (track.v, -limits.velocity, limits.velocity)]
     rows.append((track.a, -limits.acceleration, limits.acceleration))
@@ -155,7 +155,7 @@ def _plan_figure(planned: Planned) -> Chart:
 
 
 def _profile_figure(planned: Planned) -> Chart:
-    """Return the speed along the path, and which limit is nearest to being reached."""
+    """Return the chart of the speed along the path, and of the limit closest to being reached."""
     above, below, start = [], [], 0.0
     for one in planned.timings:
         times = start + one.profile.times
@@ -170,11 +170,11 @@ def _profile_figure(planned: Planned) -> Chart:
         Panel(below, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),
         Panel(above, x="time [s]", y="speed along the path", xlim=(0.0, start)),
     ]
-    return Chart(panels, 3.8, title=f"{start:.3g} s, with a limit all but reached for {share:.0%} of them")
+    return Chart(panels, 3.8, title=f"{start:.3g} s, close to a limit for {share:.0%} of the time")
 
 
 def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
-    """Return a designed motion of joints from its folder, and how well it identifies the parameters."""
+    """Return the picture of a designed motion from its folder, with its condition number in the caption."""
     from calib.procedure.excitation.design import DesignMetrics
 
     motion = coefficients.read(folder)
@@ -185,7 +185,7 @@ def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
     words = (
         f"The training motion, one period of {made.setting.period:g} s: condition number "
         f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
-        f"{len(made.setting.columns)} columns. Every limit was kept, at and between {made.setting.instants_verified} "
+        f"{len(made.setting.columns)} columns. All limits were respected, at and between {made.setting.instants_verified} "
         f"instants; smallest margins: {margins}."
     )
     none = np.full(q.shape[1], np.inf)

@@ -1,6 +1,6 @@
-"""What a report is made of, as values: tables, texts, pictures, sections, pages; and how rich prints them.
+"""Elements of a report as values (tables, texts, pictures, sections, pages), and their printing by rich.
 
-A certificate shows the same values as HTML; nothing here knows of a robot.
+A certificate shows the same values as HTML; this module does not depend on robots.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -42,14 +42,14 @@ class Table:
 
 
 class Column(NamedTuple):
-    """A column of a table over records: its name, what a cell says of a record (``{0.sigma:.2g}``), and its side."""
+    """A column of a table of records: name, format of a cell (``{0.sigma:.2g}``), and alignment."""
 
     name: str
     cell: str | Callable[[Any], str]
     number: bool = True
 
     def of(self, record: Any) -> str:
-        """Return the cell of a record."""
+        """Return the text of a record's cell."""
         return self.cell.format(record) if isinstance(self.cell, str) else self.cell(record)
 
 
@@ -57,7 +57,7 @@ def table(
     title: str, columns: Sequence[Column], records: Sequence[Any], note: str = "",
     strong: Callable[[Any], bool] = lambda record: False, most: int | None = None,
 ) -> Table:  # fmt: skip
-    """Return a table of records, a row for each, at most so many; those that are `strong` are set in bold."""
+    """Return a table of records, a row for each up to `most`, with the `strong` ones in bold."""
     if most is not None and len(records) > most:
         note, records = f"{note} {len(records) - most} more in metrics.json.", records[:most]
     rows = [[column.of(record) for column in columns] for record in records]
@@ -68,7 +68,7 @@ def table(
 
 @dataclass(frozen=True)
 class Text:
-    """Sentences, as a list; `label` stands before each of them on the console."""
+    """A list of sentences; on the console, `label` is printed before each."""
 
     title: str
     lines: Sequence[str]
@@ -81,7 +81,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure, drawn once as PNG; a wide one takes the whole line."""
+    """A figure as PNG; a wide one uses the full width of the page."""
 
     png: bytes
     caption: str
@@ -105,7 +105,7 @@ Block = Table | Text | Pictures
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """One number that a verdict rests on.
+    """A number that decides a verdict.
 
     Attributes:
         quantity: what it is.
@@ -125,7 +125,7 @@ class KeyFigure:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a report; a judged one has a verdict (pass, marginal, fail), its reason and what it rests on."""
+    """A part of a report; a judged one has a verdict (pass, marginal, fail), its reason and key figures."""
 
     title: str
     blocks: Sequence[Block]
@@ -136,7 +136,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A certificate: a first sheet that stands alone, and sections behind it.
+    """A certificate: a self-contained first sheet, followed by sections.
 
     Attributes:
         title, subtitle: its head.
@@ -155,23 +155,23 @@ class Page:
 
     @property
     def tight(self) -> bool:
-        """Whether there is so much to say on the first sheet that it has to be set small."""
+        """Whether the first sheet needs a small font."""
         lines = sum(max(60, len(value)) for _, value in self.setup)
         return sum(len(section.reason) for section in self.judged) + lines > 1400
 
     @property
     def judged(self) -> list[Section]:
-        """The sections with a verdict."""
+        """The sections that have a verdict."""
         return [section for section in self.sections if section.verdict]
 
 
 def relative_sigma(percent: float | None) -> str:
-    """Return an RSD [%] with two digits; empty where it says nothing."""
+    """Return an RSD [%] with two digits as text; empty if None or too large."""
     return "" if percent is None or percent > 999 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
 def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
-    """Yield each block as rich prints it; pictures are left out."""
+    """Yield each block as a rich renderable, without pictures."""
     for block in blocks:
         if isinstance(block, Table):
             yield _rich_table(block)
@@ -182,7 +182,7 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
 
 
 def _rich_table(table: Table) -> RichTable:
-    """Return a table of `page` as rich's."""
+    """Return a table as a table of rich."""
     title = table.title[:1].lower() + table.title[1:]
     result = RichTable(
         title=RichText(title), title_justify="left", caption=RichText(table.note) if table.note else None,
@@ -201,7 +201,7 @@ def _rich_table(table: Table) -> RichTable:
 
 
 def section(shown: Section) -> Iterator[RenderableType]:
-    """Yield the blocks of a section, and its verdict with the reason."""
+    """Yield the blocks of a section as rich renderables, and its verdict with the reason."""
     yield from rendered(shown.blocks)
     if shown.verdict:
         yield RichText.assemble("verdict: ", (shown.verdict, f"bold {COLOURS[shown.verdict]}"), f": {shown.reason}")

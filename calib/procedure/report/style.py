@@ -1,4 +1,4 @@
-"""How every figure looks: one palette that survives a greyscale print, quiet axes, PNG with a palette.
+"""Common style of all figures: one palette that is legible in greyscale, light axes, PNG with a palette.
 
 Margins are matplotlib's constrained layout; text is never read as mathematics, so that a ``$`` in a name is a ``$``.
 """
@@ -58,7 +58,7 @@ STYLE: Any = {
 
 @contextmanager
 def styled(quiet_titles: bool = False) -> Iterator[None]:
-    """Draw in our style, leaving matplotlib's settings as they were; quiet titles are those under a figure's own."""
+    """Apply our style within a context, and restore matplotlib's settings; quiet titles are small panel titles."""
     with matplotlib.rc_context(STYLE | ({"axes.titleweight": "normal", "axes.titlesize": 7.5} if quiet_titles else {})):
         yield
 
@@ -66,7 +66,7 @@ def styled(quiet_titles: bool = False) -> Iterator[None]:
 def sheet(
     rows: int = 1, columns: int = 1, width: float = HALF_WIDTH, height: float = 2.5, head: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure without a window, and its axes row by row.
+    """Return a matplotlib figure without a window, and its axes row by row.
 
     Args:
         rows, columns: of axes.
@@ -90,7 +90,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float) -> str:
-    """Return a tick's number: plain from 0.001 to 10 000, else a power of ten."""
+    """Return the text of a tick: a plain number from 0.001 to 10 000, else a power of ten."""
     if value == 0.0 or 0.99e-3 < abs(value) < 0.99e5:
         return f"{value:g}"
     digits, power = f"{value:.0e}".split("e")
@@ -99,7 +99,7 @@ def number(value: float) -> str:
 
 
 def legend(figure: Figure, axes: Axes | None, title: str) -> None:
-    """Write a figure's title in its upper left corner and the legend of `axes` in the right one, where no data are."""
+    """Draw the figure's title in its upper left corner, and the legend of `axes` in the upper right one."""
     width, height = figure.get_size_inches()
     figure.text(0.1 / width, 1.0 - 0.06 / height, title, va="top", fontsize=9.0, fontweight="bold")
     if axes is not None:
@@ -109,7 +109,7 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
 
 
 def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return of a long curve the smallest and the largest value of each of `POINTS` stretches, so that no peak is lost.
+    """Return a long curve reduced to minimum and maximum of each of `POINTS` segments, which keeps all peaks.
 
     Args:
         t: (N,) [s].
@@ -126,7 +126,7 @@ def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def png(figure: Figure, dpi: float = DPI) -> bytes:
-    """Draw a figure and return it as PNG."""
+    """Return a figure as PNG."""
     with styled():
         figure.set_dpi(dpi)
         canvas = FigureCanvasAgg(figure)
@@ -142,5 +142,5 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
 
 
 def save(figure: Figure, path: str | Path, dpi: float = DPI) -> Path:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG, completely or not at all."""
     return files.write(path, png(figure, dpi))

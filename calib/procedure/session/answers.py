@@ -1,4 +1,4 @@
-"""What `calib new` is given, by options or at a terminal; loads nothing, so that the command line starts at once."""
+"""Answers to `calib new`, by options or at a terminal; imports little, for a fast start of the command line."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,28 +16,28 @@ Torques = Annotated[str, OneOf(("motor", "link", "both"))]
 @strict
 @dataclass(frozen=True)
 class Answers:
-    """Answers as they were typed; None where nothing was said.
+    """Answers as typed; None: not answered.
 
     Of the cell, "unknown" says that it is not known and not checked, "none" that there is no such thing.
 
     Attributes:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none.
-        tool: x,y,z: where the target roughly sits in the tip's frame [m].
-        limits: TOML file that states the cell: instrument or [camera], obstacles, speeds; none: asked for now.
+        tool: x,y,z: approximate position of the target in the tip's frame [m].
+        limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; none: asked for now.
         mounting: of a camera: in hand (the arm carries it), to hand (the board), or unknown.
-        lens: camera_info YAML of the camera, roughly right; or unknown.
+        lens: camera_info YAML of the camera, approximate; or unknown.
         board: board.toml, of calib board; or unknown.
-        carried: what the arm carries, the camera or the board, in the tip's frame [m]: 'x,y,z facing z'; or unknown.
-        stands: the other of the two in the robot's base frame [m]: '0.5,0,0 facing z'; or unknown.
-        instrument_at: x,y,z: where the instrument stands in the robot's base frame [m]; unknown, or none.
+        carried: placement of the carried camera or board in the tip's frame [m]: 'x,y,z facing z'; or unknown.
+        stands: placement of the other one in the robot's base frame [m]: '0.5,0,0 facing z'; or unknown.
+        instrument_at: x,y,z: position of the instrument in the robot's base frame [m]; unknown, or none.
         cone: half angle of the cone in which the target sees the instrument [deg] (a reflector: 30); or unknown.
-        facing: where the target faces in the tip's frame: z, -x ….
-        box: x,x,y,y,z,z that no part of the arm leaves, in its base frame [m]; unknown, or none.
-        obstacles: 'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m], its middle; unknown, or none; repeatable.
+        facing: direction that the target faces in the tip's frame: z, -x ….
+        box: x,x,y,y,z,z: box around all parts of the arm, in its base frame [m]; unknown, or none.
+        obstacles: 'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]: shape, size, centre; unknown, or none; repeatable.
         dynamics: identify the dynamics, too (default).
-        torques: what the log holds.
-        payloads: label=kg of a body to record with as well; repeatable.
+        torques: which torques the log contains.
+        payloads: label=kg of a payload for additional recordings; repeatable.
     """
 
     robot: Text | None = None
@@ -60,5 +60,5 @@ class Answers:
 
     @property
     def cell(self) -> dict[str, Any]:
-        """What was said of the cell."""
+        """The answers on the cell, by name."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

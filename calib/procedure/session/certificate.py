@@ -32,7 +32,7 @@ TORQUES = {
 
 
 def certify(session: Session, say: Say) -> list[str]:
-    """Print the certificate."""
+    """Write the certificate of a session as HTML, and return its notes."""
     from calib.procedure.report import dynamics_section, geometry_section
 
     say("drawing" if session.plots else "writing")
@@ -74,7 +74,7 @@ def certify(session: Session, say: Say) -> list[str]:
 
 
 def _whole_report(session: Session) -> fit_report.Report:
-    """Return the fit's report with what the step validate found."""
+    """Return the report of the fit, including the results of the step validate."""
     place = session.validation
     found = place.metrics()
     if found.schema >= SCHEMA:
@@ -86,7 +86,7 @@ def _whole_report(session: Session) -> fit_report.Report:
 
 
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
-    """Return what was said of files as they came: those for training, and those that the step `unseen` looked at."""
+    """Return the notes on the files when they were read: training files, and those of the step `unseen`."""
     lines = read_lines(session.path(f"{place}/{CHECKED}"))
     files_there = session.brought("validation" if place == "3-measured" else "unseen")
     said = read_state(session).notes(unseen)
@@ -95,14 +95,14 @@ def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
 
 
 def _with_arrival(section: Section, lines: list[str]) -> Section:
-    """Return a section with what was noticed when its files came, and is not said in it anyway."""
+    """Return a section, extended by the notes on its files that it does not contain yet."""
     said = {line for block in section.blocks if isinstance(block, Text) for line in block.lines}
     fresh = [line for line in dict.fromkeys(lines) if line not in said]
     return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", fresh)])
 
 
 def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str, str]]:
-    """Return what stands under Setup: labels and values, of a fit and of dynamics where there are any."""
+    """Return the rows of Setup (label, value), for geometry and dynamics as far as the session has them."""
     settings, chain = session.settings, chain_of(session)
     described = settings.robot.given if found else f"{settings.robot.given}, taken as calibrated"
     rows = [*(("simulated", line) for line in read_lines(session.path(MARK)))]
@@ -135,7 +135,7 @@ def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str,
 
 
 def _instrument(session: Session, found: FitMetrics) -> str:
-    """Return what the instrument measures, its sigmas, and what was used where the files hold something else."""
+    """Return a text on the instrument: kind of measurement (stated and used) and sigmas."""
     instrument = session.settings.instrument
     said, turned = instrument.measures, found.fit.calibrated.orientation_deg is not None
     used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
@@ -147,13 +147,13 @@ def _instrument(session: Session, found: FitMetrics) -> str:
 
 
 def _named(paths: list[Path]) -> str:
-    """Return names of files; when they were measured no file says, and a copy's date says when it was copied."""
+    """Return the file names as text, without dates: file dates are those of copying, not of measuring."""
     return ", ".join(path.name for path in paths)
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What ``selection.json`` says for people: how the poses were chosen, what they were held against, what not."""
+    """The content of ``selection.json``: how the poses were chosen, which limits were checked, and which not."""
 
     words: str = "chosen by hand"
     checked: tuple[str, ...] = ()
@@ -168,7 +168,7 @@ def _session_plan(session: Session) -> _Plan:
 
 
 def _filed(paths: list[Path]) -> list[Path]:
-    """Return what is to be filed of measured paths: of images the corners found in them stand for all."""
+    """Return the measured files to archive; for image folders the files of detected corners."""
     own = [
         (path / CORNERS if (path / CORNERS).exists() else path / JOINTS) if path.is_dir() else path for path in paths
     ]
@@ -176,7 +176,7 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 
 def listed(session: Session) -> list[FileRow]:
-    """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
+    """Return the input files of the certificate, those to archive first: name, content, bytes, SHA-256."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
     filed = [

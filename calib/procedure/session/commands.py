@@ -1,4 +1,4 @@
-"""The guided procedure as the commands `calib new`, `next`, `status` and `redo` run it.
+"""The guided procedure behind the commands `calib new`, `next`, `status` and `redo`.
 
 What a session asks of people, in two lines: what to do at the robot, and which file to bring, in which form.
 """
@@ -38,7 +38,7 @@ from calib.robot.tables import dumps
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
-    """Return two lines: what to do at the robot, and which file to bring, in which form."""
+    """Return two lines: the task at the robot, and the file to provide with its format."""
     if state.kind == WAITING and state.step.name in ("record", "predict"):
         return _play(session, state.step.name), _log(session, state.step.name)
     if state.kind == WAITING and state.step.name in ("measure", "validate"):
@@ -63,25 +63,25 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
     return (
         f"Drive the {len(read_table(path))} poses of {path}{order if name == 'poses' and ways.exists() else ''}"
         f"{_and_validation(session) if both else ''}, let the arm settle, measure the "
-        f"target's {what} with the {device} and log the joint angles read back; the first three once more at the end "
-        "show drift "
-        "(into drift.csv, if you like)."
+        f"target's {what} with the {device} and log the joint angles read back. At the end, measure the "
+        "first three again to check for drift "
+        "(optional, into drift.csv)."
     )
 
 
 def _take_images(session: Session, path: Path, both: bool) -> str:
-    """Say how images are to be taken."""
-    where = "poses all over the workspace that see the board from near and far, and tilted"
+    """Return the instruction for taking images."""
+    where = "poses all over the workspace, with the board near, far and tilted"
     if session.settings.poses.plan and path.exists():
         where = f"the {len(read_table(path))} poses of {path}{_and_validation(session) if both else ''}"
     return (
-        f"Drive {where}; at each let the arm settle for a second, take an image of the board (focus, zoom and exposure "
-        "fixed, no automatic ones, no image turned or scaled), and log the joint angles read back."
+        f"Drive {where}; at each let the arm settle for a second, take an image of the board (fixed focus, zoom and "
+        "exposure; images neither rotated nor scaled), and log the joint angles read back."
     )
 
 
 def _and_validation(session: Session) -> str:
-    """Name the list of validation poses, so that the robot is visited once."""
+    """Return the text on the validation poses, so that both lists are measured in one visit."""
     path = session.path(f"2-poses/{UNSEEN}")
     if not session.settings.poses.validation or not path.exists():
         return ""
@@ -103,38 +103,38 @@ def _form(session: Session, target: str, both: bool) -> str:
 
 
 def _form_of_images(session: Session, joints: tuple[str, ...], target: str, both: bool) -> str:
-    """Say where images, joint values and the board's description go."""
+    """Return the instruction on where to put images, joint values and the description of the board."""
     names = [target, *([UNSEEN] if both and session.settings.poses.validation else [])]
     folders = " and ".join(str(session.path("3-measured") / Path(name).stem) for name in names)
     return (
-        f"Bring {folders}: the images, joints.csv (image, {joints[0]} [deg] … {joints[-1]} [deg]; one row per image), "
+        f"Bring {folders}: images, joints.csv (image, {joints[0]} [deg] … {joints[-1]} [deg]; one row per image), "
         "board.toml (calib board makes boards), and camera.yaml if the lens is known (calib formats images); then: "
         f"{command_line('next', session.folder)}"
     )
 
 
 def _play(session: Session, step: str) -> str:
-    """Return what is to be played and logged."""
+    """Return the instruction for playing and logging the motions."""
     section = session.settings.dynamics
     names = _motions(session, step)
     if not section.plan:
-        return "Record the robot moving in all its joints, in one motion for training and in another, unseen one."
+        return "Record two motions of all joints: one for training, and a different one for validation."
     file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never used for training)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
     again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
     return (
-        f"Play {motions}{unseen}, {section.repeats} times the motion each, at {section.rate:g} Hz, from rest at "
+        f"Play {motions}{unseen}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at "
         "its "
-        "first row, before that at a low override, to see that the way is free; log joint positions and torques "
-        "all "
-        f"the while.{again if step == 'record' else ''}"
+        "first row. Before that, play it at a low override to check for collisions. Log joint positions and "
+        "torques "
+        f"all the time.{again if step == 'record' else ''}"
     )
 
 
 def _motions(session: Session, step: str) -> list[str]:
-    """Return which of the motions are still to be recorded."""
+    """Return the names of the motions that are not recorded yet."""
     names = [] if step == "predict" or session.brought("training") else ["training"]
     return names + (["validation"] if session.settings.dynamics.validation and not session.brought("unseen") else [])
 
@@ -154,7 +154,7 @@ def _log(session: Session, step: str) -> str:
     return (
         f"Bring {files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS "
         "bags "
-        f"are read, too (calib formats recordings); then: {command_line('next', session.folder)}"
+        f"work, too (calib formats recordings); then: {command_line('next', session.folder)}"
     )
 
 
@@ -168,7 +168,7 @@ def _chain(session: Session) -> Chain:
 Say = Callable[[str], None]
 LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
-HEAD = "# What the cell is like, as stated to calib new; calib formats limits says what may stand here.\n"
+HEAD = "# The cell, as stated to calib new; calib formats limits lists the possible keys.\n"
 COLOURS = {
     **page.COLOURS, "done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow",
     "waits": "yellow", "after": "dim", "failed": "red",
@@ -177,7 +177,7 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class _Stop:
-    """Where `go_on` stopped: the step that waits, lines that say what to do now, and the verdict at the end."""
+    """The end of `go_on`: the waiting step, lines of instructions, and the verdict if the session is complete."""
 
     session: Session
     waiting: State | None
@@ -190,11 +190,11 @@ def begin(
     base: str = "", tip: str = "", tool: Sequence[float] | None = None,
     limits: Path | Mapping[str, Any] | None = None, dynamics: bool = True, motion: Mapping[str, Any] | None = None,
 ) -> Session:  # fmt: skip
-    """Make a session in the new folder `folder`, for a robot, which is read once to see that it can be.
+    """Make a session in the new folder `folder`, after checking that the robot can be read.
 
     Args:
         robot: see `calib.robot.load`.
-        instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`; ``none``: the geometry is taken as it is.
+        instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`; ``none``: the geometry is not fitted.
         poses, validation: how many to choose.
         seed: of everything random.
         base, tip: of a URDF, empty for its own.
@@ -204,10 +204,10 @@ def begin(
         motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
 
     Raises:
-        UsageError: for a value that a key of ``session.toml`` cannot have.
+        UsageError: for an invalid value of a key of ``session.toml``.
     """
     device, source = instrument_named(instrument), resolve(robot)
-    words = "nothing is measured and no dynamics are wanted: nothing is left to be done"
+    words = "neither geometry nor dynamics are requested: choose an instrument, or identify the dynamics"
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     copied, named = _limits(limits, chain, source, dynamics)
@@ -224,7 +224,7 @@ def begin(
 def _limits(
     stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
-    """Return what is to be copied of stated limits, which are read once to see that they can be, and its name."""
+    """Return the files to copy (name -> content) for the stated, checked limits, and the name of the limits file."""
     if stated is None:
         return {}, ""
     if isinstance(stated, Path):
@@ -245,7 +245,7 @@ def _limits(
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
-    """Run what can be run, and say what to do then.
+    """Run all steps that can run, and return where it stopped with instructions.
 
     Args:
         folder: of the session.
@@ -265,7 +265,7 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 
 def _ending(session: Session) -> tuple[str, ...]:
-    """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
+    """Return the closing lines of a complete session; with verdict fail, the robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
     level = session.verdicts().level
     if level == "fail":
@@ -276,7 +276,7 @@ def _ending(session: Session) -> tuple[str, ...]:
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
-    """Say how every step of a session stands, and what comes next."""
+    """Yield the status of every step of a session, and the next command."""
     session = open_session(folder)
     settings, found = session.settings, steps.states(session)
     yield Text.assemble((settings.name, "bold"), f", {settings.instrument.name}, made {settings.created[:10]}")
@@ -294,6 +294,6 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
 
 
 def noted(folder: Path) -> list[str]:
-    """Return what was noted as each step of a session was made."""
+    """Return the notes of each completed step of a session."""
     recorded = read_state(open_session(folder)).steps
     return [f"  {name}: {note}" for name, record in recorded.items() for note in record.notes]

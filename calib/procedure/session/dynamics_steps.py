@@ -1,4 +1,4 @@
-"""What the steps of a session's dynamics do: design motions, check their recordings, identify, predict other motion.
+"""Steps of a session's dynamics: design motions, check recordings, identify, validate on unseen motion.
 
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
@@ -46,7 +46,7 @@ VALIDATION_SEED = 3  # added to the seed for the validation motion
 
 
 def options_of(session: Session) -> IdentifyOptions:
-    """Return how to identify: the options file's content, or what ``session.toml`` says; payloads by file name."""
+    """Return the options of identification, from the options file or ``session.toml``; payloads by file name."""
     section = session.settings.dynamics
     options = read_options(session.named(section.options))
     settings = options.settings
@@ -66,14 +66,14 @@ def options_of(session: Session) -> IdentifyOptions:
 
 
 def excite(session: Session, say: Say) -> list[str]:
-    """Design the training motion, and another one to validate on."""
+    """Design the training motion and the validation motion, and return notes."""
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
     from calib.procedure.excitation.settings import ExcitationSettings
 
     section, notes, draw = session.settings.dynamics, [], None
     if not section.plan:
-        return ["no motion is designed: the recorded files hold others (plan = false)"]
+        return ["no motion is designed: the recorded files contain other motions (plan = false)"]
     if session.plots:
         from calib.procedure.report.motion_figures import write_design as draw
     limits = session.named(section.limits)
@@ -96,17 +96,17 @@ def excite(session: Session, say: Say) -> list[str]:
         cond = designed.condition
         notes.append(
             f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "
-            f"normalised, {len(designed.inputs.model.exact.names)} columns; every limit is kept"
+            f"normalised, {len(designed.inputs.model.exact.names)} columns; all limits are respected"
         )
         said = (*designed.inputs.limits.bounds.lines(), *designed.notes)
         notes += [f"{name}: {note}" for note in said if first]
     if limits is None:
-        notes.append("only the robot's own limits were kept: watch for collisions, or name a limits file")
+        notes.append("only the robot's own limits were checked: watch for collisions, or state a limits file")
     return notes
 
 
 def record(session: Session, say: Say) -> list[str]:
-    """Check the training recordings."""
+    """Check the training recordings, and return notes."""
     cuts, notes = {}, []
     for path in session.brought("training"):
         say(f"reading {path.name}")
@@ -119,10 +119,10 @@ def record(session: Session, say: Say) -> list[str]:
 
 
 def _check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
-    """Return from when to when the designed motion is in a recording [s] (None: all of it counts), and notes.
+    """Return start and end of the designed motion in a recording [s] (None: use all of it), and notes.
 
     Raises:
-        MeasurementError: for what cannot be right: units, order of joints, another motion, reversed torques.
+        MeasurementError: for wrong units or joint order, another motion, or reversed torques.
     """
     chain, options = load_calibrated(session.fit.path).chain, options_of(session)
     own = options.file_settings(str(path))
@@ -141,7 +141,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     found, loose = check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
     worst = max(found.tracking)
     notes.append(
-        f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
+        f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s; deviation up to "
         f"{1e3 * worst:.2g} mrad rms"
     )
     return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in lines_of(loose)]
@@ -150,7 +150,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
 def check_motion(
     recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], repeats: int
 ) -> tuple[LocatedMotion, list[Finding]]:
-    """Find the designed motion in a recording, and return what is worth a note.
+    """Find the designed motion in a recording, and return its location and findings.
 
     Args:
         recording: of n joints.
@@ -159,7 +159,7 @@ def check_motion(
         repeats: how many repetitions were asked for.
 
     Raises:
-        MeasurementError: where it is not there, with what explains the recording.
+        MeasurementError: if the motion is not found, with the likely reason.
     """
     found = locate(recording, motion)
     if found is None:
@@ -174,7 +174,7 @@ def check_motion(
 
 
 def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | None) -> Finding:
-    """Return what a recording without the designed motion is."""
+    """Return a finding on what a recording contains instead of the designed motion."""
     if found is None and recording.duration < motion.period:
         return finding("motion-short", duration=recording.duration, period=motion.period)
     if found is None:
@@ -185,17 +185,17 @@ def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | 
     unit, order, sign = (found.values[key] for key in ("unit", "order", "sign"))
     moved = [(names[column], names[j]) for j, column in enumerate(order) if column != j]
     return finding(
-        found.code, unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad under a header that says deg",
-        swapped=[f"the column of {column} holds {joint}" for column, joint in moved],
+        found.code, unit="" if unit == 1.0 else "deg" if unit < 1.0 else "rad although the header says deg",
+        swapped=[f"the column of {column} contains {joint}" for column, joint in moved],
         reversed=[names[j] for j, one in enumerate(sign) if one < 0],
     )  # fmt: skip
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:
-    """Compare recorded torques with those of the nominal masses: reversed signs, other units.
+    """Raise an error if recorded torques have reversed signs or other units than those of the nominal masses.
 
     Raises:
-        MeasurementError: where the torques of joints that carry much are reversed, or of another size.
+        MeasurementError: if torques of heavily loaded joints are reversed, or of another magnitude.
     """
     if chain.inertias is None or recording.kind != "torque":
         return
@@ -220,7 +220,7 @@ def _refuse(recording: Recording, found: Finding) -> NoReturn:
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:
-    """Return the session's motions by name; none where it does not plan."""
+    """Return the session's designed motions by name; empty if no motion was designed."""
     if not session.settings.dynamics.plan:
         return {}
     folders = {name: session.path(f"6-excitation/{name}") for name in ("training", "validation")}
@@ -228,13 +228,13 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
 
 
 def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
-    """Return paths with the cut that holds the motion."""
+    """Return the paths of recordings, each with the cut that contains the motion."""
     marked = {path: cuts.get(path.name) for path in paths}
     return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
-    """Return the training recordings, and what is held out of them, as paths with cuts."""
+    """Return the training recordings and the held-out parts, as paths with cuts."""
     cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")
@@ -249,13 +249,13 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
 def _gathered(
     session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
 ) -> inputs.IdentificationInputs:
-    """Return the calibrated robot with recordings, as paths with cuts, to identify and to judge it by."""
+    """Return the calibrated robot with its recordings (paths with cuts) for identification and validation."""
     options, seed = options_of(session), session.settings.seed
     return inputs.gather(session.fit.path, training, unseen, options=options, seed=seed, progress=say)
 
 
 def identify(session: Session, say: Say) -> list[str]:
-    """Identify base parameters and friction on the calibrated geometry; validation files are not looked at."""
+    """Identify base parameters and friction on the calibrated geometry; validation files are not used."""
     from calib.procedure.dynamic_stage import folder as identification_outputs
 
     draw = None
@@ -281,7 +281,7 @@ def identify(session: Session, say: Say) -> list[str]:
 
 
 def predict(session: Session, say: Say) -> list[str]:
-    """Hold the identified model against motion it has not seen, and judge."""
+    """Validate the identified model on unseen motion, and write the verdict."""
     training, held = _divided(session)
     unseen = session.brought("unseen")
     notes, aside = [], {}
@@ -301,7 +301,7 @@ def predict(session: Session, say: Say) -> list[str]:
 
 
 def _as_delivered(session: Session, found: Assessment) -> Verdict:
-    """Return the verdict on the robot as it will be exported; of a model that cannot be, for prediction only."""
+    """Return the verdict on the robot as exported; a model that cannot be exported is for prediction only."""
     from calib.procedure.export.delivery import Export, deliver
     from calib.procedure.export.delivery import prediction as prediction_of_export
 
@@ -317,5 +317,5 @@ def _as_delivered(session: Session, found: Assessment) -> Verdict:
     tolerance = session.settings.dynamics.tolerance_percent
     if not tolerance or left <= tolerance:
         return verdict
-    why = f"the {what} leaves {left:.2f} %, above the tolerance of {tolerance:g} %"
+    why = f"the {what} has an error of {left:.2f} %, above the tolerance of {tolerance:g} %"
     return Verdict("fail", f"{verdict.reason}; {why}")

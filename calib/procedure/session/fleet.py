@@ -1,4 +1,4 @@
-"""Many sessions at once, one folder per robot: each goes on as far as it can, and none stops another."""
+"""Parallel run of many sessions, one folder per robot: each runs as far as it can, a failure stops no other."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +25,7 @@ WAITS, FAILED = "waits", "failed"  # what a session comes to, or `DONE`
 
 @dataclass(frozen=True)
 class FleetRow:
-    """How one session ended.
+    """The outcome of one session: state, verdict, errors and exit code.
 
     Attributes:
         folder: of the session.
@@ -54,7 +54,7 @@ class FleetRow:
         return "\n".join([self.line(), *(self.asks or remarks([self]))])
 
     def line(self) -> str:
-        """Return one session's end in a line."""
+        """Return the outcome of the session as a line."""
         errors = self.nominal is not None and f"{self.nominal:.3g} → {self.calibrated:.3g} mm"
         torque = self.torque is not None and f"torque {self.torque:.3g} %"
         words = [word for word in (self.state, self.verdict, errors, torque, f"{self.seconds:.1f} s") if word]
@@ -62,22 +62,22 @@ class FleetRow:
 
 
 def folders_of(given: Sequence[Path]) -> list[Path]:
-    """Return the sessions' folders of what was named: folders, or the ``session.toml`` in them.
+    """Return the folders of sessions, given as folders or as their ``session.toml``.
 
     Raises:
-        UsageError: for one that is named twice, or where nothing was.
+        UsageError: for a duplicate, or an empty list.
     """
     found = [path.parent if path.name == SETTINGS else path for path in given]
     real = [path.resolve() for path in found]
     twice = [path for path, own in zip(found, real) if real.count(own) > 1]
     if twice:
-        raise UsageError(f"{twice[0]} is named twice")
-    require(found, "no session named; give folders or their session.toml", UsageError)
+        raise UsageError(f"{twice[0]} is given twice")
+    require(found, "no session given; give folders or their session.toml", UsageError)
     return found
 
 
 def run(folders: Sequence[Path], workers: Workers, command: str, plots: bool = True) -> Iterator[FleetRow]:
-    """Run every session as far as it goes, and yield each outcome when its session ends.
+    """Run every session as far as possible, and yield each outcome when its session ends.
 
     Args:
         folders: of the sessions.
@@ -93,7 +93,7 @@ def run(folders: Sequence[Path], workers: Workers, command: str, plots: bool = T
 
 
 def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> FleetRow:
-    """Run one session as far as it goes; what it says goes into its ``run.log``. Only Ctrl-C leaves this function."""
+    """Run one session as far as possible, its output written to ``run.log``. Only Ctrl-C leaves this function."""
     started, said = time.perf_counter(), []
     try:
         outcome = _go_on(folder, said.append, command, plots)
@@ -128,7 +128,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:
-    """Return the summary, a line per robot: errors on unseen poses, rms, and on unseen motion."""
+    """Return the summary table, a line per robot: rms errors on unseen poses, and on unseen motion."""
     found = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
         found.add_column(name, justify="right", no_wrap=True)
@@ -142,14 +142,14 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
-    """Say of every session that is not done what it waits for, or what went wrong."""
+    """Yield a line for each incomplete session: the file it waits for, or the error."""
     for one in outcomes:
         if one.state != DONE:
             yield f"{one.folder} {one.state}{' for ' if one.state == WAITS else ': '}{one.words}"
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
-    """Return one line on all of them."""
+    """Return a line that counts the sessions by state and verdict."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
     judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
     words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
@@ -159,5 +159,5 @@ def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
 
 
 def worst_code(outcomes: Sequence[FleetRow]) -> int:
-    """Return the exit code of all: the first that occurred of 4, 3, 2 (they failed), 1 (verdict fail), 0."""
+    """Return the exit code of all sessions: the first occurring of 4, 3, 2 (error), 1 (verdict fail), 0."""
     return max((one.code for one in outcomes), default=0)

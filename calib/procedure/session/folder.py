@@ -72,7 +72,7 @@ BROUGHT = {  # what people bring: where to, and how its name begins
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What ``state.json`` has to say of a step: when and by what it was made, from which files (SHA-256), and which."""
+    """Record of a completed step in ``state.json``: time, version, fingerprints (SHA-256) of inputs and outputs."""
 
     finished: Text
     inputs: Mapping[str, Text]
@@ -86,23 +86,23 @@ class StepRecord:
 
 @dataclass(frozen=True)
 class StateFile:
-    """``state.json``: the steps that were made, and the one that runs."""
+    """The content of ``state.json``: completed steps, and the running one."""
 
     steps: Mapping[str, StepRecord] = field(default_factory=dict)
     running: Text = ""
 
     def without(self, *names: str) -> StateFile:
-        """Return the state without these steps, and with none that runs."""
+        """Return the state without these steps and without a running one."""
         return StateFile({name: record for name, record in self.steps.items() if name not in names})
 
     def notes(self, step: str) -> tuple[str, ...]:
-        """Return what was noted when a step was made; nothing where it was not."""
+        """Return the notes of a completed step; empty if it was not run."""
         return self.steps[step].notes if step in self.steps else ()
 
 
 @dataclass(frozen=True)
 class Session:
-    """An open session: its folder, its settings as they stand now, and whether what is made now is drawn, too."""
+    """An open session: folder, current settings, and whether figures are drawn."""
 
     folder: Path
     settings: SessionSettings
@@ -110,24 +110,24 @@ class Session:
     plots: bool = True
 
     def path(self, name: str) -> Path:
-        """Return a file of the session by its name relative to the folder."""
+        """Return the path of a file, given by its name relative to the session's folder."""
         return self.folder / name
 
     def named(self, name: str) -> Path | None:
-        """Return a file that ``session.toml`` names; None where it names none."""
+        """Return the path of the file that a key of ``session.toml`` names; None if the key is empty."""
         return self.path(name) if name else None
 
     def links(self, chain: Chain) -> tuple[str | None, str | None]:
-        """Return base and tip by which the robot's file is read as this chain; None where only a URDF has links."""
+        """Return base and tip link with which the robot's file yields this chain; None, None without a URDF."""
         return (chain.base, chain.tip) if self.robot_file.suffix == ".urdf" else (None, None)
 
     @property
     def robot_file(self) -> Path:
-        """The robot's description."""
+        """Path of the robot's description."""
         return self.path(self.settings.robot.file)
 
     def brought(self, *kinds: str) -> list[Path]:
-        """Return the files, and folders of images or bags, that people have brought (`BROUGHT`); files come first."""
+        """Return the user's files, and folders of images or bags, of these kinds (`BROUGHT`); files come first."""
         result = []
         for folder, prefix in (BROUGHT[kind] for kind in kinds):
             others = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
@@ -138,7 +138,7 @@ class Session:
         return result
 
     def files_brought(self, kind: str) -> list[Path]:
-        """Return the same file by file; the corners found in images are ours."""
+        """Return the user's files of a kind, folders expanded, without the corner files written by the toolkit."""
         behind = (sorted(each for each in path.rglob("*") if each.is_file()) or [path] for path in self.brought(kind))
         return [each for paths in behind for each in paths if each.name != CORNERS]
 
@@ -149,22 +149,22 @@ class Session:
 
     @property
     def geometric(self) -> bool:
-        """Whether the geometry is fitted; else it is taken as it is described."""
+        """Whether the geometry is fitted; else the described one is used."""
         return self.settings.instrument.measures != NOTHING
 
     @property
     def fit(self) -> FitFolder:
-        """What the geometric fit leaves; without one the robot as it is described."""
+        """Folder of the geometric fit; without one, of the robot as described."""
         return FitFolder(self.folder / (IN_SESSION if self.geometric else AS_GIVEN))
 
     @property
     def validation(self) -> ValidationFolder:
-        """What the fit comes to on unseen poses."""
+        """Folder of the validation on unseen poses."""
         return ValidationFolder(self.folder / VALIDATED)
 
     @property
     def identification(self) -> IdentificationFolder:
-        """What the identification leaves."""
+        """Folder of the identification."""
         return IdentificationFolder(self.folder / "8-dynamics")
 
     @property
@@ -173,11 +173,11 @@ class Session:
         return EXPORT[self.dynamic]
 
     def write_state(self, state: StateFile) -> None:
-        """Record `state`, whole or not at all."""
+        """Write `state` to ``state.json``, completely or not at all."""
         files.write_json(self.path("state.json"), {"schema": SCHEMA, **plain(state)})
 
     def verdicts(self) -> Verdicts:
-        """Return the verdict of each stage; dynamics that were not exported are good for prediction only."""
+        """Return the verdict of each stage; dynamics that were not exported are for prediction only."""
         geometry = self.validation.metrics() if self.geometric else None
         judged = {"geometry": geometry, "dynamics": self.identification.unseen.read() if self.dynamic else None}
         found = {stage: Verdict(one.verdict, one.reason) for stage, one in judged.items() if one}
@@ -200,7 +200,7 @@ def _is_measured(path: Path) -> bool:
 def create(
     folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path | str] | None = None
 ) -> Session:
-    """Make a session folder, whole or not at all.
+    """Make a session folder, completely or not at all.
 
     Args:
         folder: new, or empty.
@@ -209,7 +209,7 @@ def create(
         copied: other files to copy, or texts to write, by their names in the folder.
 
     Raises:
-        SessionError: where something is there already, or the folder cannot be written.
+        SessionError: if the folder is not empty, or cannot be written.
     """
     target = f"1-robot/robot{robot_file.suffix}"
     created = datetime.now().astimezone().isoformat(timespec="seconds")
@@ -217,7 +217,7 @@ def create(
     staging = folder.parent / f".{folder.name}.part"
     try:
         if (folder / SETTINGS).exists():
-            raise SessionError(f"{folder} is a session already; go on with: {command_line('next', folder)}")
+            raise SessionError(f"{folder} is already a session; go on with: {command_line('next', folder)}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise SessionError(f"{folder} is not empty; give a new folder")
         shutil.rmtree(staging, ignore_errors=True)
@@ -241,18 +241,18 @@ def create(
         shutil.rmtree(staging, ignore_errors=True)
         if isinstance(error, CalibError):
             raise
-        raise SessionError(f"cannot make {folder}: {error.strerror or error}; nothing was left there") from error
+        raise SessionError(f"cannot make {folder}: {error.strerror or error}; nothing was written") from error
     return open_session(folder)
 
 
 def _no_session(folder: Path) -> str:
-    """Say what a folder is that is no session, and what to call."""
+    """Return the message for a folder that is not a session: its content, and the command to use."""
     identified = IdentificationFolder(folder).model.exists()
     if not identified and not FitFolder(folder).report.exists():
-        return f"{folder} is no session (no session.toml); make one with: {command_line('new', folder)}"
+        return f"{folder} is not a session (no session.toml); make one with: {command_line('new', folder)}"
     what, where = ("an identification", METRICS) if identified else ("a fit", CERTIFICATE)
     return (
-        f"{folder} is the result of {what}, no session: verdict and figures are in its {where}; "
+        f"{folder} is the result of {what}, not a session: verdict and figures are in its {where}; "
         f"{command_line('view', folder)} shows it, {command_line('export', folder, '--into', 'DIR')} writes the robot "
         "for other programs"
     )
@@ -262,7 +262,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the session in `folder`.
 
     Raises:
-        SessionError: where there is none, it was made by a newer version, or its file is damaged.
+        SessionError: if it is not a session, was made by a newer version, or its file is damaged.
     """
     path = folder / SETTINGS
     if not path.exists():
@@ -271,7 +271,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
 
 
 def read_state(session: Session) -> StateFile:
-    """Return what ``state.json`` records; an empty record where there is none.
+    """Return the content of ``state.json``; an empty state if the file is missing.
 
     Raises:
         SessionError: for a damaged file or one by a newer version, with what to do.
@@ -279,7 +279,7 @@ def read_state(session: Session) -> StateFile:
     path = session.path("state.json")
     if not path.exists():
         return StateFile()
-    damaged = f"{path} is damaged ({{}}); delete it, and calib next makes the steps again"
+    damaged = f"{path} is damaged ({{}}); delete it, and calib next repeats the steps"
     with refused_as(SessionError, (OSError, ValueError, RecursionError), damaged):
         state = json.loads(path.read_text(encoding="utf-8"))
     check_schema(path, state.get("schema") if isinstance(state, dict) else None)
@@ -289,7 +289,7 @@ def read_state(session: Session) -> StateFile:
 
 @contextmanager
 def locked(session: Session, say: Any = print) -> Iterator[None]:
-    """Hold the session for one command; the lock of a command that was killed is taken over.
+    """Lock the session for one command; the lock of a killed command is taken over.
 
     The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
 

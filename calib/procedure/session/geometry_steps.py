@@ -1,4 +1,4 @@
-"""What each step of a session does. The same functions as the scriptable commands; only the files are the session's.
+"""Steps of a session's geometry and its export, by the functions of the scriptable commands.
 
 Which poses a session asks for: chosen ones for the fit, random ones within the same limits for validation.
 """
@@ -61,7 +61,7 @@ HOW = "state [camera] in the limits file: calib formats constraints"
 
 
 def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[str]:
-    """Choose and write the poses that ``session.toml`` asks for, the run through them, and predicted sigmas."""
+    """Choose poses as set in ``session.toml``, and write them, the run through them, and predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
     base, tip = session.links(chain)
@@ -108,12 +108,12 @@ def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[
 
 
 def _seen_as(measures: str) -> str:
-    """Return the kind of measurement that poses are chosen for: an image determines a pose."""
+    """Return the kind of measurement for pose selection; an image counts as a pose."""
     return "pose" if measures == IMAGES else measures
 
 
 def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
-    """Return random poses within limits and constraints (count, n), from another stream than the candidates'."""
+    """Return random poses (count, n) within limits and constraints, with another random stream than the candidates."""
     if not count:
         return np.zeros((0, chain.n))
     cell = targets_of(chain, [session.settings.instrument.tool])
@@ -132,14 +132,14 @@ Say = Callable[[str], None]
 
 
 def chain_of(session: Session) -> Chain:
-    """Return the nominal arm."""
+    """Return the nominal arm of the session's robot."""
     robot = session.settings.robot
     options = _options_of(session)
     return inputs.load_robot(session.robot_file, None, options, robot.base or None, robot.tip or None)[0]
 
 
 def _options_of(session: Session) -> FitOptions:
-    """Return the fit options, with the instrument's sigmas where a file states none."""
+    """Return the fit options, with the instrument's sigmas for files that state none."""
     instrument = session.settings.instrument
     options = read_options(session.named(session.settings.fit.options))
     position, turn = instrument.sigma_position, instrument.sigma_orientation
@@ -156,7 +156,7 @@ def _options_of(session: Session) -> FitOptions:
 
 
 def describe(session: Session, say: Say) -> list[str]:
-    """Read the robot, and write down how it was understood."""
+    """Read the robot, write a summary of it, and return notes."""
     chain = chain_of(session)
     lines = [f"{chain.name}: {chain.base} to {chain.tip}, {chain.n} joints, {len(chain.elements)} elements", ""]
     for joint in chain.joints:
@@ -171,24 +171,24 @@ def describe(session: Session, say: Say) -> list[str]:
     known = load_calibrated(session.robot_file, robot.base or None, robot.tip or None)
     session.fit.path.mkdir(exist_ok=True)
     calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
-    return [lines[0], "nothing is measured: this geometry is taken as calibrated"]
+    return [lines[0], "nothing is measured: the described geometry is used"]
 
 
 def select(session: Session, say: Say) -> list[str]:
-    """Choose poses for the fit, and others at random for validation."""
+    """Choose poses for the fit, and random ones for validation, and return notes."""
     chain = chain_of(session)
     for path in (session.path(f"2-poses/{name}") for name in (POSES, UNSEEN)):
         if path.exists() and filled_in(path, chain.n):
             raise UsageError(
-                f"{path} holds more than the poses to measure, and would be written over: bring measurements in "
-                f"{session.path('3-measured')}, and put the plain list back or remove it"
+                f"{path} contains more than the planned poses and would be overwritten: move measurements to "
+                f"{session.path('3-measured')}, and restore or remove this list"
             )
     say("choosing poses")
     return _choose(session, chain, say)
 
 
 def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
-    """Return the planned poses in ``2-poses``; None where there is no plan."""
+    """Return the planned poses (m, n) of a list in ``2-poses``; None without a plan."""
     path = session.path(f"2-poses/{name}.csv")
     if not session.settings.poses.plan or not path.exists():
         return None
@@ -196,7 +196,7 @@ def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
 
 
 def arrive(session: Session, say: Say) -> list[str]:
-    """Check the files that were brought for the fit."""
+    """Check the measured files for the fit, and return notes."""
     chain, notes = chain_of(session), []
     plan = _planned(session, chain, "poses")
     for path in session.brought("measured"):
@@ -209,22 +209,22 @@ def arrive(session: Session, say: Say) -> list[str]:
 def check_file(
     session: Session, chain: Chain, path: Path, plan: np.ndarray | None, like: Sequence[PoseMeasurements] = ()
 ) -> list[str]:
-    """Return what is to be said of a measured file: rows, kind, what was ignored, missing poses.
+    """Return the notes on a measured file: rows, kind, ignored columns, missing poses.
 
     Raises:
-        MeasurementError: for whatever cannot be right, with row and column.
+        MeasurementError: for implausible values, with row and column.
     """
     notes = []
     for block in inputs.read_file(path, chain, _options_of(session), like):
         measures = session.settings.instrument.measures
         if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
-            notes.append(f"{path.name}: positions only, where the instrument gives poses")
+            notes.append(f"{path.name}: only positions, although the instrument measures poses")
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
         notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
         if block.kind == IMAGES:
             notes.append(f"{path.name}: {needed('image_words')(block)}")
         elif measures == IMAGES:
-            notes.append(f"{path.name}: no images, which the instrument takes; fitted all the same")
+            notes.append(f"{path.name}: not images, although the instrument is a camera; it is fitted")
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:
             notes += [
@@ -234,7 +234,7 @@ def check_file(
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
-    """Return how far the joints read back are from those commanded (m, n) [rad or m]; nothing of other poses."""
+    """Return findings on measured minus commanded joint values (m, n) [rad or m]; empty for other poses."""
     distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
     close = distance <= MAX_JOINT_DIFFERENCE
     if not close.any():
@@ -249,7 +249,7 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
 def drift(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
 ) -> list[Finding]:
-    """Return how far repeated poses differ: from those measured again at the end, and within each block.
+    """Return findings on drift: repeated poses at the end, and within each block.
 
     Args:
         chain: the nominal arm.
@@ -269,7 +269,7 @@ def drift(
 
 
 def _drifts(session: Session, chain: Chain) -> list[str]:
-    """Return what poses that were measured more than once say of drift."""
+    """Return the drift findings from repeatedly measured poses."""
     options = _options_of(session)
     first, again = (
         [block for path in paths for block in inputs.read_file(path, chain, options)]
@@ -279,7 +279,7 @@ def _drifts(session: Session, chain: Chain) -> list[str]:
 
 
 def _fit_settings(session: Session) -> FitSettings:
-    """Return how the geometry is fitted and judged, as session.toml says; what is ``auto`` there, as the options do."""
+    """Return the fit settings of session.toml; values of ``auto`` are taken from the options file."""
     section = session.settings.fit
     model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
     return FitSettings(
@@ -300,7 +300,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 
 def fit(session: Session, say: Say) -> list[str]:
-    """Fit the geometry to the measured files; validation files are not looked at."""
+    """Fit the geometry to the measured files; validation files are not used."""
     poses = session.path(f"2-poses/{POSES}")
     selection = read_prediction(poses) if session.settings.poses.plan and beside(poses).exists() else None
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
@@ -309,13 +309,13 @@ def fit(session: Session, say: Say) -> list[str]:
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
     metrics = session.fit.metrics()
     words = f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}"
-    advice = () if outcome.selection.loss != "none" else ('look at these rows, or set loss = "cauchy" in session.toml',)
+    advice = () if outcome.selection.loss != "none" else ('check these rows, or set loss = "cauchy" in session.toml',)
     outliers = ["; ".join((line, *advice)) for line in outlier_sentences(metrics)]
     return [words, *outcome.warnings, *outliers]
 
 
 def validate(session: Session, say: Say) -> list[str]:
-    """Hold the fitted robot against poses it has not seen, and judge, as `calib fit` does with validation files."""
+    """Validate the fitted robot on unseen poses, as `calib fit` does with validation files."""
     chain, unseen, notes = chain_of(session), session.brought("validation"), []
     fit, out = session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
@@ -336,7 +336,7 @@ def validate(session: Session, say: Say) -> list[str]:
 
 
 def export(session: Session, say: Say) -> list[str]:
-    """Put the calibrated robot into the forms others read, with a verdict on each, and on the session as a whole."""
+    """Export the calibrated robot to all formats, with a verdict on each file and on the session."""
     from calib.procedure.export.delivery import by_file, mark, prediction
 
     out = session.path(session.export)
@@ -356,7 +356,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
         write_staged(out, [file.name for file in FILES], partial(shutil.copy, session.fit.robot))
     if not session.dynamic:
         return deliver(Export(session.robot_file, session.fit.path), out)
-    say("all parameters of possible bodies")
+    say("physically consistent parameters")
     for name in FILES:  # a second robot.urdf, by earlier versions
         (out / "dynamics" / name.name).unlink(missing_ok=True)
     with suppress(OSError):  # not there, or not empty
@@ -370,7 +370,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
 
 
 def clear_staging(session: Session) -> None:
-    """Remove what a killed command left beside its place."""
+    """Remove the temporary folders of a killed command."""
     for path in session.folder.rglob(".*.part"):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

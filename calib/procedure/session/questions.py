@@ -1,4 +1,4 @@
-"""What `calib new` needs to know: instruments by name, options or questions at a terminal, each answer checked."""
+"""Questions of `calib new`: instruments by name, options or questions at a terminal, each answer checked."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,24 +37,24 @@ INSTRUMENTS = {  # starting values in ``session.toml``; a sigma of 0 is estimate
 
 
 def instrument_named(name: str) -> InstrumentSection:
-    """Return an instrument by name.
+    """Return the settings of an instrument by its name.
 
     Raises:
-        UsageError: with the names there are.
+        UsageError: for an unknown name, with the known ones.
     """
     if name not in INSTRUMENTS:
         known = ", ".join(f"{key} ({each.name}, {each.measures})" for key, each in INSTRUMENTS.items())
-        raise UsageError(f"no instrument '{name}'; there are {known}")
+        raise UsageError(f"unknown instrument '{name}'; known: {known}")
     return INSTRUMENTS[name]
 
 
 def by_nothing(given: Answers) -> bool:
-    """Say whether the geometry is taken as it is described."""
+    """Return whether no instrument is used, so that the described geometry is kept."""
     return _measures(given) == NOTHING
 
 
 def by_camera(given: Answers) -> bool:
-    """Say whether images are taken: where the camera is takes more than a place."""
+    """Return whether a camera takes images, which needs a placement with orientation."""
     return _measures(given) == "pixels"
 
 
@@ -64,7 +64,7 @@ def _measures(given: Answers) -> str:
 
 @dataclass(frozen=True)
 class Question:
-    """One question: which answer it is about, what an empty answer means, and when it is put."""
+    """A question at the terminal: its answer's name, default, and condition."""
 
     name: str
     default: str
@@ -72,22 +72,22 @@ class Question:
 
     @property
     def words(self) -> str:
-        """What is asked, as the option's help says it."""
+        """Text of the question, from the help of the option."""
         return f"{self.name.replace('_', ' ')} ({described(Answers)[self.name]})"
 
     def open(self, given: Answers) -> bool:
-        """Say whether it is to be put."""
+        """Return whether the question is to be asked."""
         return getattr(given, self.name) in (None, ()) and self.applies(given)
 
 
 def _about_camera(given: Answers, name: str) -> bool:
-    """Put a question on a camera where no file states it, once it is known what the arm carries."""
+    """Return whether to ask a question on the camera: no limits file, and the mounting is known."""
     known = name == "mounting" or (given.mounting or "").lower() not in UNSAID
     return by_camera(given) and given.limits is None and known
 
 
 def _about_cell(given: Answers, name: str) -> bool:
-    """Put a question on the cell where no file states it, and on the target's cone where the instrument is known."""
+    """Return whether to ask a question on the cell: no limits file; for the cone, the instrument is known."""
     known = name not in ("cone", "facing") or "instrument" in cell_tables(instrument_at=given.instrument_at)
     return given.limits is None and known and not (name == "instrument_at" and (by_camera(given) or by_nothing(given)))
 
@@ -110,10 +110,10 @@ QUESTIONS = (
 
 
 def with_answer(given: Answers, question: Question, text: str) -> Answers:
-    """Return the answers with one more.
+    """Return the answers, extended by one.
 
     Raises:
-        UsageError: where it cannot be one, with what can.
+        UsageError: for an invalid answer, with the valid form.
     """
     name, empty = question.name, text.lower() in ("", "none", "-")
     values: dict[str, Any] = {
@@ -129,10 +129,10 @@ def with_answer(given: Answers, question: Question, text: str) -> Answers:
 
 
 def checked(given: Answers) -> dict[str, Any]:
-    """Return the arguments of `calib.api.sessions.new_session`.
+    """Return the arguments of `calib.api.sessions.new_session` from checked answers.
 
     Raises:
-        UsageError: for an answer that cannot be.
+        UsageError: for an invalid answer.
     """
     robot, instrument = given.robot, given.instrument
     require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
@@ -140,16 +140,16 @@ def checked(given: Answers) -> dict[str, Any]:
     stated = next((name for name in CAMERA if getattr(given, name) is not None), None)
     require(
         by_camera(given) or not stated,
-        f"--{stated} is about a camera that takes images; the instrument is {instrument}",
+        f"--{stated} applies to a camera that takes images; the instrument is {instrument}",
     )
     dynamics = given.dynamics is not False
-    words = "--payload and --torques are about the dynamics, which --geometry-only leaves out"
+    words = "--payload and --torques apply to the dynamics, which --geometry-only excludes"
     require(dynamics or not (given.payloads or given.torques), words, UsageError)
     result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": given.limits}
     if given.limits is not None:
         require(given.limits.is_file(), f"--limits {given.limits}: no such file", UsageError)
         option = next(iter(given.cell), "").replace("_", "-").replace("obstacles", "obstacle")
-        words = f"--{option} and --limits both say what the cell is like; put it into {given.limits}"
+        words = f"--{option} and --limits both describe the cell; put it into {given.limits}"
         require(not given.cell, words, UsageError)
     else:
         result["limits"] = cell_tables(**given.cell) or None
@@ -175,7 +175,7 @@ ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}
 
 
 def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
-    """Return the tables of a limits file that answers to `calib new` come to; empty where nothing is known.
+    """Return the tables of a limits file from the answers to `calib new`; empty if nothing is known.
 
     "unknown" is an answer to every question: what it is about is then not checked, and the certificate says so. "none"
     says that there is no such thing, and nothing is missing.
@@ -184,7 +184,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
         answers: by the names of `calib.procedure.session.answers.Answers`.
 
     Raises:
-        UsageError: for an answer that cannot be one, with what can.
+        UsageError: for an invalid answer, with the valid form.
     """
     texts = {name: text if isinstance(text, str) else ";".join(text or ()) for name, text in answers.items()}
     found: dict[str, Any] = {}
@@ -230,7 +230,7 @@ def _box(text: str) -> list[list[float]]:
     if any(low >= high for low, high in ranges):
         raise ValueError("expected x,x,y,y,z,z in metres, the smaller one first")
     if not all(low <= 0.0 <= high for low, high in ranges[:2]):
-        raise ValueError("the robot's base, at 0,0, stands outside; places are in its base frame")
+        raise ValueError("the robot's base, at 0,0, is outside the box; coordinates are in the base frame")
     return ranges
 
 
@@ -254,25 +254,25 @@ def _mounting(text: str) -> str:
 
 
 def _file(read: str, text: str) -> str:
-    """Return the path of a lens or a board that can be read."""
+    """Return the path of a lens or board file, after checking that it can be read."""
     path = Path(text).expanduser()
     path = path / BOARD if read == "read_board" and path.is_dir() else path
-    require(path.is_file(), "no such file; give one", ValueError)
+    require(path.is_file(), "no such file; give an existing one", ValueError)
     needed(read)(path)
     return str(path)
 
 
 def _turned(name: str, most: float, text: str, known: dict[str, str]) -> dict[str, list[float]]:
-    """Return a place whose z axis is the direction of view: along a camera's, against a board's facing."""
-    require("mounting" in known, "of the camera or of the board? Say --mounting, too", ValueError)
+    """Return a placement with z along the viewing direction: that of the camera, or opposite to the board's normal."""
+    require("mounting" in known, "of the camera or of the board? State --mounting, too", ValueError)
     looks = (_mounting(known["mounting"]) == IN_HAND) == (name == "carried")
     spot, _, way = text.partition("facing")
     if not way.strip() and name == "stands":
-        raise ValueError("expected x,y,z in metres and the way it faces, e.g. 0.5,0,0 facing z")
+        raise ValueError("expected x,y,z in metres and a direction, e.g. 0.5,0,0 facing z")
     direction = _direction(way.strip() or "z")
     along = np.array(AXES[direction] if isinstance(direction, str) else direction)
     if along.shape != (3,) or not along.any():
-        raise ValueError("expected an axis of the frame (x, -z …) or three numbers behind facing")
+        raise ValueError("expected an axis of the frame (x, -z …) or three numbers after facing")
     turn = Rotation.align_vectors([along if looks else -along], [[0.0, 0.0, 1.0]])[0].as_matrix()
     xyz, rpy = to_xyz_rpy(pose(turn, _lengths(spot.strip(), 3, most)))
     return {"xyz": [float(x) for x in xyz], "rpy": [round(float(x), 6) for x in rpy]}

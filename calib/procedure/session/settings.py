@@ -1,4 +1,4 @@
-"""The settings of a session, ``session.toml``: what is to be calibrated, with what, how.
+"""Settings of a session, ``session.toml``: robot, instrument, poses, fit and dynamics.
 
 Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
 """
@@ -53,29 +53,29 @@ FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "d
 COLUMN, WIDTH = 41, 118  # where comments begin and end
 _HEAD = (
     "A calibration session; see `calib status` and `calib next`. Lengths in m, angles in rad.",
-    "Change what you like: steps made from something that changed are shown as stale and made again.",
+    "All values may be changed: steps that depend on a changed value become stale and are repeated.",
 )
 
 
 def _beside(value: Any) -> Any:
-    """Refuse a path from the root, and one that no file system takes."""
+    """Check that a name is a valid relative path, and return it."""
     if isinstance(value, str) and (PurePath(value).is_absolute() or len(value) > 200 or "\0" in value):
-        raise ValueError(f"expected a file beside session.toml, found {shown(value)}; copy it there and give its name")
+        raise ValueError(f"expected a file next to session.toml, found {shown(value)}; copy it there and give its name")
     return value
 
 
-Beside = Annotated[str, Expect("the name of a file beside session.toml, or an empty text"), Checked(_beside)]
+Beside = Annotated[str, Expect("the name of a file next to session.toml, or an empty text"), Checked(_beside)]
 
 
 @strict
 @dataclass(frozen=True)
 class RobotSection:
-    """Which robot.
+    """Section ``[robot]``: the robot and its file.
 
     Attributes:
-        given: what it was called
-        base: URDF: the link the arm starts at, empty: the root
-        tip: URDF: the link the arm ends at, empty: the longest chain's end
+        given: name or file as given to calib new
+        base: URDF: first link of the arm; empty: the root
+        tip: URDF: last link of the arm; empty: end of the longest chain
     """
 
     file: Annotated[Name, Checked(_beside)]
@@ -87,12 +87,12 @@ class RobotSection:
 @strict
 @dataclass(frozen=True)
 class InstrumentSection:
-    """What measures, and how well.
+    """Section ``[instrument]``: the instrument, and its sigmas.
 
     Attributes:
-        measures: pose (with orientation), position or pixels; nothing: the geometry is taken as it is described
+        measures: pose (with orientation), position or pixels; nothing: the geometry is not fitted
         sigma_position: of one measurement, per axis; 0: to be estimated
-        tool: where the target roughly sits in the tip's frame; only pose selection uses it
+        tool: approximate position of the target in the tip's frame; for pose selection only
     """
 
     name: Text
@@ -105,13 +105,13 @@ class InstrumentSection:
 @strict
 @dataclass(frozen=True)
 class PosesSection:
-    """Which poses to measure.
+    """Section ``[poses]``: number and limits of the poses to measure.
 
     Attributes:
-        fit: how many poses to choose for the fit
-        validation: how many more to measure and never fit; 0: no validation
-        plan: false: measured files hold other poses than those chosen here
-        constraints: a TOML file beside this one; see `calib formats constraints`
+        fit: number of poses to choose for the fit
+        validation: number of additional poses, never fitted; 0: no validation
+        plan: false: measured files contain other poses than those chosen here
+        constraints: a TOML file next to this one; see `calib formats constraints`
     """
 
     fit: Annotated[int, Whole(1)] = 30
@@ -125,18 +125,18 @@ class PosesSection:
 @strict
 @dataclass(frozen=True)
 class FitSection:
-    """How to fit and to judge the geometry.
+    """Section ``[fit]``: fit and validation of the geometry.
 
     Attributes:
         model: or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
-        loss: or none, huber, cauchy; auto: robust where rows are grossly wrong
-        options: a TOML file beside this one: column names, units; see `calib formats options`
+        loss: or none, huber, cauchy; auto: robust if rows are grossly wrong
+        options: a TOML file next to this one: column names, units; see `calib formats options`
         stations: each measured file has its own base placement, or one for all
         validation_frames: own: base and tool placement are fitted anew on validation files
-        tolerance_mm: largest rms [mm] on unseen poses that is good enough: above it the verdict is fail; 0: none, and
+        tolerance_mm: largest accepted rms [mm] on unseen poses, above it the verdict is fail; 0: none, and
             pass only means better than the nominal robot
-        deliverable: what the verdict is about: robot.urdf alone, or corrections: with joint_corrections.csv
-        holdout: share of the measured poses that is not fitted but judged on, for want of a validation file; 0: none
+        deliverable: what the verdict rates: robot.urdf alone, or corrections: with joint_corrections.csv
+        holdout: share of the measured poses that is held out if there is no validation file; 0: none
     """
 
     model: Model = FitOptions.model
@@ -152,26 +152,26 @@ class FitSection:
 @strict
 @dataclass(frozen=True)
 class DynamicsSection:
-    """Whether and how to identify and to judge the dynamics.
+    """Section ``[dynamics]``: identification and validation of the dynamics.
 
     Attributes:
         wanted: false: geometry only
-        plan: false: recorded files hold other motions than those designed here
-        validation: false: no second motion is designed or asked for
+        plan: false: recorded files contain other motions than those designed here
+        validation: false: no second motion is designed or requested
         period: of the designed motion [s]; the validation motion's is 0.8 of it
         harmonics: frequencies per joint
         rate: of the controller [Hz]
-        repeats: how often the robot plays each motion
+        repeats: number of repetitions of each motion
         starts: random starts of the search for a motion
-        evaluations: most per start
-        limits: a TOML file beside this one; see `calib formats limits`
-        torques: motor, link, or both: sensors behind the gears beside the motors' torques
-        friction: or standard, or one rung of the ladder; see calib identify --friction
+        evaluations: largest number per start
+        limits: a TOML file next to this one; see `calib formats limits`
+        torques: motor, link (sensors behind the gears), or both
+        friction: or standard, or one step of the ladder; see calib identify --friction
         method: or ols, irls, tls
-        options: a TOML file beside this one; see `calib formats identify-options`
-        holdout: share of each recording, its end, that is not identified from but judged on, for want of another; 0:
+        options: a TOML file next to this one; see `calib formats identify-options`
+        holdout: share at the end of each recording that is held out if there is no validation recording; 0:
             none
-        tolerance_percent: largest torque error of the exported robot on unseen motion that is good enough [%]; 0: none
+        tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none
         payloads: label = mass [kg] of bodies at the flange: loaded = 3.28
     """
 
@@ -206,7 +206,7 @@ class DynamicsSection:
 @strict
 @dataclass(frozen=True)
 class SessionSettings:
-    """What ``session.toml`` says, section by section.
+    """The content of ``session.toml``, by sections.
 
     Attributes:
         seed: of pose selection, cross-validation and everything else random
@@ -224,10 +224,10 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; one of schema 1 gets no dynamics, missing keys their defaults.
+    """Read ``session.toml``; missing keys get their defaults, and schema 1 gets no dynamics.
 
     Raises:
-        SessionError: where it was made by a newer version, is damaged, or a value cannot be.
+        SessionError: if it was made by a newer version, is damaged, or has an invalid value.
     """
     table = read_toml(path, SessionError)
     check_schema(path, table.get("schema"))
@@ -242,32 +242,32 @@ def read_settings(path: Path) -> SessionSettings:
 
 
 def check_schema(path: Path, found: Any) -> None:
-    """Refuse the schema of another version.
+    """Raise an error for a schema that this version cannot read.
 
     Raises:
-        SessionError: with what to do.
+        SessionError: with advice.
     """
     if found in READ and type(found) is int:
         return
     if isinstance(found, int) and found > SCHEMA:
         raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
     if found is None:
-        raise SessionError(f"{path} states no schema: was it cut short as it was copied? Copy the session again")
+        raise SessionError(f"{path} states no schema: was it truncated while copying? Copy the session again")
     known = " and ".join(map(str, READ))
     raise SessionError(
-        f"{path}: schema {shown(found)} is not known to this version, which reads {known}; make a new session"
+        f"{path}: schema {shown(found)} is unknown to this version, which reads {known}; make a new session"
     )
 
 
 def default_keys(section: str) -> dict[str, Any]:
-    """Return the keys of a section that have defaults, with these; of a key outside sections nothing."""
+    """Return the defaults of a section by key; empty for a key outside sections."""
     kind = get_type_hints(SessionSettings).get(section)
     keys = fields(kind) if is_dataclass(kind) else ()
     return {key.name: key.default for key in keys if key.default is not MISSING}
 
 
 def written(settings: SessionSettings) -> str:
-    """Return ``session.toml``: these settings, every key with its comment."""
+    """Return the text of ``session.toml`` with these settings, every key with its comment."""
     document = tomlkit.document()
     for line in _HEAD:
         document.add(tomlkit.comment(line))
@@ -277,7 +277,7 @@ def written(settings: SessionSettings) -> str:
 
 
 def _fill(table: Any, section: Any) -> None:
-    """Add the keys of a section to a table of the document, comments in one column; tables come last."""
+    """Add the keys of a section to a table of the document, comments aligned in one column, tables last."""
     words = described(type(section))
     for key in fields(section):
         value, about = getattr(section, key.name), words.get(key.name, "")
@@ -297,7 +297,7 @@ def _fill(table: Any, section: Any) -> None:
 
 
 def _add(table: Any, key: str, item: Any, about: str) -> None:
-    """Add a key with its comment behind it, wrapped into lines below where it is long."""
+    """Add a key with its comment after it; a long comment is wrapped into lines below."""
     first, *rest = wrap(about, WIDTH - COLUMN) or [""]
     if first:
         item.comment(first)
@@ -308,7 +308,7 @@ def _add(table: Any, key: str, item: Any, about: str) -> None:
 
 
 def example() -> str:
-    """Return a ``session.toml`` with every key."""
+    """Return the text of an example ``session.toml`` with every key."""
     return written(
         SessionSettings(
             "", "", 0, RobotSection(""), InstrumentSection("", "pose"), PosesSection(), FitSection(), DynamicsSection()

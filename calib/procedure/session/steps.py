@@ -1,4 +1,4 @@
-"""How a session's steps stand: what is stale, what waits for people, and how the next one is run.
+"""Status of a session's steps: stale ones, waiting ones, and the run of the next one.
 
 A step is current while its inputs' fingerprints are those recorded when it was made. Outputs that a person has replaced
 are kept and said. Before a step runs, it is marked as running; a killed one is found marked and made again.
@@ -51,7 +51,7 @@ FOLDERS = {"geometry": ("2-", "3-", "4-", "5-", "export/"), "dynamics": ("6-", "
 
 @dataclass(frozen=True)
 class SessionStep:
-    """One step.
+    """A step of a session: inputs, outputs, settings and function.
 
     Attributes:
         name, purpose: for people.
@@ -82,7 +82,7 @@ class SessionStep:
         return {path: name.endswith("?") for name in names for path in _paths(session, name.rstrip("?"))}
 
     def waits(self, session: Session) -> str:
-        """Say which of people's files the step waits for; empty where it waits for none."""
+        """Return a text on the user's files that the step waits for; empty if none are missing."""
         kind, words = self.brings
         poses, dynamics = session.settings.poses, session.settings.dynamics
         holdouts = {"validation": (poses, session.settings.fit), "unseen": (dynamics, dynamics)}
@@ -94,7 +94,7 @@ class SessionStep:
 
 
 def _paths(session: Session, name: str) -> Iterator[Path]:
-    """Yield the files behind a name that a step reads."""
+    """Yield the files that a name in `reads` stands for."""
     left_out = () if session.geometric else FOLDERS["geometry"]
     left_out += () if session.dynamic else FOLDERS["dynamics"]
     if name in BROUGHT:
@@ -118,7 +118,7 @@ STEPS = (
         "select", "choose the poses to measure", geometry_steps.select, "robot:file poses:constraints",
         f"2-poses/{POSES} 2-poses/{WAYS} 2-poses/{UNSEEN} {SELECTION} {PREDICTED} {PREDICTION}",
         "robot instrument poses seed", "geometry",
-        kept=(("measured",), "files were measured to it (calib redo select: new poses)"),
+        kept=(("measured",), "files were measured at these poses (calib redo select: new poses)"),
     ),
     SessionStep(
         "measure", "check what was measured", geometry_steps.arrive,
@@ -137,7 +137,7 @@ STEPS = (
     SessionStep(
         "excite", "design the motions to record", dynamics_steps.excite, "fit/robot.toml dynamics:limits",
         "6-excitation/*/*", "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed", "dynamics",
-        kept=(("training", "unseen"), "files were recorded to it (calib redo excite: new motions)"),
+        kept=(("training", "unseen"), "files were recorded with these motions (calib redo excite: new motions)"),
     ),
     SessionStep(
         "record", "check what was recorded", dynamics_steps.record,
@@ -177,7 +177,7 @@ DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", 
 
 @dataclass(frozen=True)
 class State:
-    """How a step stands, and why."""
+    """Status of a step, and the reason."""
 
     step: SessionStep
     kind: str
@@ -185,7 +185,7 @@ class State:
 
 
 def _steps_of(session: Session) -> tuple[SessionStep, ...]:
-    """Return the steps of a session."""
+    """Return the steps that a session with its settings has."""
     left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric}
     return tuple(step for step in STEPS if not left_out.get(step.stage))
 
@@ -202,15 +202,15 @@ def find(session: Session, name: str) -> SessionStep:
             return step
     if stage := next((step.stage for step in STEPS if step.name == name), ""):
         key = "wanted = true under [dynamics]" if stage == "dynamics" else "what measures under [instrument]"
-        raise SessionError(f"this session leaves the {stage} out; for '{name}' write {key} in session.toml")
-    raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in there)}")
+        raise SessionError(f"this session does not include the {stage}; for '{name}' write {key} in session.toml")
+    raise SessionError(f"unknown step '{name}'; steps: {', '.join(step.name for step in there)}")
 
 
 def states(session: Session) -> list[State]:
-    """Return how every step stands."""
+    """Return the status of every step."""
     recorded, result, current = read_state(session), [], True
     for step in _steps_of(session):
-        words = "made before; an earlier step comes first" if step.name in recorded.steps else "comes later"
+        words = "completed before; an earlier step comes first" if step.name in recorded.steps else "comes later"
         state = _state(session, step, recorded) if current else State(step, AFTER, words)
         result.append(state)
         current = current and state.kind in (DONE, KEPT)
@@ -222,7 +222,7 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
     if missing := _missing(session, step):
         return State(step, WAITING, missing)
     if recorded.running == step.name:
-        return State(step, READY, "was interrupted; will be made again")
+        return State(step, READY, "was interrupted; will be repeated")
     if entry is None:
         return State(step, READY, step.purpose)
     if changes := _changes(entry.inputs, _inputs(session, step)):
@@ -232,14 +232,14 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
         return State(step, STALE, changes)
     gone = [name for name in entry.outputs if not session.path(name).exists()]
     if gone:
-        return State(step, STALE, f"{gone[0]} is gone")
+        return State(step, STALE, f"{gone[0]} is missing")
     replaced = [name for name, mark in entry.outputs.items() if fingerprint(session.path(name)) != mark]
     by_hand = f"; replaced by hand: {', '.join(replaced)}" if replaced else ""
     return State(step, DONE, f"{entry.finished[:16].replace('T', ' ')}{by_hand}")
 
 
 def _missing(session: Session, step: SessionStep) -> str:
-    """Say which of people's files a step waits for."""
+    """Return a text on the user's files that a step waits for."""
     absent = (path for path, may_miss in step.inputs(session).items() if not may_miss and not path.exists())
     path = next(absent, None)
     return step.waits(session) or ("" if path is None else f"{path.relative_to(session.folder)}, which is missing")
@@ -259,7 +259,7 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
 
 
 def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Say what differs between two sets of fingerprints."""
+    """Return a text on the differences between two sets of fingerprints."""
     changed = [name for name in now if name in before and not _same(name, before[name], now[name])]
     added = [name for name in sorted(set(now) - set(before)) if not _same(name, "{}", now[name])]
     gone = sorted(set(before) - set(now))
@@ -269,7 +269,7 @@ def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 def _same(name: str, before: str, now: str) -> bool:
-    """Compare two fingerprints; of settings by value: 3 is 3.0, and a key that was not there had its default.
+    """Return whether two fingerprints are equal; settings by value (3 equals 3.0, a missing key is its default).
 
     A single key that was not there is ``{}`` before.
     """
@@ -289,7 +289,7 @@ def _same(name: str, before: str, now: str) -> bool:
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
-    """Run every step that can run, up to the next one that waits for people; return that one, None at the end.
+    """Run all steps up to the next one that waits for the user; return that one, or None at the end.
 
     The session has to be locked.
     """
@@ -331,13 +331,13 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 
 def forget(session: Session, step: SessionStep) -> None:
-    """Let a step and all behind it be made again."""
+    """Mark a step and all steps after it to be run again."""
     there = _steps_of(session)
     session.write_state(read_state(session).without(*(later.name for later in there[there.index(step) :])))
 
 
 def _move_export(session: Session) -> None:
-    """Rename the folder of the export, once dynamics are switched on or off in ``session.toml``."""
+    """Rename the folder of the export after dynamics were switched on or off in ``session.toml``."""
     before, now = session.path(EXPORT[not session.dynamic]), session.path(session.export)
     if (now.is_dir() and any(now.iterdir())) or not before.is_dir():
         return
