@@ -147,7 +147,7 @@ def test_places_are_named_as_toml_names_them() -> None:
         ({"obstacle": [{"kind": "bax", "size": [1]}]}, r"\[\[obstacle\]\] number 1, kind: expected one of.*mean 'box'"),
         ({"obstacle": [{"kind": "box", "size": [-1, 1, 1]}]}, "number 1, size: expected lengths above 0"),
         ({"target": {"reach": -1}}, "target.reach: expected a number above 0, found -1"),
-        ({"target": {"facing": [0, 0, 0]}}, r"target: facing: \[0, 0, 0\] is no direction"),
+        ({"target": {"facing": [0, 0, 0]}}, r"target: facing: \[0, 0, 0\] is not a direction"),
         ({"target": {"height": [1, 0]}}, "target: height: 1 is not below 0"),
         ({"target": {"height": "1 rad"}}, "target.height: cannot read '1 rad' as a number .here .*: m, mm, um, cm, in"),
         ({"instrument": {"xyz": [0, 0, 1], "sight": "-10 deg"}}, "instrument.sight: expected a number above 0"),

@@ -88,7 +88,7 @@ def model(logs: Path) -> calib.DynamicsModel:
             "kind: expected one of pose, position .did you mean 'position'",
         ),
         (lambda: calib.SelectionSettings(method="detmx"), "method: expected one of detmax"),
-        (lambda: calib.ExcitationSettings(goals=("foo=3",)), "goal 'foo=3': 'foo' is none of raw"),
+        (lambda: calib.ExcitationSettings(goals=("foo=3",)), "goal 'foo=3': 'foo' is unknown; use raw"),
         (lambda: calib.ExcitationSettings(hard=("logdet",)), "goal 'logdet': expected NAME=NUMBER"),
         (lambda: calib.load(""), "an empty text names no robot"),
     ],

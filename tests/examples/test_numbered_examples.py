@@ -71,7 +71,7 @@ def test_03_session_as_script(tmp_path):
 @pytest.mark.slow
 def test_05_design_excitation(tmp_path):
     raw, _ = figures(r"([\d.]+) (?:raw|normalised)", said := run("05_design_excitation.py", tmp_path))
-    assert raw < 200 and "every limit is kept" in said
+    assert raw < 200 and "all limits are respected" in said
     assert (tmp_path / "motion/trajectory.yaml").is_file()
 
 

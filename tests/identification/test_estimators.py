@@ -44,7 +44,7 @@ def test_all_methods_find_the_truth_of_a_clean_log(robot, tmp_path, capsys, meth
     assert away(found, found) < 2.0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["method"] == method and metrics["method_assumes"] == METHODS[method].assumes
-    assert f"method {method}: takes for granted" in capsys.readouterr().out
+    assert f"method {method}: assumes that" in capsys.readouterr().out
 
 
 @pytest.mark.slow

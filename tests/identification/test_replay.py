@@ -95,7 +95,7 @@ def test_the_command_reports_it(robot, tmp_path, capsys):
     assert said["unseen"] and not said["stated"] and said["feedback_over_model"] > 5.0
     assert set(said["rms"]) == {"feedback", "cad", "model", "floor"} and len(said["rms"]["model"]) == 3
     assert np.all(np.array(said["rms"]["model"]) < 0.5 * np.array(said["rms"]["cad"]))
-    assert "divides the tracking error by" in capsys.readouterr().out
+    assert "reduces the tracking error by" in capsys.readouterr().out
 
 
 def test_no_ratio_is_told_of_a_model_that_is_no_possible_robot():

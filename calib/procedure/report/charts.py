@@ -138,7 +138,7 @@ def histogram(axes: Axes, counts: Any, edges: Any, colour: str = AFTER) -> None:
 
 @layer
 def box(axes: Axes, values: Any, place: float, colour: str = AFTER) -> None:
-    """Draw a box plot of values (k,) at a place of the y axis: quartiles and median, 5th and 95th percentile, points beyond."""
+    """Draw a box plot of values (k,) at a place on y: quartiles and median, 5th and 95th percentile, points beyond."""
     axes.boxplot(
         [values], positions=[place], orientation="horizontal", whis=(5, 95), widths=0.56, patch_artist=True,
         manage_ticks=False, boxprops={"facecolor": colour, "linewidth": 0}, whiskerprops={"color": QUIET},

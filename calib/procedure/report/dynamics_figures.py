@@ -160,8 +160,8 @@ def from_folder(folder: Path) -> dict[str, Picture]:
     if rows:
         words = (
             "Essential parameters identified from the same torques on the nominal (CAD) and on the calibrated geometry "
-            "(as Fig. 7 of Kolyubin et al. 2019). Above: values relative to the calibrated one, bars two sigmas (nominal: "
-            "of torque noise; calibrated: with the geometry's uncertainty). Below: difference of the two estimates, "
+            "(as Fig. 7 of Kolyubin et al. 2019). Above: relative to the calibrated one, bars two sigmas (nominal: "
+            "of torque noise; calibrated: with the geometry's uncertainty). Below: difference of the two, "
             "in sigmas of the calibrated one."
         )
         result["geometries"] = picture(_geometries(rows), words)

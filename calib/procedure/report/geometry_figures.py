@@ -282,7 +282,7 @@ def captioned(report: Report) -> dict[str, Captioned]:
         result["ladder"] = chart, "Models tried, by their cross-validated error. Filled: kept; open: rejected."
     if report.singular_values:
         chart = singular_values(np.array(report.singular_values), report.rank)
-        words = "Singular values of the scaled observation matrix: filled: of identifiable parameters, open: not identifiable."
+        words = "Singular values of the scaled observation matrix; filled: identifiable, open: not identifiable."
         result["singular_values"] = chart, words
     if proof.q:
         nature = "position" if "position" in proof.calibrated else "distance"
@@ -297,10 +297,7 @@ def captioned(report: Report) -> dict[str, Captioned]:
         words = f"Number of corners and reprojection error over the image ({seen.file})."
         result["coverage" if count == 1 else f"coverage_{count}"] = chart, words
     if arm := [row for row in report.parameters if row.group == "arm"]:
-        result["parameters"] = (
-            parameter_changes(arm),
-            "Changes of the arm's parameters by the fit. Grey: less than two sigmas.",
-        )
+        result["parameters"] = parameter_changes(arm), "Parameter changes by the fit. Grey: less than two sigmas."
     if len(report.correlated.names) > 1:
         chart = correlation_map(report.correlated.names, np.array(report.correlated.matrix))
         result["correlations"] = chart, "The most strongly correlated parameters."

@@ -185,7 +185,7 @@ def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:
     words = (
         f"The training motion, one period of {made.setting.period:g} s: condition number "
         f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
-        f"{len(made.setting.columns)} columns. All limits were respected, at and between {made.setting.instants_verified} "
+        f"{len(made.setting.columns)} columns. All limits are kept, at and between {made.setting.instants_verified} "
         f"instants; smallest margins: {margins}."
     )
     none = np.full(q.shape[1], np.inf)

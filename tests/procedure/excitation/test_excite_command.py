@@ -57,7 +57,7 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
     code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
     assert "self-collision (capsules" in out and "NOT checked: walls of the cell (not known), obstacles" in out
-    assert "64 columns" in out and "every limit is kept" in out and "the approach and 2 periods" in out
+    assert "64 columns" in out and "all limits are respected" in out and "the approach and 2 periods" in out
     metrics = json.loads(Path("e/metrics.json").read_text())
     assert {"condition_number", "objective", "feasible", "margins", "seconds", "evaluations", "history"} <= set(metrics)
     assert metrics["feasible"] is True and metrics["condition_number"]["normalised"] < 12
@@ -136,7 +136,7 @@ def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
     assert code == 0, err
     metrics = json.loads(Path("e/metrics.json").read_text())
     told = metrics["setting"]["columns"]
-    assert metrics["setting"]["held"] == {"joint4": 0.5} and "held: joint4" in out
+    assert metrics["setting"]["held"] == {"joint4": 0.5} and "locked: joint4" in out
     assert len(told) < 64 and f"condition number of {len(told)} columns" in out
     assert not {"Fv4", "Fc4", "off4"} & set(told) and {"Fv3", "Fc5"} < set(told)
     assert metrics["condition_number"]["normalised"] < 100
@@ -181,7 +181,7 @@ def test_a_motion_is_recalled_from_a_log_and_read_by_identify(earlier, tmp_path,
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("no/where", "log.npz"), "holds no trajectory.toml"),
+        (("no/where", "log.npz"), "has no trajectory.toml"),
         (("{earlier}", "other.npz"), "is not in the recording"),
         (("{earlier}", "none.npz"), "cannot be read"),
         (("{earlier}", "other.npz", "--skip", "-1"), "--skip -1"),
@@ -283,17 +283,17 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ("", ("--start", "0,0"), "expected 7 joint values, found 2"),
         ("", ("--repeat", "0"), "repeat: expected"),
         ("", ("--slower", "0.5"), "slower: expected"),
-        ("", ("--lock", "joint9"), "'joint9' is no joint"),
+        ("", ("--lock", "joint9"), "'joint9' is not a joint"),
         ("", ("--lock", "joint4=9"), "joint4 at 9 is beyond its limits"),
         ("", ("--lock", "joint4=x"), "'x' is not a number"),
-        ("", ("--lock", "q1,q2,q3,q4,q5,q6,q7"), "nothing is left to move"),
+        ("", ("--lock", "q1,q2,q3,q4,q5,q6,q7"), "all joints are locked"),
         ("", ("--existing", "nowhere.npz"), "cannot be read"),
         ('[frequency]\nresonance = "0.25 Hz"', (), "take fewer harmonics or a period above 16 s"),
         ("[target]\nreach = nan", (), "target.reach: expected a number above 0, found nan"),
         ("", ("--goal", "wrist=2"), "above 0 and below 1"),
         ("", ("--goal", "elbow=0.1"), "none of raw"),
         ("", ("--goal", "wrist"), "expected NAME=NUMBER"),
-        ("", ("--goal", "logdet", "--goal", "raw=30"), "'logdet' takes the place of the others"),
+        ("", ("--goal", "logdet", "--goal", "raw=30"), "'logdet' replaces the others"),
         ("", ("--hard", "logdet"), "expected NAME=NUMBER"),
         ("", ("--goal", "duration=8"), "needs --shortest"),
         ("", ("--shortest", "99"), "at most the period"),

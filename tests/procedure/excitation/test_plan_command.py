@@ -81,7 +81,7 @@ def test_an_identified_model_is_planned_with(room, capsys):
     np.testing.assert_allclose(lead["q"][-1], WAYPOINTS[0], atol=1e-9)
     assert slow["t"][-1] == pytest.approx(4 * table["duration"], abs=1e-9)
     assert {"plot_motion.png", "plot_profile.png"} <= {path.name for path in (room / "out").iterdir()}
-    assert "none is crossed" in capsys.readouterr().out
+    assert "all limits are respected" in capsys.readouterr().out
     assert plan("--model", "model") == 0  # over the earlier plan, whose approach is no longer one's own
     assert not (room / "out" / "approach.csv").exists()
 
@@ -144,7 +144,7 @@ def test_waypoints_of_the_tool(room, capsys):
         ("[velocity]\nq3 = nan\n", "is not a number"),
         ("[torque]\nq2 = 30.0\n", "joint 2 needs"),
         ("[torque]\nmargin = 1.5\n", "margin"),
-        ("[target]\nheight = 0.9\n", "is broken by"),
+        ("[target]\nheight = 0.9\n", "is violated by"),
         ("[speed]\nall = 1.0\n", "there is no key 'speed'"),
         (WAYPOINTS[:1], "1 waypoint"),
         (WAYPOINTS[[0, 0, 1]], "waypoints 1 and 2 are the same"),
@@ -155,7 +155,7 @@ def test_waypoints_of_the_tool(room, capsys):
         (["--model", "."], "contains no identified model"),
         (["--payload", "tool"], "no payload 'tool'"),
         (["--rate", "0"], "rate: expected"),
-        (["--line", "--shorten", "10"], "leave nothing to change"),
+        (["--line", "--shorten", "10"], "leave no path to change"),
         (["--start", "0,0"], "expected 7 joint values"),
         (["--start", "0,9,0,0,0,0,0"], "beyond its limits"),
         (["--slower", "0.5"], "slower: expected"),
@@ -231,10 +231,10 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
     "change, message",
     [
         ({"M": -2.0}, "body behind A4: a negative mass"),
-        ({"velocity": 0.0}, "nothing limits the speed of A4 (velocity 0 is no limit)"),
-        ({"velocity": 1e8}, "nothing limits the speed of A4 (velocity 1e+08 is no limit)"),
-        ({"velocity": np.inf}, "nothing limits the speed of A4, and"),
-        ({"effort": 0.0}, "nothing limits the acceleration of A4 (effort 0 is no limit)"),
+        ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is no limit)"),
+        ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is no limit)"),
+        ({"velocity": np.inf}, "no limit for the speed of A4, and"),
+        ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is no limit)"),
     ],
 )
 def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, message):
@@ -259,9 +259,9 @@ def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
     words = ("plan", "ur10e", "--waypoints", "way.csv", "--limits", "limits.toml", "--out", "out")
     assert run(*words) == 2
     said = capsys.readouterr().err
-    assert "nothing limits the acceleration of" in said and "such as [acceleration] all = 5.0" in said
+    assert "no limit for the acceleration of" in said and "such as [acceleration] all = 5.0" in said
     assert said.count("\n") == 1 and not Path("out").exists()
-    with pytest.raises(CalibError, match="nothing limits the acceleration"):
+    with pytest.raises(CalibError, match="no limit for the acceleration"):
         planning.plan("ur10e", Path("way.csv"))
     Path("limits.toml").write_text(stated.replace("q1", "all") + "[acceleration]\nall = 5.0\n" * ("q1" not in stated))
     assert run(*words) == 0
@@ -280,5 +280,5 @@ def test_a_motion_beyond_its_bounds_is_not_written(room):
 
 def test_torque_limits_that_no_robot_has_limit_no_acceleration(room):
     joints = tuple(replace(joint, effort=1e4) for joint in CHAIN.joints)
-    with pytest.raises(CalibError, match=r"the acceleration of joint\d reaches \d+ in this motion, beyond 3000"):
+    with pytest.raises(CalibError, match=r"the acceleration of joint\d reaches \d+ in this motion, above 3000"):
         planning.plan(CalibratedChain(replace(CHAIN, joints=joints)), room / "way.csv")

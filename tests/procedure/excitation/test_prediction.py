@@ -79,7 +79,7 @@ def test_sigmas_go_with_the_noise(designed):
 
 
 def test_a_folder_without_a_prediction_is_refused(motion, outcome, tmp_path):
-    with pytest.raises(UsageError, match=r"holds no prediction\.csv"):
+    with pytest.raises(UsageError, match=r"has no prediction\.csv"):
         prediction.check_folder(tmp_path)
     fitted = SimpleNamespace(estimate=SimpleNamespace(sigma=np.ones(2)))
     other = replace(outcome, found=SimpleNamespace(names=["one", "two"], fitted=fitted))

@@ -96,7 +96,7 @@ def test_a_camera_as_told_is_held_against_its_view_or_said_not_to_be(cell, tmp_p
     np.testing.assert_allclose([carried, stands], [[0, 0, 1], [0, 0, -1]], atol=1e-5)
     seen, blind = (read_limits(tmp_path / name / "limits.toml", arm) for name in ("whole", "part"))
     assert seen.camera is not None and not any("camera" in words for words in seen.unchecked)
-    assert blind.camera is None and "whether the camera sees the board (not known: lens, stands)" in blind.unchecked
+    assert blind.camera is None and "the camera's view of the board (not known: lens, stands)" in blind.unchecked
     assert not (tmp_path / "part/camera.yaml").exists() and (tmp_path / "part/board.toml").exists()
 
 
