@@ -422,7 +422,7 @@ def _constraints(
     margin, notes = limits.margin, ()
     if margin is None:
         margin = 0.0 if dynamics.friction else GUARD
-        notes = () if dynamics.friction else (f"{GUARD:.0%} of the torque limits stay free for friction",)
+        notes = () if dynamics.friction else (f"{GUARD:.0%} of the torque limits are reserved for friction",)
     torque = [
         TorqueLimit(
             one.regressor, one.regressor_gradient, dynamics.values, limits.torque, dynamics.covariance,

@@ -168,11 +168,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     if not np.isfinite(values).all():
         names = [*bodies.names, *(one.name for one, _ in kept)]
         raise UsageError(f"{folder}: parameter {names[int(np.argmin(np.isfinite(values)))]} of the model is not finite")
-    notes = (
-        [f"friction terms that cannot be differentiated are not in the predicted torque: {', '.join(left)}"]
-        if left
-        else []
-    )
+    notes = [f"predicted torques do not include friction terms without derivatives: {', '.join(left)}"] if left else []
     model = IdentificationModel(bodies, tuple(one for one, _ in kept))
     made = _dynamics(model, values, any(one.shape == "sign" for one, _ in kept))
     covariance = _covariance(folder, made.exact.names)
@@ -274,7 +270,7 @@ def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.nd
     found = coefficients.read(folder)
     if found.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"existing {folder}: a motion of {', '.join(found.joint_names)}; {chain.name} has "
+            f"existing {folder}: the motion has joints {', '.join(found.joint_names)}; {chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(1000, round(50 * found.period))

@@ -107,8 +107,8 @@ def _reached(
         best = left[np.argmin(np.linalg.norm(left, axis=1))]
         turn = f" and {np.degrees(np.linalg.norm(best[3:])):.3g} deg" if goal.dof == 6 else ""
         raise UsageError(
-            f"{targets.file}: waypoint {k + 1} is out of reach: of {len(others)} tries the nearest stays "
-            f"{1e3 * np.linalg.norm(best[:3]):.3g} mm{turn} short within the joint limits; are x y z those of the tip "
+            f"{targets.file}: waypoint {k + 1} is out of reach: the nearest of {len(others)} tries is "
+            f"{1e3 * np.linalg.norm(best[:3]):.3g} mm{turn} off, within the joint limits. Are x y z those of the tip "
             "in the robot's base frame, in metres?"
         )
     distance = np.where(met, np.abs(tried - near).max(axis=1), np.inf)

@@ -92,7 +92,7 @@ def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Ch
     j = int(np.argmax(share))
     if share[j] <= 1.0:
         return ()
-    return (f"the {name} needs {share[j]:.0%} of the torque limit of {chain.joint_names[j]}: do not run it",)
+    return (f"torque of {chain.joint_names[j]} reaches {share[j]:.0%} of its limit in the {name}: do not run it",)
 
 
 def approach_to(
@@ -125,7 +125,7 @@ def approach_to(
     for limit, broken, k in known.broken(SampledMotion(*(x[rows] for x in parts))):
         words = f"on the straight approach, {broken} at t = {found.times[rows[k]]:.3g} s"
         if isinstance(limit, Clearance):
-            raise UsageError(f"{words}: move the robot to another pose first, or drive to the start by hand")
+            raise UsageError(f"{words}: move the robot to another pose first, or jog it to the start")
         notes.append(f"{words}: watch the approach, or start from another pose")
     return found, tuple(notes)
 

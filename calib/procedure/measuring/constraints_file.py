@@ -144,7 +144,7 @@ class InstrumentTable(PlacedTable):
     def __post_init__(self) -> None:
         for key in ("sight", "range"):
             if getattr(self, key) is not None and self.xyz is None and self.matrix is None:
-                raise ValueError(f"{key} needs the place of the instrument, xyz")
+                raise ValueError(f"{key} needs the position of the instrument, xyz")
 
 
 @strict

@@ -83,7 +83,7 @@ class Run:
 
     @property
     def cut_off(self) -> tuple[int, ...]:
-        """Numbers of the poses (in input order) that no clear way reaches from the largest connected group."""
+        """Numbers of the poses (in input order) without a clear path from the largest connected group."""
         parts = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
         most = max(parts, key=len)
         return tuple(sorted(int(k) for part in parts if part is not most for k in part))

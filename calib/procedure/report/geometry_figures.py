@@ -291,7 +291,7 @@ def captioned(report: Report) -> dict[str, Captioned]:
         result["joints"] = chart, f"Errors against each joint, {label}: a trend is an unmodelled effect."
         chart = error_map(np.array(proof.points), after, expected=np.array(proof.expected))
         below = "; below: radius expected to contain 95 % of the errors." if proof.expected else "."
-        result["map"] = chart, f"Remaining error over the workspace, {label}{below}"
+        result["map"] = chart, f"Remaining position error over the workspace, {label}{below}"
     for count, seen in enumerate(report.images, 1):
         chart = image_coverage(seen.size, np.array(seen.count), np.array(seen.rms))
         words = f"Number of corners and reprojection error over the image ({seen.file})."

@@ -237,7 +237,7 @@ def parameter_words(metrics: FitMetrics) -> str:
     last = [step for step in metrics.ladder if step.kept][-1:]
     corrections = last[0].corrections if last else 0
     words = f"{metrics.fit.parameters - corrections} geometric parameters (base and tool placement included)"
-    return words + (f" + {corrections} small joint corrections, shrunk by a ridge" if corrections else "")
+    return words + (f" + {corrections} small joint corrections, regularised by a ridge" if corrections else "")
 
 
 def error_words(metrics: FitMetrics) -> str:

@@ -98,7 +98,7 @@ def _with_arrival(section: Section, lines: list[str]) -> Section:
     """Return a section, extended by the notes on its files that it does not contain yet."""
     said = {line for block in section.blocks if isinstance(block, Text) for line in block.lines}
     fresh = [line for line in dict.fromkeys(lines) if line not in said]
-    return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", fresh)])
+    return replace(section, blocks=[*section.blocks, Text("Notes on the files when they were read", fresh)])
 
 
 def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str, str]]:
@@ -140,7 +140,7 @@ def _instrument(session: Session, found: FitMetrics) -> str:
     said, turned = instrument.measures, found.fit.calibrated.orientation_deg is not None
     used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
     other = used.get((said, turned))
-    measures = f"said to measure {said}; the files hold {other}, which were used" if other else f"measures {said}"
+    measures = f"stated to measure {said}; the files contain {other}, which were used" if other else f"measures {said}"
     stated = f"σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else "σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
     return f"{instrument.name}, {measures}, {stated}{turning}"

@@ -85,7 +85,7 @@ def _and_validation(session: Session) -> str:
     path = session.path(f"2-poses/{UNSEEN}")
     if not session.settings.poses.validation or not path.exists():
         return ""
-    return f" and, into a file of their own, the {len(read_table(path))} of {path} (never fitted)"
+    return f" and, into a separate file, the {len(read_table(path))} of {path} (never fitted)"
 
 
 def _form(session: Session, target: str, both: bool) -> str:
@@ -120,10 +120,10 @@ def _play(session: Session, step: str) -> str:
     if not section.plan:
         return "Record two motions of all joints: one for training, and a different one for validation."
     file = RUN if section.repeats > 1 else SAMPLES
-    motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
+    motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never used for training)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
-    again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
+    again = f" Then repeat it with {loads} on the flange, and put the label into the file's name." if loads else ""
     return (
         f"Play {motions}{unseen}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at "
         "its "

@@ -114,7 +114,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
     if stop.waiting is not None:
         for words in stop.lines[1:]:
             say(words)
-        words = f"{stop.waiting.words} (step {stop.waiting.step.name}); {LOG} says what to bring"
+        words = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
         return FleetRow(str(folder), WAITS, words=words, asks=stop.lines[1:])
     found = session.validation.metrics() if session.geometric else None
     sets = found.validation.values() if found else ()

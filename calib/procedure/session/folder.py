@@ -313,7 +313,7 @@ def locked(session: Session, say: Any = print) -> Iterator[None]:
             raise SessionError(f"{session.folder} was busy a moment ago; try again")
         before = os.read(handle, 200).decode(errors="replace").strip()
         if before:
-            say(f"the last command ({before}) was interrupted; going on from there")
+            say(f"the last command ({before}) was interrupted; continuing from there")
         os.ftruncate(handle, 0)
         os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
         yield

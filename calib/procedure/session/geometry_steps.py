@@ -102,7 +102,7 @@ def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
     files.write_json(session.path(SELECTION), record)
     notes = [f"{len(q)} poses for the fit: {words}"]
-    notes += [f"{len(unseen)} poses for validation, at random"] if section.validation else []
+    notes += [f"{len(unseen)} random poses for validation"] if section.validation else []
     numbers = (f"{words}: {number}" for words, number in selection.predicted_rows(chosen))
     return [*notes, *chosen.kept(), *numbers, *record["notes"]]
 
