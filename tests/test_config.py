@@ -171,7 +171,7 @@ def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
         ({"recording": {"rows": "both"}}, "recording: there is no key 'rows'"),
         ({"term": [{"name": "x", "shape": "sine"}]}, r"\[\[term\]\] number 1: there is no 'joint'; needed are name"),
         ({"term": {"name": "x"}}, r"expected a list of tables, \[\[term\]\]"),
-        ({"coupling": [{"joints": [1, 0]}]}, r"number 1, joints: expected two numbers of joints, counted from 1"),
+        ({"coupling": [{"joints": [1, 0]}]}, r"number 1, joints: expected two joint numbers, counted from 1"),
         ({"slow": [0.1, -1]}, "slow: expected a number above 0, found -1"),
         ({"files": {"run": {"npz": {"gains": [1.0]}}}}, r'the dot needs quotes: \[files."run.npz"\]'),
         ({"files": {"a.npz": {"payload": ["tool"]}}}, 'files."a.npz".payload: there is no key .tool.; there are none'),

@@ -90,7 +90,7 @@ class BodyCone(Frozen):
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
-    """Return the cone of a model's base parameters."""
+    """Return the cone of consistent base parameters of a model."""
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     return BodyCone(
         np.asarray(base.transform), labels, np.array([one.nonnegative for one in model.columns], dtype=bool)

@@ -69,7 +69,7 @@ class DriveGains:
 
 @dataclass(frozen=True, eq=False)
 class GainRecord:
-    """Drive gains as files store them, by joint: torque = gain · current.
+    """Record of drive gains in files, by joint: torque = gain · current.
 
     Attributes:
         values: (n,); NaN where the motion does not identify the gain: that joint's torque is in amperes.

@@ -93,7 +93,7 @@ def identify(
     settings: IdentificationSettings | None = None,
     progress: Progress | None = None,
 ) -> Identification:
-    """Identify the dynamics of a robot from recordings, on its calibrated geometry.
+    """Return the dynamics of a robot identified from recordings, on its calibrated geometry.
 
     Args:
         robot: as a geometric fit returns it, or a chain that no fit has moved. Base columns are chosen on its nominal
@@ -126,7 +126,7 @@ def identify_model(
     effort: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Identification[RegressorModel]:
-    """Identify the parameters of a model that is linear in them from recordings.
+    """Return the identification of a model, linear in its parameters, from recordings.
 
     Base columns, what is known beforehand, richer friction, the method's estimate, ripple, essential parameters: a
     sequence of steps around one method, each of which says what it accepts.
@@ -390,6 +390,6 @@ def _require_motion(cases: Sequence[Case]) -> None:
 
 def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:
     count = sum(int(part.present.sum()) for part in rows)
-    words = f"{count} rows are left for {base.b} base parameters after filtering and thinning"
+    words = f"{count} rows remain for {base.b} base parameters after filtering and decimation"
     advice = "record longer, or raise the identification band ([filter] band)"
     require(count >= 2 * base.b, f"{words}: {advice}", MeasurementError)

@@ -198,7 +198,7 @@ class Binding:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A constrained estimate with the unconstrained one.
+    """A constrained estimate, its binding constraints, and the unconstrained estimate.
 
     Attributes:
         constraints: the requested constraints, the cone of bodies as a plane.
@@ -382,7 +382,7 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
 
 
 def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.ndarray | None) -> Definite | None:
-    """Return S M(q) S over the postures, S from the size of the diagonal of the free estimate."""
+    """Return the scaled inertia matrices S M(q) S of the postures, S from the diagonals at the free estimate."""
     if not len(inertia):
         return None
     size = np.abs(np.einsum("kiip,p->ki", inertia, free)).mean(axis=0)

@@ -18,19 +18,19 @@ Model = TypeVar("Model", bound=RegressorModel, default=IdentificationModel, cova
 
 @dataclass(frozen=True, eq=False)
 class Dynamics(Frozen, Generic[Model]):
-    """A model with numbers.
+    """A dynamic model with its parameter values.
 
     Attributes:
-        model: bodies and drive terms, or whatever else is linear in its parameters.
-        values: (p,) a value of every standard parameter and term; regrouped parameters hold base values, the others
-            zero, so that single ones need not be those of any body (`calib.dynamics.base.to_standard`).
+        model: bodies and drive terms, or another model that is linear in its parameters.
+        values: (p,) of all standard parameters and terms; regrouped parameters have base values, the others
+            zero, so that single ones may not be physically consistent (`calib.dynamics.base.to_standard`).
     """
 
     model: Model
     values: np.ndarray
 
     def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
-        """Return the torques (N, n) the gears pass on to the bodies, by the model; friction may depend on them."""
+        """Return the torques (N, n) that the gears transmit to the bodies; load-dependent friction needs them."""
         model, motion = self.model, case.motion
         result = np.empty(motion.q.shape)
         for start in range(0, len(motion), BLOCK):

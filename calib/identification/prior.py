@@ -1,4 +1,4 @@
-"""What is known before any data: a proper prior, always on, whose sizes are estimated by the data's evidence.
+"""Prior of the parameters: proper, always used, with sizes estimated from the data by maximum evidence.
 
 Standard parameters χ of one kind (masses, first moments, inertias; rotor inertia, viscous friction, Coulomb friction,
 offsets: whatever has one shape and one unit) are about equally large, and the robot as a whole is about s times a known
@@ -62,7 +62,7 @@ ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times i
 
 
 class FirstFit(NamedTuple):
-    """A fit of the base parameters to weigh rows by: (rows,) std and inflation of its residuals, (b,) values."""
+    """A first fit of the base parameters for row weights: std and inflation of its residuals (rows,), values (b,)."""
 
     std: np.ndarray
     inflation: np.ndarray
@@ -71,15 +71,15 @@ class FirstFit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A normal prior of b base parameters, of mean zero.
+    """A normal prior of b base parameters with mean zero.
 
     Attributes:
         covariance: (b, b).
-        own: (b,) standard deviations about the whole robot's share, s u.
+        own: (b,) standard deviations about the common part of the whole robot, s u.
         sizes: kind → σ, and ``whole`` → κ.
         source: of u, ``cad`` or ``sizes``.
-        first: the fit with it, of the base parameters alone.
-        tempering: how many times more it counts for the values than for their covariance.
+        first: the fit of the base parameters with this prior, without richer friction.
+        tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
 
     covariance: np.ndarray
@@ -91,18 +91,18 @@ class Prior:
 
     @property
     def rows(self) -> np.ndarray:
-        """(b, b + 1) the prior as rows of [W y], already whitened."""
+        """The prior as whitened rows of [W y], (b, b + 1)."""
         unit = np.sqrt(np.diag(self.covariance))
         lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit))
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
     def widened(self, more: int) -> np.ndarray:
-        """Return these rows with zeros for `more` columns behind the base's."""
+        """Return these rows with zeros for `more` columns after the base columns."""
         return np.insert(self.rows, [len(self.own)] * more, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return (b,) which parameters rest on the prior: the data lower their variance by less than `resting_share`.
+        """Return which parameters (b,) rest on the prior: the data reduce their variance by less than `resting_share`.
 
         Counted about the whole robot's share: its factor s is one number, and soon identified.
         """
@@ -113,7 +113,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """Prior standard deviations exp(E t) of p parameters and of k directions by the logarithms t of sizes."""
+    """Prior standard deviations exp(E t) of p parameters and k directions, as functions of log sizes t."""
 
     names: tuple[str, ...]
     member: np.ndarray  # (p + k,) which size each has
@@ -138,7 +138,7 @@ def find_prior(
     effort: np.ndarray | None = None,
     tempering: float = TEMPERING,
 ) -> Prior:
-    """Return the prior of the base parameters whose sizes the evidence chose.
+    """Return the prior of the base parameters with sizes that maximise the evidence.
 
     Args:
         rows: in the base columns, and those of richer friction behind them.
@@ -194,7 +194,7 @@ def weighing(
     rows: Sequence[ObservationRows], data: Triangles, values: np.ndarray, covariance: np.ndarray, std: np.ndarray,
     tau: np.ndarray, noise: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return standard deviation and inflation of the residuals (rows,), with as many degrees of freedom as are left.
+    """Return standard deviation and inflation of the residuals (rows,), by their degrees of freedom.
 
     Args:
         data: triangles of the rows, one group per torque row.
@@ -214,7 +214,7 @@ def weighing(
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the rows' noise times one factor, that of the residuals' `std` (rows,) of `counts` samples; None: `std`.
+    """Return the stated noise (rows,) times a common factor from the residuals' `std`; without it, `std`.
 
     Relative between joints, with a common scale (our choice): the variance over repeats does not see what every period
     has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
@@ -236,7 +236,7 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
 
 
 def _shared(model: RegressorModel, whole: np.ndarray, effort: np.ndarray | None) -> np.ndarray:
-    """Return (p, k) directions of what parameters have in common: the whole robot, then drives by their torque limits.
+    """Return common directions (p, k) of the parameters: the whole robot, then drives by their torque limits.
 
     Args:
         whole: (p,) of the robot's bodies, up to a factor.
@@ -255,7 +255,7 @@ def _kind(term: DriveTerm) -> str:
 
 
 def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, more: np.ndarray) -> _Sizes:
-    """Return the kinds of parameters, and what is known of their sizes before any data; groups of `more` unnamed."""
+    """Return the kinds of parameters and the prior of their sizes; the groups of `more` have no names."""
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
     kinds += [_kind(one) for one in model.columns]
     own = tuple(dict.fromkeys(kinds))
@@ -290,7 +290,7 @@ def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: 
 
 
 def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (b,) and their covariance (b, b)."""
+    """Return posterior values (b,) and their covariance (b, b)."""
     _, solution, inverse, _ = _whitened(factor, columns, deviations)
     root = columns * deviations @ inverse
     return columns * deviations @ solution, root @ root.T
@@ -299,7 +299,7 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
 def _whitened(
     factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return, in units of the prior's deviations, R, the solution, the inverse of the posterior's root, and log det."""
+    """Return R, the solution, the posterior root's inverse, and log det, in units of the prior's deviations."""
     b, p = columns.shape
     own = factor[:b, :b] @ (columns * deviations)
     stacked = np.zeros((b + p, p + 1))
@@ -310,7 +310,7 @@ def _whitened(
 
 
 def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
-    """Return the logarithms of sizes (k,) that maximise the product of evidence and their prior."""
+    """Return the logarithms of the sizes (k,) that maximise evidence times their prior."""
     b = len(columns)
 
     def lost(t: np.ndarray) -> tuple[float, np.ndarray]:
@@ -329,7 +329,7 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
 
 
 def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:
-    """Return rods (B, 10) from each body's frame to the next one's, mass by length and thickness; `total` [kg]."""
+    """Return parameters (B, 10) of rods from each body's frame to the next, mass by length and thickness."""
     arm = model.bodies
     ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
     for i, parent in enumerate(arm.parents):
@@ -347,7 +347,7 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
 
 
 def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return argmin ‖R x - z‖² (p,) under A x >= 0: inertia of motors is positive, and friction brakes.
+    """Return argmin ‖R x - z‖² (p,) under A x >= 0: positive motor inertia and dissipative friction.
 
     Args:
         factor: (p + 1, p + 1) triangle of data and prior, whitened.
@@ -364,7 +364,7 @@ STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
 def tempered_prior(
     find: Callable[[float, Prior | None], Prior], rows: Sequence[ObservationRows], regimes: Regimes
 ) -> Prior:
-    """Return the prior of the tempering with which the regimes are predicted best by what the rest identifies.
+    """Return the prior with the tempering that best predicts held-out regimes.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
     one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by

@@ -1,4 +1,4 @@
-"""Cases as rows of y = W x: built a block at a time at the full rate, low-passed and thinned alike on both sides.
+"""Rows y = W x of cases: computed in blocks at the full rate, with the same low-pass and decimation of y and W.
 
 A `Case` is one recording: its motion, the torques to explain, and what the robot carried.
 """
@@ -25,17 +25,17 @@ from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A motion and its torques.
+    """A recorded motion with its torques.
 
     Attributes:
-        name: the recording's, unique among all.
+        name: unique name of the recording.
         motion: q, v, a at the full rate.
-        target: (N, rows) what the model's rows have to explain, unfiltered [N m or N; A where no gain is known].
-        carried: labels of the payloads on board.
-        present: (N, rows) which rows may be used: no lost samples, and no slow ones where they are cut.
+        target: (N, rows) torques to explain, unfiltered [N m or N; A where no gain is known].
+        carried: labels of the mounted payloads.
+        present: (N, rows) which rows may be used: without lost samples, and without slow ones if these are cut.
         noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
             known.
-        torque_rows: which torques the targets are.
+        torque_rows: kind of torques in the target.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Case:
 
     @property
     def duration(self) -> float:
-        """Length of what the filters left [s]."""
+        """Duration of the samples that remain after filtering [s]."""
         return len(self.motion) / self.motion.rate
 
 
@@ -61,7 +61,7 @@ def make_case(
     carried: Sequence[str] = (),
     slow: float | Sequence[float] | None = None,
 ) -> Case:
-    """Return the case of a motion.
+    """Return the case of a motion and its torques.
 
     Args:
         rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
@@ -74,8 +74,8 @@ def make_case(
     if rows.sensed and motion.tau_link is None:
         refuse_data(
             motion.file,
-            f"rows '{rows.name}' need torques of sensors behind the gear (columns tau_l1 …, tau_sensor1 …) beside "
-            "motors'",
+            f"rows '{rows.name}' need torques of motors, and of sensors behind the gear (columns tau_l1 …, "
+            "tau_sensor1 …)",
         )
     target = rows.target(effort, motion.tau_link, motion.q, motion.v)
     known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
@@ -88,7 +88,7 @@ def make_case(
 
 
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:
-    """Return a unique name per recording: the file's, with the cut (or the folder) where that is needed.
+    """Return a unique name per recording: the file's, with the cut or the folder if needed.
 
     Raises:
         UsageError: where the same recording and cut is given twice.
@@ -113,15 +113,15 @@ BLOCK = 4096  # samples of the full rate at a time
 
 @dataclass(frozen=True, eq=False)
 class ObservationRows:
-    """M thinned samples of one case.
+    """Observation matrix and torques of M decimated samples of one case.
 
     Attributes:
-        names, units: of the p columns.
+        names, units: names and units of the p columns.
         matrix: (M, rows, p).
         target: (M, rows).
-        present: (M, rows) bool, rows to learn from.
-        block: (M,) number of the time block, for cross-validation; -1 beside a cut.
-        rate: [Hz].
+        present: (M, rows) bool, rows for training.
+        block: (M,) number of the time block, for cross-validation; -1 next to a cut.
+        rate: sampling rate [Hz].
     """
 
     names: tuple[str, ...]
@@ -133,7 +133,7 @@ class ObservationRows:
     rate: float
 
     def by_recording(self, own: int, count: int) -> ObservationRows:
-        """Return rows with a place per recording in place of their one row: recording `own` of `count` fills its own.
+        """Return rows with separate torque rows per recording: those of recording `own` of `count` are filled.
 
         So that recordings are weighed apart, as joints are where a sample has a row for each.
         """
@@ -144,7 +144,7 @@ class ObservationRows:
         )  # fmt: skip
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
-        """Return rows with more columns (M, rows, k) appended."""
+        """Return rows with columns (M, rows, k) appended."""
         if not terms:
             return self
         return replace(
@@ -156,7 +156,7 @@ class ObservationRows:
 
 
 def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator) -> ObservationRows:
-    """Return the rows of a case in the model's `columns`, filtered and thinned by `decimator`.
+    """Return the rows of a case in the model's `columns`, filtered and decimated by `decimator`.
 
     A body's parameters reach the joints before it, a drive's its own: half of all entries, or less, can differ from 0.
     """
@@ -194,7 +194,7 @@ def observe_terms(
     terms: Sequence[DriveTerm], case: Case, decimator: Decimator, load: np.ndarray | None = None,
     torque_rows: TorqueRows = MOTOR,
 ) -> np.ndarray:  # fmt: skip
-    """Return the columns of drive terms alone, (M, rows, k), filtered and thinned; rows without a projection.
+    """Return the columns of drive terms (M, rows, k), filtered and decimated; for rows without a projection.
 
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
     """
@@ -214,19 +214,19 @@ def term_columns(one: DriveTerm, case: Case, load: np.ndarray | None = None) -> 
 
 
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
-    """Return the states (s, N) of friction with memory; each segment starts unstressed."""
+    """Return the states (s, N) of friction with memory, zero at the start of each segment."""
     parts = [drives.friction_states(terms, case.motion.q[a:b].T) for a, b in segments(case.motion.segment)]
     return np.concatenate(parts, axis=1)
 
 
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
-    """Return (start, stop) of each run of equal numbers."""
+    """Return (start, stop) of each run of equal numbers in an array."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
     return [(int(a), int(b)) for a, b in pairwise(edges)]
 
 
 def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
-    """Number the time blocks of all cases: contiguous, about `count` in all, at least one per case.
+    """Return rows with time blocks numbered over all cases: contiguous, about `count`, at least one per case.
 
     Samples within `margin` of a cut get -1: the filter's window reaches over it.
     """
@@ -245,7 +245,7 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 
 
 def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
-    """Return the triangles of all rows, one group per (block, row): group = block · rows + row.
+    """Return the triangles of all rows, one group per time block and torque row: group = block · rows + row.
 
     The last block holds the samples beside cuts.
     """
@@ -261,7 +261,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
 
 
 def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:
-    """Return triangles with one group per row, of all blocks or of those named."""
+    """Return triangles with one group per torque row, over all blocks or the given ones."""
     count = data.groups // rows
     wanted = range(count) if blocks is None else blocks
     index = np.array([[block * rows + row for block in wanted] for row in range(rows)], dtype=int)
@@ -271,7 +271,7 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
 
 
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
-    """Return the regressor (N_i, rows, p) of a part of the samples."""
+    """Return the regressor (N_i, rows, p) at a part of the samples."""
     motion = case.motion
     return model.regressor(motion.q[part], motion.v[part], motion.a[part], None, case.carried, states[:, part])
 
@@ -279,13 +279,13 @@ def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarra
 def _power_block(
     model: RegressorModel, columns: np.ndarray, case: Case, part: slice, states: np.ndarray, segment: slice
 ) -> np.ndarray:
-    """Return entries (k, N_i) of the power's regressor, d/dt h of energies and vᵀ W of the other columns.
+    """Return entries (k, N_i) of the power regressor: d/dt h of energies, vᵀ W of the other columns.
 
     No acceleration takes part. Differences and the filter of the decimation are linear and do not mind which comes
     first: this is the derivative of the filtered energies (Gautier 1997; Gautier & Briot 2013).
     """
     if not isinstance(model, _HasEnergy):
-        raise UsageError("rows = 'power' need a model that knows its energies")
+        raise UsageError("rows = 'power' requires a model with energies")
     motion = case.motion
     edge = 4  # samples beside a block that differences of its energies reach
     near = slice(max(segment.start, part.start - edge), min(segment.stop, part.stop + edge))
@@ -305,6 +305,6 @@ class _HasEnergy(Protocol):
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return which thinned rows (M, rows) stand for samples of a mask (N, rows) by more than half."""
+    """Return the decimated mask (M, rows): true where more than half of the samples of a mask (N, rows) are."""
     share = decimate(mask.astype(float), decimator, segment)
     return (share > 0.5) & mask[kept(segment, decimator)] if len(decimator.taps) == 1 else share > 0.5

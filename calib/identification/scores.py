@@ -1,4 +1,4 @@
-"""How good a prediction of torques is: relative errors, moving and standing apart, and the share no model reaches."""
+"""Errors of predicted torques: relative errors, moving and standing separately, and the share above the band."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class RelativeErrors:
 
     Attributes:
         total: 100 ‖τ - τ̂‖_F / ‖τ‖_F over all rows and samples.
-        joints: (rows,) 100 ‖τ_j - τ̂_j‖ / ‖τ_j‖; NaN where nothing was measured.
+        joints: (rows,) 100 ‖τ_j - τ̂_j‖ / ‖τ_j‖; NaN without measurements.
     """
 
     total: Number
@@ -26,12 +26,12 @@ class RelativeErrors:
 
 @dataclass(frozen=True, eq=False)
 class PredictionErrors:
-    """Errors on one set of samples.
+    """Prediction errors on one set of samples.
 
     Attributes:
-        relative_error_percent: of all rows, and of each.
+        relative_error_percent: of all rows together, and of each.
         rms: (rows,) of τ - τ̂ in the torque's unit.
-        samples: how many rows it rests on, in all.
+        samples: number of torque values in all rows.
     """
 
     relative_error_percent: RelativeErrors
@@ -51,13 +51,13 @@ class PredictionErrors:
 
 @dataclass(frozen=True, eq=False)
 class IntervalCoverage:
-    """Share of the errors within the 95 % intervals that a model states, and where it extrapolates.
+    """Share of the errors within a model's 95 % intervals, and share of samples outside its training range.
 
     Attributes:
         coverage_percent, joints_percent: of all rows, and of each (rows,).
         median: (rows,) half width of the intervals in the torque's unit.
-        samples: at which this was judged.
-        extrapolated_percent: of these samples, how many lie outside the training range.
+        samples: number of samples compared.
+        extrapolated_percent: share of these samples outside the training range.
     """
 
     coverage_percent: float
@@ -69,20 +69,20 @@ class IntervalCoverage:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """One case, predicted: a record of ``metrics.json``.
+    """Prediction errors of one case, a record of ``metrics.json``.
 
     Attributes:
-        raw: against the torque as recorded, at the full rate.
-        filtered: both sides low-passed to the identification band, at the full rate.
-        moving, standing: rows of joints that move, or stand, against the torque as recorded.
+        raw: errors relative to the torque as recorded, at the full rate.
+        filtered: errors with both torques low-passed to the identification band, at the full rate.
+        moving, standing: errors as `raw` for moving joints, and for standing ones.
         above_band_percent: (rows,) share of the torque above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]:
-            noise, ripple, elasticity; a floor for `raw` of any model whose prediction stays in the band.
-        r_squared: (rows,) of the raw torque.
-        whiteness: of the residuals below the band, per row; None for series too short to say.
-        rate: of the series whose whiteness was looked at: thinned to its band [Hz].
-        motion_share: part of the rows that move; where it is small, little but friction at rest was tested.
+            noise, ripple, elasticity; a lower bound of `raw` for any model with predictions in the band.
+        r_squared: (rows,) R² of the raw torque.
+        whiteness: whiteness test of the residuals below the band, per row; None for series too short to test.
+        rate: sampling rate of the series in the whiteness test, decimated to its band [Hz].
+        motion_share: share of rows in motion; if small, the test covers mostly friction at rest.
         evidence: False for a repeat of the training motion.
-        interval95: of errors of unseen torques; None where the model states no intervals.
+        interval95: coverage of the 95 % intervals; None where the model states no intervals.
     """
 
     raw: PredictionErrors
@@ -124,7 +124,7 @@ def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: in
 def score(
     case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | None = None, apart: Sequence[int] = ()
 ) -> Score:
-    """Return the errors of a prediction (N, rows) at the full rate; lost samples count nowhere.
+    """Return the errors of a prediction (N, rows) at the full rate, without lost samples.
 
     Args:
         slow: what stands, see `calib.data.signals.motion.moving`.
@@ -146,7 +146,7 @@ def score(
 def _row(
     case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray
 ) -> tuple[np.ndarray, float, float, np.ndarray]:
-    """Return one torque row's share of a score: an hour's rows would not fit into memory side by side.
+    """Return the sums of one torque row for a score; rows are processed one by one to save memory.
 
     Returns:
         (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
@@ -167,7 +167,7 @@ def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[f
 
 
 def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErrors:
-    """Return the errors of all rows from their sums, each (3,); the total without the rows `apart`."""
+    """Return the errors of all rows from their sums (3,); the total excludes the rows `apart`."""
     square, size, count = np.array(sums).T
     alike = ~np.isin(np.arange(len(square)), apart)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -179,7 +179,7 @@ def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErr
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:
-    """Return the verdicts on the longest segment of the thinned residuals (M, rows)."""
+    """Return the whiteness tests of the longest segment of the decimated residuals (M, rows)."""
     spans = segments(segment)
     first, last = max(spans, key=lambda span: span[1] - span[0]) if spans else (0, 0)
     found: list[Whiteness | None] = []

@@ -1,4 +1,4 @@
-"""How to identify: which terms the drives have, how rows are weighed, what may be left out."""
+"""Settings of an identification: drive terms, weights of the rows, and elimination of parameters."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,21 +32,21 @@ WEIGHTS = ("residuals", "repeats")
 class Coupling:
     """A gear whose motor turns with the sum of two joints (from 0), see `calib.dynamics.drives.coupled`."""
 
-    joints: Annotated[tuple[JointNumber, JointNumber], Expect("two numbers of joints, counted from 1")]
+    joints: Annotated[tuple[JointNumber, JointNumber], Expect("two joint numbers, counted from 1")]
     label: Text = ""
 
 
 @strict
 @dataclass(frozen=True)
 class Payload:
-    """A body at the flange: its known mass [kg] (None: not known), known centre of mass in the tip's frame [m]."""
+    """A body at the flange: mass [kg] and centre of mass in the tip's frame [m]; None if unknown."""
 
     mass: Annotated[float, Real(above=0, most=1e4, unit="kg")] | None = None
     com: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None
 
     @property
     def parameters(self) -> tuple[float, ...] | None:
-        """Its ten standard parameters in the tip's frame as a point mass; None where mass or centre are not known."""
+        """Ten standard parameters in the tip's frame, as a point mass; None if mass or centre is unknown."""
         if self.mass is None or self.com is None:
             return None
         x, y, z = self.com
@@ -56,24 +56,24 @@ class Payload:
 
 @dataclass(frozen=True)
 class Choices:
-    """The choices that options files and identification call alike; the defaults suit a serial arm with motor torques.
+    """Settings with the same names in options files and code; the defaults suit a serial arm with motor torques.
 
     Attributes:
-        passive: names of the drive terms of a parallel robot's passive joints, one text for all.
+        passive: drive terms of a parallel robot's passive joints, one text for all.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
-        friction: ``auto``, ``standard`` or a rung (`calib.identification.friction.friction_ladder`).
-        method: see `calib.identification.methods.least_squares`.
-        weights: what weighs the joints' rows in WLS, one of `WEIGHTS`: their residuals, or the variance over repeats.
-        essential: when to stop leaving out, one of `RULES`.
-        ratio, level: r_σ of the RSD rule, level of the F rule.
-        keep, drop: parameters never, or first, left out.
-        prior: of the parameters, its sizes by evidence, regularised towards the CAD or rods (``auto``), to the CAD, or
-            none.
-        gravity: in the base frame [m/s²]; None: the robot's.
-        samples: most rows (per torque) that are held; of longer recordings every second, third, ... row alone.
+        friction: ``auto``, ``standard`` or a step (`calib.identification.friction.friction_ladder`).
+        method: name of the method, see `calib.identification.methods.least_squares`.
+        weights: source of the joints' weights in WLS, one of `WEIGHTS`: residuals, or variance over repeats.
+        essential: rule to stop eliminating parameters, one of `RULES`.
+        ratio, level: r_σ of the RSD rule, significance level of the F rule.
+        keep, drop: parameters never eliminated, or eliminated first.
+        prior: towards CAD values or rods (``auto``) or CAD values only (``cad``), with sizes by evidence, or
+            not at all (``none``).
+        gravity: gravity in the base frame [m/s²]; None: the robot's.
+        samples: largest number of rows per torque; longer recordings use only every second, third, ... row.
         folds: number of time blocks for cross-validation.
-        loop: the closed loop that recordings came from, for instrumental variables.
-        constraints: what parameters must satisfy, for the methods pc-*; None: their defaults.
+        loop: the closed loop in which recordings were made, for instrumental variables.
+        constraints: constraints on parameters for the methods pc-*; None: their defaults.
     """
 
     passive: Text = ""
@@ -96,17 +96,17 @@ class Choices:
 
 @dataclass(frozen=True)
 class IdentificationSettings(Choices):
-    """All choices of an identification.
+    """All settings of an identification.
 
     Attributes:
-        sets: names of the standard drive terms, one text per joint, or one for all; none: those of the rows.
-        torque_rows: which torques are explained.
-        couplings, terms: what a joint-by-joint model lacks.
-        payloads: label → what is known of it.
-        payload_values: label → its ten standard parameters in the tip's frame, where a gain identification found them;
-            they, or else the stated mass and centre, serve for predictions where no recording to learn from carries it.
-        seed: for random states.
-        apart: joints, from 0, whose torque is in a unit of its own: no total holds them.
+        sets: names of the standard drive terms, one text per joint, or one for all; empty: those of the rows.
+        torque_rows: kind of torques to explain.
+        couplings, terms: couplings and torque terms in addition to the model of single joints.
+        payloads: label → known mass and centre of mass.
+        payload_values: label → ten standard parameters in the tip's frame, from a gain identification;
+            these, or else the stated mass and centre, are used where no training recording has the payload.
+        seed: seed of random states.
+        apart: joints, from 0, whose torque has a different unit, excluded from totals.
     """
 
     sets: tuple[str, ...] = ()
@@ -120,7 +120,7 @@ class IdentificationSettings(Choices):
 
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
-    """Return the model of a chain: its bodies, payloads at its tip, and the drives' standard terms."""
+    """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
     require(not settings.passive, f"passive = '{settings.passive}': a serial arm has no passive joints", UsageError)
     bodies = bodies_of(chain)
     if settings.gravity is not None:
@@ -139,7 +139,7 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:
-    """Refuse couplings and terms of joints that the robot does not have, and a joint coupled with itself."""
+    """Raise an error for couplings or terms of unknown joints, and for a joint coupled with itself."""
     named: list[tuple[str, tuple[int, ...]]] = [
         (f"coupling: joints {[j + 1 for j in one.joints]}", one.joints) for one in settings.couplings
     ]
@@ -154,33 +154,33 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 
 
 def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
-    """Return n values from one or n."""
+    """Return n values from a list of one or n."""
     if len(values) not in (1, n):
         refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
     return tuple(values) * n if len(values) == 1 else tuple(values)
 
 
 def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:
-    """Return the settings of a method that simulates, whose model is one that can be.
+    """Return the settings of a method that simulates, with standard friction, which can be simulated.
 
     Args:
         with_loop: whether it simulates the closed loop, or the robot alone.
 
     Raises:
-        UsageError: where no loop is stated, or for other torques than the motors', or richer friction.
+        UsageError: for a missing loop, torques other than the motors', or richer friction.
     """
     place = f"method '{settings.method}'"
     if with_loop and settings.loop is None:
         words = (
-            "state the controller that it simulates in the options file, [loop] controller = … (calib formats "
+            "state the controller in the options file, [loop] controller = … (calib formats "
             "identify-options), and log or state the reference; from q and torque alone use wls or irls"
         )
         refuse_option(place, words)
     if not settings.torque_rows.motors_alone:
         refuse_option(
-            place, f"explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
+            place, f"supports motor torques only; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
         )
     if settings.friction not in ("auto", "standard"):
         words = f"simulates standard friction only, not friction = '{settings.friction}'"
-        refuse_option(place, f"{words}; use wls, whose estimate a [loop] then tests for bias")
+        refuse_option(place, f"{words}; use wls, which is tested for bias if a [loop] is stated")
     return replace(settings, friction="standard")

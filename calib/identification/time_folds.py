@@ -1,4 +1,4 @@
-"""Models judged on time they have not seen: everything from triangles, one fit per fold.
+"""Cross-validation of models over time blocks: all from triangles, one fit per fold.
 
 Regimes of a motion, on which models are judged without having been fitted to them, are each joint's extremes. A model
 that is right goes on being right where a joint is faster, accelerates more, or stands farther out than in its training
@@ -22,7 +22,7 @@ FAST_SHARE, END_SHARE = 0.1, 0.15  # of the rows: a joint's fastest, its hardest
 
 @dataclass(frozen=True, eq=False)
 class Regimes:
-    """[W y]ᵀ[W y] of what each regime holds, row by row: of joint j's rows those at which joint j is in it.
+    """Products [W y]ᵀ[W y] by regime and torque row: of joint j's rows, those with joint j in the regime.
 
     Attributes:
         squares, counts: (k, rows, p + 1, p + 1) and (k, rows) of the k regimes.
@@ -36,7 +36,7 @@ class Regimes:
 
 
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
-    """Return the regimes of cases, from their rows."""
+    """Return the products by regime of cases, from their rows."""
     motions = [case.motion for case in cases]
     chosen = [kept(motion.segment, decimator) for motion in motions]
     q, v, a = (
@@ -70,17 +70,17 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Triangles of all candidate columns by (block, row), and how they are weighed.
+    """Triangles of all candidate columns by (block, row), with their weights and priors.
 
     Attributes:
-        data: the triangles.
-        rows: torque rows per sample.
-        blocks: number of time blocks that are left out in turn.
+        data: triangles by (block, row).
+        rows: number of torque rows per sample.
+        blocks: number of time blocks, each held out in turn.
         std: (rows,) standard deviation of the residuals.
-        inflation: (rows,) how many rows count as one.
+        inflation: (rows,) variance inflation: number of rows that count as one.
         group: (p,) ridge group of each column, -1 for none.
-        prior: (k, p + 1) rows of [W y] that say what is known beforehand, whitened; None for nothing.
-        regimes: what each torque row's regimes hold, see `calib.identification.time_folds`.
+        prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
+        regimes: products by regime of each torque row, see `calib.identification.time_folds`.
     """
 
     data: Triangles
@@ -94,7 +94,7 @@ class CrossValidation:
     _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
-        """Return the squared errors (blocks, rows) on each block of the model with these columns, fitted to others.
+        """Return the squared errors (blocks, rows) on each block by a model with these columns fitted to the others.
 
         Squares are of samples, not whitened; blocks that a recording's gaps left empty hold zeros.
 
@@ -113,7 +113,7 @@ class CrossValidation:
         return self._known[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (regimes, rows) in each regime of a model with these columns fitted to the rest."""
+        """Return the squared errors (regimes, rows) in each regime by a model with these columns fitted to the rest."""
         assert self.regimes is not None
         index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
@@ -129,7 +129,7 @@ class CrossValidation:
         return np.maximum(result, 0.0)
 
     def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
-        """Return the squared errors of values (k,) per block."""
+        """Return the squared errors of parameter values (k,) per block."""
         result = np.zeros((self.blocks, self.rows))
         for block, own in enumerate(values):
             x = np.zeros(self.data.parameters)
@@ -147,7 +147,7 @@ class CrossValidation:
         return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
 
     def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the ridge estimates from the blocks outside each run; they need [W y]ᵀ[W y] alone."""
+        """Return the ridge estimates from the blocks outside each run, computed from [W y]ᵀ[W y]."""
         index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
         squares = self._squares.take(index, 1).take(index, 2)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
@@ -166,7 +166,7 @@ class CrossValidation:
 
     @cached_property
     def _squares(self) -> np.ndarray:
-        """(blocks, p + 1, p + 1) [W y]ᵀ[W y] of each block, its rows whitened."""
+        """Products [W y]ᵀ[W y] of the whitened rows of each block (blocks, p + 1, p + 1)."""
         factors = self.data.factors[: self.blocks * self.rows]
         weight = np.tile(1.0 / (self.std**2 * self.inflation), self.blocks)
         squares = (factors.transpose(0, 2, 1) * weight[:, None, None]) @ factors
@@ -180,7 +180,7 @@ class CrossValidation:
 def estimate(
     data: Triangles, std: np.ndarray, inflation: np.ndarray, group: np.ndarray, prior: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (p,) and prior standard deviations (p,; infinite where there is no ridge, 0 where switched off).
+    """Return values (p,) and prior standard deviations (p,): infinite without ridge, 0 where switched off.
 
     Columns with a group are regularised towards zero as strongly as the evidence says (`calib.estimation.relevance`);
     with none, this is weighted least squares. Directions without any data stay where they are: at zero.
@@ -198,13 +198,13 @@ def estimate(
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
-    """Return (p,) a number for columns of one group and one unit; -1 for those of no group."""
+    """Return a number (p,) for columns with the same group and unit; -1 for columns without a group."""
     found, unit = np.unique(units, return_inverse=True)
     return np.where(group < 0, -1, group * len(found) + unit)
 
 
 def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) of so many rows.
+    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) and its number of rows.
 
     A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters
     of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows

@@ -141,7 +141,7 @@ def test_one_sine_is_drawn_to_cad_and_says_so():
 
 
 def test_a_record_too_short_is_refused():
-    with pytest.raises(MeasurementError, match="rows are left for"):
+    with pytest.raises(MeasurementError, match="rows remain for"):
         identify(planted.arm(), [planted.case("a", 0, duration=1.3, band=10.0)])
 
 

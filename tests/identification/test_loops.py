@@ -184,7 +184,7 @@ def test_wrong_gains_are_noticed(robot, tmp_path, capsys):
 
 REFUSED = [
     ({"form": ""}, GAINS, "has no reference positions"),
-    ({"factor": 180.0 / np.pi}, GAINS, "probably in deg"),
+    ({"factor": 180.0 / np.pi}, GAINS, "looks like deg"),
     ({"factor": 3.0}, GAINS, "check that the reference belongs to this recording"),
     ({}, GAINS.replace("rate = 1000", "rate = 100"), "is below 250 Hz"),
     ({}, 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "2 values for 3 joints"),

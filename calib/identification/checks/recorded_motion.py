@@ -40,7 +40,7 @@ class DesignedMotion(Protocol):
 
 @dataclass(frozen=True)
 class LocatedMotion:
-    """A designed motion found in a recording.
+    """Location of a designed motion in a recording.
 
     Attributes:
         start, stop: of the complete repetitions with a short margin [s], in the recording's time.
@@ -217,7 +217,7 @@ def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndar
 
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
-    """N samples of a motion of n joints.
+    """N samples of a recorded motion of n joints, with the regressors of its torques.
 
     Attributes:
         index: (N,) indices of the samples in the motion.

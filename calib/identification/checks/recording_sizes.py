@@ -142,7 +142,7 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints, or shift of one's zero, that explains the torques best; None if none helps.
+    """Return the exchange of two joints, or shift of one joint's zero, that best explains the torques, or None.
 
     The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
     """

@@ -166,7 +166,7 @@ def select_friction(
             say(f"friction: {name}")
             columns = [k for k in place[name] if k not in taken]
             found, new, at = bench.tried(taken, columns, error)
-            note = "" if at else "no better on held-out time: left out"
+            note = "" if at else "no improvement on held-out time: not used"
             shown = new if found else bench.errors([*taken, *columns])
             names = tuple(bench.term(k).name for k in found)
             steps.append(bench.trial(f"+ {name}", [*taken, *(found or columns)], shown, at, note, names))
@@ -214,7 +214,7 @@ class _Bench:
             return columns, self.errors([*taken, *columns]), _flat(everyone)
 
         def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
-            """Return the whitened squared errors (blocks,) of the torque rows that terms of these joints act on."""
+            """Return the whitened squared errors (blocks,) of the torque rows affected by terms of these joints."""
             rows = [row for j in own for row in self.candidates.torque_rows.of_side(side, j, self.candidates.n)]
             return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
 

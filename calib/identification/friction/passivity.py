@@ -87,7 +87,7 @@ def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
         named = ", ".join(str(joint + 1) for joint in found)
         refuse_data(
             cases[0].motion.file,
-            f"friction would drive the robot instead of braking it (joints {named}): the torques' sign is reversed, or "
+            f"friction adds energy at joints {named}: the torques' sign is reversed, or "
             "positions and torques are not of the same joints; turn the sign (gains = [-1]), or check the columns",
         )
     return tuple(int(joint) for joint in found)

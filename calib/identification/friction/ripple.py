@@ -202,7 +202,7 @@ class _WaveCrossValidation:
         self._made: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
-        """Return the columns (N, k), in the order of `_terms`."""
+        """Return the regressor columns (N, k) of the waves, in the order of `_terms`."""
         for wave in waves:
             if (wave, nodes) not in self._made:
                 self._made[wave, nodes] = _columns(self._track, wave, nodes)
@@ -234,7 +234,7 @@ class _WaveCrossValidation:
 
 
 def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
-    """Return the columns (N, k) of a wave at the samples of a track, in the order of `_terms`."""
+    """Return the regressor columns (N, k) of a wave along a track, in the order of `_terms`."""
     q, v = track.q[:, wave[0]], track.v[:, wave[0]]
     seen = Joined(q, v, np.zeros_like(q))
     return np.stack([one.values(seen) for one in _terms(wave[0], (wave,), nodes, None)], axis=1)
@@ -295,7 +295,7 @@ def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, .
 
 
 def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
-    """Return the part of a residual (N,) above twice the bandwidth of the motion, segment by segment."""
+    """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, by segments."""
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
     slow = [low_pass(residual[a:b], motion.rate, cutoff) for a, b in segments(motion.segment)]

@@ -140,7 +140,7 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
         refuse_data(
             motion.file,
-            f"the reference of {name} is {size / spread:.3g} times its position, probably in deg; if so, state it (a "
+            f"the reference of {name} is {size / spread:.3g} times its position: it looks like deg; if so, state it (a "
             f"header 'q_ref{joint + 1} [deg]', or [recording] units = {{ q_ref = 'deg' }})",
         )
     refuse_data(
@@ -269,7 +269,7 @@ def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
         raise CalibError(
             f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
             f"{1 / case.motion.rate:.6g} s, the simulation from {t[0]:.6g} s to {t[-1]:.6g} s in steps of "
-            f"{step:.6g} s: give the whole reference, and `every`"
+            f"{step:.6g} s; state the whole reference and `every`"
         )
     return index
 

@@ -158,7 +158,7 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
 
 
 def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
-    """Return the regression slope of the torques W own on W other, for each torque row."""
+    """Return for each torque row the regression slope of torques W own on torques W other."""
     factors = problem.pooled.factors[:, :, :-1]
     mine, theirs = factors @ own, factors @ other
     return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))

@@ -63,7 +63,7 @@ Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
 
 @dataclass(frozen=True)
 class Round:
-    """One iteration.
+    """Convergence of one iteration.
 
     Attributes:
         change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see
@@ -331,7 +331,7 @@ def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None)
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
         if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
-            raise UsageError("these gains give no positive inertia to start from; state it, (n,) [kg m²]")
+            raise UsageError("no regular inertia follows from these gains; state the inertia (n,) [kg m²]")
     n = model.bodies.n
     extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
     return Plant(model.bodies, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))

@@ -64,13 +64,13 @@ class _Simulated(Method):
 
 
 IV = _Simulated(
-    "iv", "the controller and its reference are those of the loop, the model's friction that of the robot",
+    "iv", "the stated controller, reference and friction model are those of the robot",
     description="instrumental variables from the simulated closed loop", source="Janot, Vandanjon & Gautier 2014",
 )  # fmt: skip
 DIDIM = _Simulated(
     "didim",
-    "the simulated robot moves as the real one: controller and reference are those of the loop, the model's friction "
-    "that of the robot; no measured position takes part",
+    "the simulated robot moves like the real one: stated controller, reference and friction model are those of the "
+    "robot; measured positions are not used",
     "didim",
     description="least squares on the simulated motion alone (the slides' CLIE)",
     source="Gautier, Janot & Vandanjon 2013",

@@ -1,4 +1,4 @@
-"""What an identification's data say about the standard parameters: ‖R T χ - z‖², and nothing else.
+"""Information of an identification's data on the standard parameters, without a prior: ‖R T χ - z‖².
 
 T regroups the p parameters χ of the model into the b that the motion identifies separately. R and z are the estimate β
 and its covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, or constraints hold it,
@@ -32,13 +32,13 @@ INFORMATION = "information.csv"
 
 @dataclass(frozen=True, eq=False)
 class Information(Frozen):
-    """An identified model with what its data say.
+    """An identified model with the information of its data.
 
     Attributes:
         chain: the robot it was identified on.
         dynamics: the model; its values hold base parameters.
         names, units: b strings each.
-        values, covariance: (b,), (b, b) the estimate as identified, a prior included where there was one.
+        values, covariance: (b,), (b, b) the estimate as identified, including a prior if one was used.
         transform: T (b, p).
         factor: (k, b + 1) the rows [R z].
     """
@@ -58,20 +58,20 @@ class Information(Frozen):
 
     @property
     def best(self) -> float:
-        """The least of ‖R β - z‖² over all β, those of impossible robots included."""
+        """The minimum of ‖R β - z‖² over all β, physically inconsistent ones included."""
         unit = np.linalg.norm(self.factor[:, :-1], axis=0)
         scaled = self.factor[:, :-1] / np.where(unit > 0.0, unit, 1.0)
         found = np.linalg.lstsq(scaled, self.factor[:, -1], rcond=1e-12)[0]
         return float(np.sum((scaled @ found - self.factor[:, -1]) ** 2))
 
     def distance(self, standard: np.ndarray) -> float:
-        """Return how far standard parameters (p,) are from the data's best, in standard deviations (Mahalanobis)."""
+        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in sigmas."""
         rest = self.factor[:, :-1] @ (self.transform @ standard) - self.factor[:, -1]
         return float(np.sqrt(max(float(rest @ rest) - self.best, 0.0)))
 
 
 def of(found: Identification, chain: Chain) -> Information:
-    """Return what an identification's data say, before anything of it is written."""
+    """Return the information of an identification in memory, without reading its files."""
     fitted, b = found.fitted, found.base.b
     estimate, standard = fitted.estimate, found.dynamics.model.names
     place = {name: k for k, name in enumerate(standard)}
@@ -107,7 +107,7 @@ def _information(found: Identification) -> np.ndarray:
 
 
 def read(folder: str | Path) -> Information:
-    """Read what an identification left in `folder`.
+    """Return the information of the identification stored in `folder`.
 
     Raises:
         RobotError: where the folder holds none, or one of a version that did not write how parameters regroup.
@@ -116,7 +116,7 @@ def read(folder: str | Path) -> Information:
     chain, dynamics = read_dynamics(folder)
     groups = read_table(folder).get("regrouping")
     if groups is None:
-        raise RobotError(f"{folder}/dynamics.json does not say how parameters regroup; identify again")
+        raise RobotError(f"{folder}/dynamics.json does not state how parameters regroup; identify again")
     with refused_as(
         RobotError,
         (OSError, KeyError, ValueError),
@@ -135,7 +135,7 @@ def read(folder: str | Path) -> Information:
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
-    """Return T (b, p); richer friction, which regroups with nothing, stands for itself."""
+    """Return the regrouping T (b, p), the identity for richer friction."""
     place = {name: k for k, name in enumerate(standard)}
     result = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):

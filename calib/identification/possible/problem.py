@@ -1,4 +1,4 @@
-"""The cost of standard parameters that belong to bodies that can exist, as arrays: data, prior bodies, drive terms.
+"""Cost function of physically consistent standard parameters, as arrays: data, prior bodies, drive terms.
 
 Prior bodies, towards which consistent parameters are regularised, are the CAD's, else rods between the joints.
 
@@ -36,14 +36,14 @@ TOTALS = tuple(float(10.0 ** (k / 2)) for k in range(0, 7))  # [kg] of an arm wi
 
 @dataclass(frozen=True, eq=False)
 class PriorBodies(Frozen):
-    """One body per body of a model.
+    """Prior inertial parameters of each body of a model.
 
     Attributes:
-        parameters: (B, 10) standard ones, all of possible bodies.
-        drawn: (B,) False where only the order of size is meant.
-        cad: whether they come from a CAD.
-        source: in words.
-        notes: what had to be mended.
+        parameters: (B, 10) standard parameters, all physically consistent.
+        drawn: (B,) False where only the order of magnitude is known.
+        cad: whether they are CAD values.
+        source: text on the source.
+        notes: texts on corrected bodies.
     """
 
     parameters: np.ndarray
@@ -54,7 +54,7 @@ class PriorBodies(Frozen):
 
 
 def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[PriorBodies]:
-    """Yield the references between which the evidence decides: one of the CAD, or rods of several total masses."""
+    """Yield the candidate priors, to be selected by evidence: CAD values alone, or rods with several total masses."""
     carried = model.bodies.coordinates < 0
     if chain.inertias is not None and chain.inertias[:, 9].max() > 0.0:
         yield _cad(chain, model, carried)
@@ -80,13 +80,13 @@ def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> Prior
             bodies[i] = _thickened(own[i])
             if pseudo_inertia.margin(own[i]) < 0.0:
                 notes.append(
-                    f"CAD inertia of body {label} is physically inconsistent: the nearest consistent one is taken"
+                    f"CAD inertia of body {label} is physically inconsistent: the nearest consistent one is used"
                 )
     return PriorBodies(bodies, drawn, True, "the inertias of the robot's description", tuple(notes))
 
 
 def _thickened(body: np.ndarray) -> np.ndarray:
-    """Return a body with its mass spread by at least `THIN` in every direction about its centre."""
+    """Return a body's parameters with its mass spread by at least `THIN` in every direction about its centre."""
     pseudo = pseudo_inertia.from_standard(body)
     mass, centre = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     size, axes = np.linalg.eigh(pseudo[:3, :3] / mass - np.outer(centre, centre))
@@ -100,17 +100,17 @@ WEAK = 2.0  # γ of payloads: nothing is known of them but the order of size
 
 @dataclass(frozen=True, eq=False)
 class BodyCost:
-    """The cost as arrays; parameters that the data do not see and no prior holds are fixed beforehand.
+    """The cost function as arrays; parameters without data and prior are fixed beforehand.
 
     Attributes:
         factor: (k, p + 1) [R T, z].
-        bodies: number of bodies, ten parameters each, before all others.
+        bodies: number of bodies, with ten parameters each, before all other parameters.
         references: (B, 4, 4) P⁰.
-        drawn: (B,) whether the common weight γ counts for a body; `WEAK` does otherwise.
+        drawn: (B,) whether the common weight γ applies to a body; `WEAK` otherwise.
         sizes: (p - 10 B,) x⁰ of positive drive terms; standard deviation of the free ones; 0 where fixed.
-        positive: (p - 10 B,) which terms are positive.
+        positive: (p - 10 B,) which terms must be positive.
         fixed: (p - 10 B,) their values where fixed.
-        lift: factor of all priors, 1 but on the way to the optimum.
+        lift: factor of all priors; 1 except during the search for the optimum.
     """
 
     factor: np.ndarray
@@ -124,16 +124,16 @@ class BodyCost:
 
     @property
     def free(self) -> np.ndarray:
-        """(p,) which parameters are unknown."""
+        """Which parameters are estimated (p,) bool."""
         return np.concatenate([np.ones(10 * self.bodies, bool), self.sizes > 0.0])
 
     def weights(self, gamma: float) -> np.ndarray:
-        """(B,) the weight of each body."""
+        """Return the prior weight of each body (B,)."""
         return self.lift * np.where(self.drawn, gamma, WEAK)
 
 
 def make_problem(information: Information, references: PriorBodies) -> BodyCost:
-    """Return the cost of an identified model; sizes of drive terms come from the torque they could explain."""
+    """Return the cost function of an identified model, with sizes of drive terms from the torque they could explain."""
     model = information.dynamics.model
     bodies = model.bodies.count
     columns = information.factor[:, :-1] @ information.transform
@@ -156,7 +156,7 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
 
 
 def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> np.ndarray:
-    """Return the standard parameters (p,) of the possible robot nearest to the data.
+    """Return the physically consistent standard parameters (p,) nearest to the data's optimum.
 
     Args:
         spared: a body (counted from 0, or from B on a term) that may be impossible.
@@ -195,7 +195,7 @@ def _pulling(problem: BodyCost, pull: float) -> np.ndarray:
 
 
 def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
-    """Return whose possibility costs most: label or name, and the distance left without the demand on it."""
+    """Return the bodies and terms whose consistency costs most: name, and the distance without that constraint."""
     model = information.dynamics.model
     found = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
     found += [
@@ -208,7 +208,7 @@ def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[t
 
 
 def _coordinates(problem: BodyCost) -> np.ndarray:
-    """Return χ (p,) as a matrix times [ξ_1; …; u], P_i = L Q_i Lᵀ, P_i⁰ = L Lᵀ, u in the terms' sizes.
+    """Return the matrix from [ξ_1; …; u] to χ (p,), with P_i = L Q_i Lᵀ, P_i⁰ = L Lᵀ, u in units of the terms' sizes.
 
     ξ_i are the entries of Q_i by an orthonormal basis.
     """

@@ -1,4 +1,4 @@
-"""All standard parameters, those of bodies that can exist: what simulators and URDFs ask for.
+"""Full set of physically consistent standard parameters, as simulators and URDFs require.
 
 The data fix b combinations T χ of the p standard parameters; the rest is free, and most choices of it belong to no
 body. With P_i the pseudo-inertia of body i (`calib.dynamics.pseudo_inertia`), P_i⁰ that of the CAD, d the drives' Ia,
@@ -75,22 +75,22 @@ SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
 
 @dataclass(frozen=True, eq=False)
 class PossibleBodies(Frozen):
-    """Standard parameters of a robot that can exist.
+    """Standard parameters of a physically consistent robot.
 
     Attributes:
         dynamics: the identified model with all its parameters.
-        covariance: (p, p) of data and prior together, by the curvature at the optimum; zero where fixed.
-        weight: γ.
-        doubt: factor of the data's sigmas, above 1 where no possible robot is within them.
-        margins: (B,) of each body [m], see `pseudo_inertia.margin`.
-        distance: of these parameters from the data's best, in standard deviations (Mahalanobis).
-        nearest: the same of the nearest possible robot; 0 where the estimate itself is possible.
-        allowed: what that distance stays below in 95 % of all cases where the model is right: √χ²(b).
+        covariance: (p, p) from data and prior, by the curvature at the optimum; zero where fixed.
+        weight: weight γ of the prior.
+        doubt: factor of the data's sigmas, above 1 where no physically consistent robot is within them.
+        margins: (B,) consistency margin of each body [m], see `pseudo_inertia.margin`.
+        distance: of these parameters from the data's optimum, in standard deviations (Mahalanobis).
+        nearest: the same for the nearest consistent robot; 0 where the estimate itself is consistent.
+        allowed: 95 % limit of that distance for a correct model: √χ²(b).
         blamed: labels of the bodies or names of the drive terms that cost most of `nearest`, worst first, and the
-            distance without the demand on each; empty where it is within `allowed`.
-        source: where P⁰ comes from, in words.
+            distance without the constraint on each; empty where it is within `allowed`.
+        source: text on the source of P⁰.
         prior: one of `PRIORS`.
-        notes: what the engineer should know.
+        notes: remarks for the engineer.
     """
 
     dynamics: Dynamics
@@ -108,19 +108,19 @@ class PossibleBodies(Frozen):
 
     @property
     def possible(self) -> bool:
-        """Whether a possible robot lies within the estimate's covariance."""
+        """Whether a physically consistent robot lies within the estimate's confidence region."""
         return self.nearest <= self.allowed
 
 
 def bound(b: int) -> float:
-    """Return what the distance of b estimated parameters from true ones stays below in 95 % of all cases: √χ²(b)."""
+    """Return the 95 % limit of the distance of b estimated parameters from the true ones: √χ²(b)."""
     from scipy.special import chdtri
 
     return float(np.sqrt(chdtri(b, 0.05)))
 
 
 def find_possible(information: Information, weight: float | None = None, prior: str = "entropic") -> PossibleBodies:
-    """Return the full standard parameters of an identified model.
+    """Return the full, physically consistent standard parameters of an identified model.
 
     Args:
         information: what was identified.
@@ -133,7 +133,7 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     one_of(prior, PRIORS, "prior", UsageError)
     model = information.dynamics.model
     if not model.torque_rows.has_bodies:
-        raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
+        raise UsageError("the model has only drives (kind 'drive'), no bodies to make consistent")
     allowed = bound(information.b)
     choices = [
         (references, make_problem(information, references))
@@ -166,7 +166,7 @@ def find_possible(information: Information, weight: float | None = None, prior: 
 def _candidates(
     references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float
 ) -> Iterator[tuple[float, float, BodyCost, np.ndarray, PriorBodies]]:
-    """Yield the optimum of each weight with its evidence, the data's sigmas widened by `doubt`."""
+    """Yield the optimum for each prior weight with its evidence; the data's sigmas are widened by `doubt`."""
     doubted = replace(problem, factor=problem.factor / doubt)
     min_cad_weight = 20.0  # of γ with a CAD
     usual = [g for g in WEIGHTS if g >= min_cad_weight] if references.cad else WEIGHTS[4::3]
@@ -176,7 +176,7 @@ def _candidates(
 
 
 def solve(problem: BodyCost, gamma: float) -> np.ndarray:
-    """Return argmin of the cost (p,), by Newton's method from the references, inside the cone all the way.
+    """Return argmin of the cost (p,) by Newton's method, starting at the references and staying inside the cone.
 
     From far off a weak barrier makes Newton's steps short, so all priors are as strong as the data at first and let
     go by factors of ten, as interior-point methods do.
@@ -192,13 +192,13 @@ def solve(problem: BodyCost, gamma: float) -> np.ndarray:
 
 
 def _reference(problem: BodyCost) -> np.ndarray:
-    """Return the standard parameters (p,) that the priors draw to."""
+    """Return the standard parameters (p,) at the centre of the priors."""
     terms = np.where(problem.sizes > 0.0, np.where(problem.positive, problem.sizes, 0.0), problem.fixed)
     return np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
 
 
 def _descend(problem: BodyCost, gamma: float, values: np.ndarray, max_steps: int = 200) -> np.ndarray:
-    """Return the optimum by Newton's method with steps halved until the cost falls (Armijo)."""
+    """Return the optimum by Newton's method, with steps halved until the cost decreases (Armijo)."""
     free, here = problem.free, cost(problem, gamma, values)
     for _ in range(max_steps):
         slope, curvature = derivatives(problem, gamma, values)
@@ -213,11 +213,11 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray, max_steps: int
             if size < 1e-12:  # rounding: no step lowers the cost any more
                 return values
         values, here = values + size * step, there
-    raise NotConverged(f"the consistent parameters still move after {max_steps} Newton steps", values)
+    raise NotConverged(f"the consistent parameters have not converged after {max_steps} Newton steps", values)
 
 
 def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return J(χ) of the module's equation; infinite outside of the cone."""
+    """Return the cost J(χ) of the module's equation; infinite outside the cone."""
     rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
     pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
     inside = np.linalg.eigvalsh(_scaled(problem, pseudo))[:, 0] > 0.0
@@ -235,7 +235,7 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return slope (p,) and curvature (p, p) of the cost."""
+    """Return gradient (p,) and Hessian (p, p) of the cost."""
     columns = problem.factor[:, :-1]
     slope = columns.T @ (columns @ values - problem.factor[:, -1])
     curvature = columns.T @ columns
@@ -254,7 +254,7 @@ def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np
 
 
 def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return log p(data | γ), Laplace's approximation, but for a constant."""
+    """Return log p(data | γ) by Laplace's approximation, up to a constant."""
     free = problem.free
     curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
     unit = np.sqrt(np.diag(curvature))
@@ -266,7 +266,7 @@ def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
-    """Return the inverse of the cost's curvature (p, p), zero for what is fixed."""
+    """Return the inverse of the cost's curvature (p, p), zero for fixed parameters."""
     free = problem.free
     result = np.zeros((len(values), len(values)))
     curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
@@ -275,7 +275,7 @@ def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarr
 
 
 def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return curvature⁻¹ target, by Cholesky in units that make the diagonal one.
+    """Return curvature⁻¹ target by Cholesky, scaled to a unit diagonal.
 
     What rounding leaves indefinite gets the least ridge of `RIDGES` that helps; a step by it still leads downhill.
 
@@ -299,28 +299,28 @@ def _bodies(problem: BodyCost, values: np.ndarray) -> np.ndarray:
 
 
 def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
-    """Return L⁻¹ P L⁻ᵀ with P⁰ = L Lᵀ: definite where P is, and of order one."""
+    """Return the scaled pseudo-inertia L⁻¹ P L⁻ᵀ with P⁰ = L Lᵀ: definite where P is, and of order one."""
     inverse = np.linalg.inv(np.linalg.cholesky(problem.references))
     return inverse @ pseudo @ inverse.transpose(0, 2, 1)
 
 
 def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) -> Sequence[str]:
-    """Return what stands out: bodies thinner than a millimetre."""
+    """Return remarks on bodies thinner than a millimetre."""
     found = []
     for label, body in zip(model.bodies.labels, _bodies(problem, values)):
         if pseudo_inertia.margin(body) < 1e-3:
-            found.append(f"body {label} is thinner than a millimetre: hardly possible")
+            found.append(f"body {label} is thinner than a millimetre: hardly realistic")
     return found
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """How far an estimate is from the nearest possible robot.
+    """Distance of an estimate from the nearest physically consistent robot.
 
     Attributes:
-        distance: in standard deviations (Mahalanobis); up to `max_times` times `allowed` that of a robot near it.
-        allowed: what it stays below in 95 % of all cases where the model is right.
-        unexplained: of the torques, in weighted rows, that the nearest possible robot leaves beside the estimate [%].
+        distance: in standard deviations (Mahalanobis); up to `max_times` times `allowed` only an approximation.
+        allowed: 95 % limit of the distance for a correct model.
+        unexplained: of the weighted torques by the nearest consistent robot, in addition to the estimate [%].
     """
 
     distance: float

@@ -1,1 +1,1 @@
-"""How sure an identified model is, the geometry's share included."""
+"""Uncertainty of an identified model, including the contribution of the geometry."""

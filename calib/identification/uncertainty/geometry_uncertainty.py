@@ -1,4 +1,4 @@
-"""What the geometry's uncertainty does to the dynamics identified on it: sensitivities and the total covariance.
+"""Effect of the geometry's uncertainty on the identified dynamics: sensitivities and the total covariance.
 
 The estimate on a geometry g (values of the chain's elements) minimises ‖(y - W(g) φ) / σ‖² (plus a prior's term, if
 there is one), so that at fixed torques y and weights
@@ -51,8 +51,8 @@ class _Estimator:
 
     Attributes:
         deviation: (rows,) R = diag(deviation²).
-        beforehand: (k, p) L, what was known beforehand, as whitened rows; (0, p) for nothing.
-        pull: (p,) that information times its mean; what keeps parameters within bounds is part of it.
+        beforehand: (k, p) L, whitened rows of the prior; (0, p) without one.
+        pull: (p,) information of the prior times its mean, including the effect of bounds.
     """
 
     deviation: np.ndarray
@@ -61,7 +61,7 @@ class _Estimator:
 
 
 def estimator(found: Identification) -> _Estimator:
-    """Return how an identification weighed its rows, and what it knew beforehand."""
+    """Return an identification's estimator: weights of its rows and prior."""
     fitted = found.fitted
     p = fitted.pooled.parameters
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
@@ -86,7 +86,7 @@ def estimate(how: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.n
 
 
 def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
-    """Return the rows of an identification as another geometry would have given them; friction's columns stay."""
+    """Return the rows of an identification recomputed for another geometry; friction columns are unchanged."""
     model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
     result = []
     for part, case in zip(found.rows, cases):
@@ -97,7 +97,7 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
 
 
 def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return by how much φ (p,) changes where rows of nearly standing joints are left out; for one row per joint."""
+    """Return the change of φ (p,) without the rows of nearly standing joints; for models with one row per joint."""
     how, decimator = estimator(found), common_decimator(cases, found.settings)
     faster = [
         replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
@@ -107,14 +107,14 @@ def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray
 
 
 def cut(rows: ObservationRows, own: slice) -> ObservationRows:
-    """Return some of the rows."""
+    """Return the part of the rows in a slice."""
     return replace(
         rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own]
     )
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
-    """Return the inverse of an upper triangle (p, p) whose columns have units of their own."""
+    """Return the inverse of an upper triangle (p, p) with columns in different units."""
     unit = np.linalg.norm(upper, axis=0)
     return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
 
@@ -124,7 +124,7 @@ def stacked(rows: ObservationRows) -> np.ndarray:
 
 
 def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
-    """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
+    """Return 1 / deviation (or 1 / `by`) of each stacked row; zero for rows not used in training."""
     return (rows.present / (how.deviation if by is None else by)).ravel()
 
 
@@ -138,17 +138,17 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class GeometryUncertainty(Frozen):
-    """The estimate's sensitivity to the geometry and what it adds to the covariance.
+    """Sensitivity of the estimate to the geometry, and its contribution to the covariance.
 
     Attributes:
-        names: of the p parameters of the estimate.
+        names: names of the p estimated parameters.
         elements, units: the K elements of the chain, then the tilts of gravity about the base's x and y axes.
         sensitivity: (p, K + 2) dφ/dg.
         torque: (p, p) covariance from the torques' noise: the estimate's own.
-        deviations: (K + 2,) standard deviations of the geometry; NaN where nothing states one.
+        deviations: (K + 2,) standard deviations of the geometry; NaN where unknown.
         geometry: (p, p) S Σ_geometry Sᵀ; None where no covariance of the geometry is known.
         felt, left: (K + 2,) rms change of the rigid torque over rows and samples per unit of each element [N m or N],
-            at fixed parameters, and after they have been estimated anew.
+            at fixed parameters, and after estimating them again.
     """
 
     names: tuple[str, ...]
@@ -163,7 +163,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def covariance(self) -> np.ndarray:
-        """(p, p) Σ_torque + S Σ_geometry Sᵀ."""
+        """Total covariance (p, p): Σ_torque + S Σ_geometry Sᵀ."""
         return np.asarray(self.torque) if self.geometry is None else self.torque + self.geometry
 
     @property
@@ -172,7 +172,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def sigma_geometry(self) -> np.ndarray:
-        """(p,) zero where the geometry is taken as exact."""
+        """Standard deviation by the geometry (p,), zero where the geometry is taken as exact."""
         if self.geometry is None:
             return np.zeros(len(self.names))
         return np.sqrt(np.clip(np.diag(self.geometry), 0.0, None))
@@ -183,19 +183,19 @@ class GeometryUncertainty(Frozen):
 
     @property
     def changed(self) -> np.ndarray:
-        """(p,) bool: σ grows by more than `NOTHING`."""
+        """Parameters whose σ grows by more than `NOTHING` (p,) bool."""
         return self.sigma > (1.0 + NOTHING) * self.sigma_torque
 
     @property
     def dominated(self) -> np.ndarray:
-        """(p,) bool: the geometric part exceeds the torque part."""
+        """Parameters whose geometric part of σ exceeds the torque part (p,) bool."""
         return self.sigma_geometry > self.sigma_torque
 
 
 def propagate(
     found: Identification, robot: Chain | CalibratedChain, cases: Sequence[Case], progress: Progress | None = None
 ) -> GeometryUncertainty:
-    """Return what the covariance of a calibrated robot's geometry adds to that of the dynamics identified on it.
+    """Return the contribution of a calibrated geometry's covariance to that of the identified dynamics.
 
     Args:
         found: the identification.
@@ -220,7 +220,7 @@ def propagate(
 def sensitivity(
     found: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return dφ/dg (p, K + 2), and the rms change of the rigid torque per unit, fixed and re-estimated, (K + 2,) each.
+    """Return dφ/dg (p, K + 2), and rms changes of the rigid torque per unit, φ fixed and re-estimated, (K + 2,) each.
 
     The last two columns turn gravity about the base's x and y axes [per rad].
     """
@@ -257,7 +257,7 @@ def sensitivity(
 
 
 def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
-    """Return the bodies with each element, then with each tilt of gravity, `STEP` above and below its value."""
+    """Return pairs of bodies with each element, then each tilt of gravity, `STEP` above and below its value."""
     result = []
     for k in range(len(chain.elements)):
         beside = [np.array(chain.values), np.array(chain.values)]
@@ -277,7 +277,7 @@ def _tree(found: Identification, chain: Chain) -> Bodies:
 
 
 def _pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32) -> list[tuple[slice, slice]]:
-    """Return (thinned rows, samples at the full rate that these see) of every `step`-th piece of a case.
+    """Return (decimated rows, full-rate samples that they depend on) of every `step`-th piece of a case.
 
     With step 1 each segment is one piece.
 
@@ -302,7 +302,7 @@ def _differences(
     found: Identification, moved: Sequence[tuple[Bodies, Bodies]], case: Case, span: slice, residual: np.ndarray,
     decimator: Decimator,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return (∂W/∂g) φ (M, rows, K + 2), filtered and thinned, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
+    """Return (∂W/∂g) φ (M, rows, K + 2), filtered and decimated, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
 
     Args:
         residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
@@ -341,11 +341,11 @@ class GeometryComparison:
     """Two estimates from the same torques, on two geometries.
 
     Attributes:
-        names, units: of the p parameters.
+        names, units: names and units of the p parameters.
         values: (2, p) on the nominal (CAD) and on the calibrated geometry.
-        sigma: (2, p) of each: of torque noise alone on the nominal, total on the calibrated one.
-        difference: (p,) standard deviation of the difference: the geometry's part, and what little of the torque noise
-            the two do not share.
+        sigma: (2, p) of both: from torque noise alone on the nominal, total on the calibrated geometry.
+        difference: (p,) standard deviation of the difference: the geometry's part, and the small part of the noise that
+            the two estimates do not share.
     """
 
     names: tuple[str, ...]
@@ -356,7 +356,7 @@ class GeometryComparison:
 
     @property
     def relative(self) -> np.ndarray:
-        """(p,) 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
+        """Relative difference (p,): 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
         with np.errstate(divide="ignore", invalid="ignore"):
             found = 100.0 * (self.values[0] - self.values[1]) / np.abs(self.values[1])
         return np.where(self.values[1] == 0.0, np.nan, found)
@@ -365,7 +365,7 @@ class GeometryComparison:
 def compare(
     found: Identification, carried: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
 ) -> GeometryComparison:
-    """Estimate the same columns from the same torques on the nominal geometry, and say how far apart the two are.
+    """Return the comparison of the estimate with one from the same columns and torques on the nominal geometry.
 
     Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
     """

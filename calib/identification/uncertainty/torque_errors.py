@@ -1,4 +1,4 @@
-"""How far off predicted torques may be: what the parameters leave open, and what the model itself leaves.
+"""Expected errors of predicted torques: from the parameters' uncertainty, and from unmodelled effects.
 
     E e_j² = κ_j w_j Σ w_jᵀ + v_j + u_j log(1 + d_j²)
 
@@ -43,12 +43,12 @@ BLOCK = 4000
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What was fitted, and how well.
+    """An identified model with the covariance of its parameters.
 
     Attributes:
-        dynamics: the model; values of payloads that are not on board are zero.
-        carried: labels of the payloads on board.
-        columns: (k,) of the regressor.
+        dynamics: the model; values of payloads that are not mounted are zero.
+        carried: labels of the mounted payloads.
+        columns: (k,) indices of the estimated columns of the regressor.
         covariance: (k, k) of their parameters.
     """
 
@@ -58,14 +58,14 @@ class Uncertainty:
     covariance: np.ndarray
 
     def sigma(self, sampled: Sampled) -> np.ndarray:
-        """Return the largest standard deviation (n,) of each torque along a motion: √(w Σ wᵀ) [N m or N]."""
+        """Return the largest standard deviation of each torque along a motion (n,): √(w Σ wᵀ) [N m or N]."""
         state = sampled.q, sampled.v, sampled.a
         variances = parameter_variances(self.dynamics, self.columns, self.covariance, *state, self.carried)
         return np.sqrt(variances.max(axis=0))[-sampled.q.shape[1] :]
 
 
 def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
-    """Return which columns of the regressor (k,) estimated parameters are of.
+    """Return the regressor columns (k,) of the estimated parameters.
 
     Raises:
         ValueError: for a name that the model does not have.
@@ -78,7 +78,7 @@ def parameter_variances(
     dynamics: Dynamics, columns: np.ndarray, covariance: np.ndarray, q: np.ndarray, v: np.ndarray,
     a: np.ndarray, carried: Collection[str] | None = None, states: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Return w Σ wᵀ (N, rows) of torques, with Σ (k, k) of the parameters of these columns (k,) [N² m² or N²].
+    """Return the variances w Σ wᵀ (N, rows) of torques, for columns (k,) with covariance Σ (k, k) [N² m² or N²].
 
     Args:
         q, v, a: (N, n) states.
@@ -101,19 +101,19 @@ def parameter_variances(
 
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
-    """Return the uncertainty that ``covariance.csv`` of an identification states; None without the file."""
+    """Return the uncertainty in ``covariance.csv`` of an identification; None without the file."""
     found = read_covariance(folder)
     if found is None:
         return None
     names, covariance = found
-    with refused_as(UsageError, ValueError, f"{folder}/covariance.csv does not fit dynamics.json beside it: {{}}"):
+    with refused_as(UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}"):
         columns = estimated_columns(dynamics, names)
     return Uncertainty(dynamics, tuple(carried), columns, covariance)
 
 
 COVERED, SIGMAS = 0.95, 1.96
 OPTIMISM = 0.6
-"""By how many of the deviations between blocks errors on other motion are larger than those on time left out.
+"""Factor on the deviations between blocks by which errors on other motion exceed those on held-out time.
 
 Friction and filters were chosen on that time, too. It holds 95 % on average over two kinds of pairs that count alike:
 33 of parts of real recordings (1.35 to 50 s to learn from; 92.5 %) and 14 of simulated arms, which are the same on
@@ -130,12 +130,12 @@ WAYS = ("outside the range of joint", "faster than in training at joint", "accel
 
 @dataclass(frozen=True)
 class TorqueDiscrepancy:
-    """What makes an error of the torque likely, learnt on time left out.
+    """Variance model of the torque's errors, estimated on held-out time.
 
     Attributes:
-        parameters: (rows,) κ, by which the parameters' variance counts.
-        floor: (rows,) v [N² m² or N²], of what no parameter of the model explains.
-        beyond: (rows,) u, the same per log(1 + d²), d the distance from the training data.
+        parameters: (rows,) κ, factor of the parameters' variance.
+        floor: (rows,) v [N² m² or N²], variance of unmodelled effects.
+        beyond: (rows,) u, additional variance per log(1 + d²), d the distance from the training data.
         lower, upper, scale: (3, n) least and largest q, v, a of the training data, and their standard deviations.
     """
 
@@ -147,13 +147,13 @@ class TorqueDiscrepancy:
     scale: tuple[tuple[float, ...], ...]
 
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
-        """Return log(1 + d²) (N, rows) of states, each (N, n): of a row's own joint, or of all where it has none."""
+        """Return log(1 + d²) (N, rows) of states q, v, a (N, n) each: over the row's joint, or over all without one."""
         away = np.sum((self._outside(q, v, a) / np.array(self.scale)[:, None]) ** 2, axis=0)
         own, left = divmod(rows, away.shape[1])
         return np.log1p(np.broadcast_to(away.sum(axis=1)[:, None], (len(q), rows)) if left else np.tile(away, own))
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return by which of q, v, a and at which joint (3, N, n) states leave the training range."""
+        """Return whether states leave the training range, by q, v, a and joint (3, N, n) bool."""
         max_outside = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
         return self._outside(q, v, a) > max_outside * (np.array(self.upper) - np.array(self.lower))[:, None]
 
@@ -165,10 +165,10 @@ class TorqueDiscrepancy:
 
 @dataclass(frozen=True, eq=False)
 class TorqueErrorModel:
-    """Predicts the size of the errors of predicted torques.
+    """Model of the standard deviations of errors of predicted torques.
 
     Attributes:
-        columns: (k,) of the model's regressor that were estimated.
+        columns: (k,) indices of the estimated columns of the model's regressor.
         covariance: (k, k) of their parameters.
         discrepancy: see `TorqueDiscrepancy`.
     """
@@ -181,7 +181,7 @@ class TorqueErrorModel:
         self, dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.ndarray,
         carried: Collection[str] | None = None, states: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
-        """Return standard deviations (N, rows) of the errors of predicted torques [N m or N]: 1.96 hold 95 %.
+        """Return standard deviations (N, rows) of the errors of predicted torques [N m or N]; 1.96 of them cover 95 %.
 
         Args:
             dynamics: the model that predicts.
@@ -197,14 +197,14 @@ class TorqueErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class TorqueIntervals:
-    """What a model expects of its errors on one recording, beside those found, at M of its samples.
+    """Predicted intervals of a model's errors on one recording and whether they contain the errors, at M samples.
 
     Attributes:
-        index: (M,) the samples.
-        sigma: (M, rows) standard deviations stated [N m or N].
-        inside: (M, rows) whether the errors found are within 1.96 of them.
-        known: (M,) False at lost samples, which count nowhere.
-        extrapolated: (3, M, n) by which of q, v, a and at which joint the motion leaves the training range.
+        index: (M,) indices of the samples.
+        sigma: (M, rows) predicted standard deviations [N m or N].
+        inside: (M, rows) whether the actual errors are within 1.96 of them.
+        known: (M,) False at lost samples, which are not counted.
+        extrapolated: (3, M, n) whether the motion leaves the training range, by q, v, a and joint.
     """
 
     index: np.ndarray
@@ -215,39 +215,39 @@ class TorqueIntervals:
 
     @property
     def covered(self) -> float:
-        """Share of all errors found that are within their interval."""
+        """Share of all errors within their interval."""
         return float(np.mean(self.inside[self.known]))
 
     @property
     def joints(self) -> np.ndarray:
-        """(rows,) the same by torque row."""
+        """Share of the errors within their interval, by torque row (rows,)."""
         return np.asarray(np.mean(self.inside[self.known], axis=0))
 
     @property
     def independent(self) -> np.ndarray:
-        """(rows,) how many independent errors they are worth, by the autocorrelation of being inside."""
+        """Number of independent errors (rows,), from the autocorrelation of `inside`."""
         seen = self.inside[self.known].astype(float)
         return np.array([len(seen) / inflation(column) for column in seen.T])
 
     @property
     def median(self) -> np.ndarray:
-        """(rows,) half width of the interval [N m or N]."""
+        """Median half width of the interval (rows,) [N m or N]."""
         return np.asarray(SIGMAS * np.median(self.sigma, axis=0))
 
     @property
     def beyond(self) -> np.ndarray:
-        """(M,) whether a sample extrapolates."""
+        """Whether each sample extrapolates (M,) bool."""
         return np.asarray(self.extrapolated.any(axis=(0, 2)))
 
     def coverage(self) -> IntervalCoverage:
-        """Return the shares of errors inside, as a record."""
+        """Return the shares of errors within their intervals, as a record."""
         return IntervalCoverage(
             100.0 * self.covered, 100.0 * self.joints, self.median, int(self.known.sum()),
             100.0 * float(self.beyond.mean()),
         )  # fmt: skip
 
     def ways(self, joints: Sequence[str]) -> list[str]:
-        """Say how the motion leaves the training range: in which of q, v, a, and at which of the joints named."""
+        """Return texts on how the motion leaves the training range: by q, v or a, and at which of the named joints."""
         outside = np.asarray(self.extrapolated.any(axis=1))
         return [
             f"{words} {', '.join(name for name, out in zip(joints, own.tolist()) if out)}"
@@ -257,7 +257,7 @@ class TorqueIntervals:
 
 
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
-    """Return what a model expects of its errors on a recording, beside those of its prediction (N, rows)."""
+    """Return the intervals of a model's errors on a recording, compared with those of its prediction (N, rows)."""
     motion = case.motion
     max_samples = 5000  # samples of a recording that intervals are evaluated at
     index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), max_samples)).astype(int))
@@ -272,7 +272,7 @@ def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicte
 def learn_torque_errors(
     found: Identification, cases: Sequence[Case], covariance: np.ndarray | None = None
 ) -> TorqueErrorModel | None:
-    """Learn what errors of the torque to expect from those on time left out; None where there is too little of it.
+    """Return a model of the torque's errors estimated from those on held-out time; None where this is too short.
 
     Args:
         found: the model and its rows.
@@ -305,16 +305,16 @@ def learn_torque_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """M thinned samples of all recordings.
+    """Data of M decimated samples of all recordings.
 
     Attributes:
-        states: (3, M, n) q, v, a.
-        torque, error: (M, rows) as recorded, and of the model as it is against it.
+        states: (3, M, n) q, v and a.
+        torque, error: (M, rows) recorded torque, and its prediction error by the final model.
         matrix: (M, rows, p) filtered columns.
-        block: (M,) of time; -1 where nothing is judged.
-        whole, part: (K, 2 n) q and v at the full rate, or about as often as matters, and the block of each.
-        triangles: of all rows, see `calib.identification.rows.triangulate`.
-        values: (p,) estimated from all of them.
+        block: (M,) number of the time block; -1 for samples not compared.
+        whole, part: (K, 2 n) q and v at the full rate, or a sufficient part of it, and their time blocks.
+        triangles: triangles of all rows, see `calib.identification.rows.triangulate`.
+        values: (p,) estimated from all rows.
     """
 
     states: np.ndarray
@@ -328,7 +328,7 @@ class _Samples:
     values: np.ndarray
 
     def box(self, chosen: np.ndarray | slice = slice(None)) -> TorqueDiscrepancy:
-        """Return what some of the states span, with no errors expected; in units of how all of them vary."""
+        """Return the range of the selected states, without expected errors, in units of the variation of all states."""
         own = self.states[:, chosen]
         edges = own.min(axis=1), own.max(axis=1), np.maximum(self.states.std(axis=1), 1e-6)
         return TorqueDiscrepancy((), (), (), *(tuple(map(tuple, one.tolist())) for one in edges))
@@ -360,7 +360,7 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
 
 
 def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
-    """Return the blocks, each with those that repeat its motion: time left out has to be motion left out.
+    """Return the blocks to hold out together: each block with those that repeat its motion.
 
     A block is repeated by another that has been in half of its states (see `calib.data.signals.persistency.repeats`).
     Where that leaves fewer than two, the blocks as they are.
@@ -378,7 +378,7 @@ def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
 
 
 def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (p,) from some blocks, with prior and ridges, and a root (p, k) of their covariance."""
+    """Return values (p,) estimated from some blocks with prior and ridges, and a root (p, k) of their covariance."""
     fitted, b = found.fitted, found.base.b
     group = np.concatenate([np.full(b, -1), np.asarray(found.friction.groups, dtype=int)])
     prior = None if found.prior is None else found.prior.widened(len(group) - b)
@@ -400,7 +400,7 @@ def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> 
 def _left_out(
     found: Identification, samples: _Samples, run: Sequence[int] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (m, rows) on blocks that the parameters did not see, and what they may grow by, (m, rows, 3).
+    """Return errors (m, rows) on held-out blocks, and the terms of their variance (m, rows, 3).
 
     No error counts for more than the torque itself: a fold that fails wholly says nothing of how the whole model errs.
     """
@@ -415,7 +415,7 @@ def _left_out(
 
 
 def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors_used: int = 4000) -> np.ndarray:
-    """Return weights (rows, 3) of what errors may grow by, each torque row's regularised towards those of all.
+    """Return weights (rows, 3) of the errors' variance terms, each row's regularised towards those of all rows.
 
     In units of a row's own mean square every row's κ, and its u over v, are of one kind. Behind a row's errors stand
     those of all others, worth `BORROWED` blocks, and what is known beforehand: the covariance is as it says, worth a
@@ -456,7 +456,7 @@ def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors
 def _in_units(
     folds: Sequence[tuple[np.ndarray, np.ndarray]], row: int, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the log size per fold of a row's errors, in units of their weights (3,), and errors in units of both."""
+    """Return the log size of a row's errors in each fold, relative to the weights (3,), and normalised errors."""
     each = [(error[:, row] ** 2, shapes[:, row] @ weights) for error, shapes in folds]
     least = max(MIN_ERROR**2 * float(np.mean(np.concatenate([square for square, _ in each]))), 1e-30)
     units = [np.sqrt(square / np.maximum(own, least)) for square, own in each]

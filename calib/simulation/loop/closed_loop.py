@@ -1,4 +1,4 @@
-"""A robot with known parameters in closed loop: drives, friction, sampled controller, encoders, noise.
+"""Simulation of a robot with known parameters in closed loop: drives, friction, controller, encoders, noise.
 
     (M(q) + Ia) a + c(q, v) + g(q) + Fv v + Fc tanh(v / v0) + off = tau + push,    tau held for one control period,
 
@@ -31,21 +31,18 @@ from calib.simulation.loop.references import Reference
 
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
-LOWER = (
-    "these gains do not hold this robot at this rate; lower kp and kd (are they in the unit of the torque?), or the "
-    "delay"
-)
+LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (check their unit), or the delay"
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A robot to simulate.
+    """A robot model to simulate.
 
     Attributes:
-        bodies: of the robot.
-        terms: its drives, signs with a smoothing above zero.
+        bodies: rigid bodies of the robot.
+        terms: drive terms of the robot; signs have a smoothing above zero.
         parameters: (10 B + k,) standard parameters of the bodies, then one value per term. Any values that give a
-            positive definite inertia will do: base parameters, zeros for the others, too.
+            positive definite inertia are valid, also base parameters with zeros for the others.
     """
 
     bodies: Bodies
@@ -58,20 +55,20 @@ class Plant:
         for one in self.terms:
             if any(x <= 0.0 for name, x in zip(one.form.settings, one.settings) if name in ("v0", "rest")):
                 raise CalibError(
-                    f"term '{one.name}': an exact sign cannot be integrated; give a smoothing v0 of some 0.01 rad/s"
+                    f"term '{one.name}': an exact sign cannot be integrated; state a smoothing v0 of about 0.01 rad/s"
                 )
 
     @property
     def inertial(self) -> int:
-        """Number of parameters that are the bodies'; they come first."""
+        """Number of the bodies' parameters, which come first."""
         return 10 * self.bodies.count
 
     def with_parameters(self, parameters: np.ndarray) -> Plant:
-        """Return the plant with other parameters."""
+        """Return the robot model with other parameters."""
         return replace(self, parameters=parameters)
 
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
-        """Return the mean diagonal (n,) of the inertia, motors' included, over configurations (N, n)."""
+        """Return the mean diagonal (n,) of the inertia matrix, motor inertia included, over configurations (N, n)."""
         from calib.dynamics import rigid_body
         from calib.dynamics.drives import added_inertia
 
@@ -83,16 +80,16 @@ class Plant:
 
 @dataclass(frozen=True, eq=False)
 class Sensing:
-    """What the controller and the log see.
+    """Measurement noise, resolution and sampling of controller and log.
 
     Attributes:
         sigma_q: (n,) white noise of every measured position [rad or m]; the controller acts on it.
         q_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
         quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
         sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
-        push: (n,) torque that acts and is not recorded: ripple, cables, all that no model holds [N m or N].
+        push: (n,) torque that acts but is not recorded: ripple, cables, all unmodelled effects [N m or N].
         push_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
-        every: control periods per recorded sample, whole or not (5 kHz and 140 Hz: 35.7).
+        every: control periods per recorded sample, not necessarily an integer (5 kHz and 140 Hz: 35.7).
     """
 
     sigma_q: np.ndarray | float = 0.0
@@ -106,14 +103,14 @@ class Sensing:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """A simulated motion; M samples.
+    """Result of a simulation at M samples.
 
     Attributes:
-        t: (M,) [s].
-        q, v, a: (M, n) the truth.
-        measured: (M, n) positions as the encoder gave them.
+        t: (M,) sample times [s].
+        q, v, a: (M, n) true motion.
+        measured: (M, n) positions measured by the encoders.
         tau: (M, n) torques as recorded, with `Sensing.sigma_tau`.
-        torque: (M, n) torques that acted.
+        torque: (M, n) torques that acted on the joints.
     """
 
     t: np.ndarray
@@ -134,7 +131,7 @@ def simulate(
     start: tuple[np.ndarray, np.ndarray] | None = None,
     push: np.ndarray | None = None,
 ) -> SimulatedRun:
-    """Let the robot follow a reference.
+    """Return the simulated motion of a robot that follows a reference.
 
     Args:
         reference: sampled at the controller's rate, which is taken from it.
@@ -179,14 +176,14 @@ def simulate(
 
 
 def sample_ticks(count: int, every: float) -> np.ndarray:
-    """Return the control periods, whole or not, at which samples of `count` periods are recorded."""
+    """Return the control periods at which samples are recorded during `count` periods, not necessarily integers."""
     return np.arange(int((count - 1) / every + 1e-9) + 1) * every
 
 
 def forward_dynamics(
     plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray, parameters: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the accelerations (N, n) under torques (N, n) of the drives, friction and motor inertia included.
+    """Return the accelerations (N, n) under drive torques (N, n), with friction and motor inertia.
 
     Friction that depends on the past is taken at rest.
 
@@ -208,14 +205,14 @@ def forward_dynamics(
 
 
 def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:
-    """Return white noise (count, n), or no rows where there is none."""
+    """Return white noise (count, n), or an empty array if the noise is zero."""
     if not np.any(sigma):
         return np.empty((0, len(sigma)))
     return rng.standard_normal((count, len(sigma))) * sigma
 
 
 def _coloured(white: np.ndarray, step: float) -> np.ndarray:
-    """Return x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), as wide as the white noise w (N, n)."""
+    """Return noise x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), with the variance of the white noise w (N, n)."""
     if not len(white):
         return white
     pole = float(np.exp(-step))
@@ -224,7 +221,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return where each parameter goes in what `packed` returns: order, entries, shares, owners of `loop_kernels`."""
+    """Return each parameter's place in the output of `packed`: order, entries, shares, owners of `loop_kernels`."""
     n, first = plant.bodies.n, plant.inertial
     order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
@@ -243,7 +240,7 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def packed(plant: Plant) -> Packed:
-    """Return tree, body, linear, kinds and acts as the kernels lay them out."""
+    """Return the arrays tree, body, linear, kinds and acts in the layout of the kernels."""
     bodies, n = plant.bodies.count, plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
     links = np.column_stack([parents, plant.bodies.kinds, plant.bodies.coordinates]).astype(np.int64)
@@ -255,7 +252,7 @@ def packed(plant: Plant) -> Packed:
 
 
 def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
-    """Return placements and parameters between frames turned so that each joint moves about or along z."""
+    """Return placements and parameters of bodies, in frames rotated so that each joint moves about or along z."""
     result = np.zeros((bodies.count + 1, 23))
     result[-1, :3] = -bodies.gravity
     turns = [upright_turn(axis)[:3, :3] for axis in bodies.axes]
@@ -269,7 +266,7 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 
 
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
-    """Return linear (n, 2 n + 1) and the acts: row, code, amount, seven settings, weights (n,).
+    """Return the linear terms (n, 2 n + 1), and the acts: row, code, amount, seven settings, weights (n,).
 
     `ramp`: of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated.
     """
@@ -295,14 +292,14 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
 
 
 def failure(status: int, time: float, where: str | None = None) -> NotConverged:
-    """Return what went wrong at `time` [s], or `where`."""
+    """Return the error for a failure status at `time` [s], or at `where`."""
     from calib.simulation.loop import loop_kernels
 
     place = f"at {time:.4g} s " if where is None else where
     if status == loop_kernels.SINGULAR:
         return CannotSimulate(
-            f"{place}the inertia matrix is not positive definite: these parameters belong to no possible "
-            "robot there; use a physically consistent estimate, or start from regular inertia"
+            f"{place}the inertia matrix is not positive definite: these parameters are not physically "
+            "consistent; use a physically consistent estimate, or start from regular inertia"
         )
     if status == loop_kernels.STIFF:
         return CannotSimulate(
@@ -314,7 +311,7 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
 
 
 def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
-    """Return the torques (N, n) that the believed robot needs along the reference, drives included [N m or N]."""
+    """Return the torques (N, n) of the controller's robot model along the reference, drives included [N m or N]."""
     model = IdentificationModel(believed.bodies, believed.terms)
     block = 4096  # instants at a time
     parts = [slice(k, k + block) for k in range(0, len(reference.t), block)]
@@ -325,7 +322,7 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
 def replayed_error(
     robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None, push: np.ndarray
 ) -> np.ndarray:
-    """Return the rms of q - q_r (n,) [rad or m] under torques (N, n) ahead and (N, n) that push, without noise."""
+    """Return the rms of q - q_r (n,) [rad or m] with feedforward torques (N, n) and disturbances (N, n), no noise."""
     own = controller if ahead is None else controller.with_feedforward(ahead)
     run = simulate(robot, own, reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
@@ -339,7 +336,7 @@ def tracking_error(
     sensing: Sensing | None = None,
     seed: int = 0,
 ) -> np.ndarray:
-    """Return the rms of q - q_r (n,) [rad or m] of the robot under feedback and the believed robot's torques.
+    """Return the rms of q - q_r (n,) [rad or m] of a robot with feedback and feedforward of the believed model.
 
     Args:
         robot: what moves; on a real arm the best model there is stands for it.

@@ -47,7 +47,7 @@ FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 @njit(**JOINED)
 def _body(tree, body, i, amount, rate, work):
-    """Write pose, velocity, acceleration at zero joint accelerations, and twist of body i, from its parent's."""
+    """Write pose, velocity, twist and acceleration (at zero joint acceleration) of body i from its parent's."""
     p, kind, scale = tree[i, 0], tree[i, 1], body[i, 22]
     a, b, c = body[i, 0], body[i, 1], body[i, 2]
     d, e, f = body[i, 3], body[i, 4], body[i, 5]
@@ -91,7 +91,7 @@ def _body(tree, body, i, amount, rate, work):
 
 @njit(**JOINED)
 def _load(body, i, work):
-    """Write the parameters of body i about the base's origin, and the wrench of its motion."""
+    """Write the inertial parameters of body i about the base's origin, and the wrench of its motion."""
     r00, r01, r02 = work[i, 0], work[i, 1], work[i, 2]
     r10, r11, r12 = work[i, 3], work[i, 4], work[i, 5]
     r20, r21, r22 = work[i, 6], work[i, 7], work[i, 8]
@@ -131,7 +131,7 @@ def _load(body, i, work):
 
 @njit(**JOINED)
 def dynamics(tree, body, linear, q, v, work, matrix, out):
-    """Write M(q) + added (lower triangle with diagonal), and take the bias c(q, v) + g(q) off out (n,)."""
+    """Write M(q) + added (lower triangle with diagonal), and subtract c(q, v) + g(q) from out (n,)."""
     count, n = tree.shape[0], q.shape[0]
     for j in range(n):
         for k in range(j + 1):
@@ -210,7 +210,7 @@ def substitute(matrix, vector):
 
 @njit(**JOINED)
 def seen(acts, t, motion):
-    """Return what act t sees of a motion (n,): the weighted sum over joints."""
+    """Return the argument of act t from a motion (n,): the weighted sum over joints."""
     total = 0.0
     for k in range(motion.shape[0]):
         total += acts[t, 8 + k] * motion[k]
@@ -219,15 +219,15 @@ def seen(acts, t, motion):
 
 @njit(**JOINED)
 def _stop(memory, t, place, width):
-    """Return the stop operator's state at a place, from its last state and place."""
+    """Return the stop operator's state at a position, from its last state and position."""
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
 
 @njit(**JOINED)
 def act(code, acts, t, memory, q, v):
-    """Return what act t is per unit of its parameter, and its slopes by place and rate; loads are another's business.
+    """Return the value of act t per unit parameter, and its slopes by position and rate, without load dependence.
 
-    `calib.dynamics.shape_kernels.shape` of what the act sees.
+    Values of `calib.dynamics.shape_kernels.shape` at the act's arguments.
     """
     place = seen(acts, t, q)
     state = _stop(memory, t, place, acts[t, 1]) if code in (STOP, PRESLIDING) else 0.0
@@ -236,7 +236,7 @@ def act(code, acts, t, memory, q, v):
 
 @njit(**JOINED)
 def _friction(linear, kinds, acts, memory, q, v, out):
-    """Take off out (n,) what the drives' friction and offsets need, but for what depends on loads; True: some does."""
+    """Subtract friction and offsets from out (n,), without load-dependent terms; return whether these exist."""
     n, loaded = v.shape[0], False
     for j in range(n):
         total = linear[j, 2 * n]
@@ -256,7 +256,7 @@ def _friction(linear, kinds, acts, memory, q, v, out):
 
 @njit(**OPTIONS)
 def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
-    """Replace out (n,), accelerations without it, by those with friction that grows with the transmitted torque.
+    """Replace the accelerations out (n,) by those with load-dependent friction.
 
     load = torque left after friction - added inertia · a, and friction hangs on the load: repeated until both agree,
     which they do where the coefficients are below one. M is factorised. False: they do not.
@@ -291,7 +291,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
 
 @njit(**OPTIONS)
 def stiffness(kinds, acts, loads, v, matrix, unit):
-    """Return a bound [1/s] of the fastest decay that smoothed signs bring in near standstill, M factorised.
+    """Return a bound [1/s] of the fastest decay rate by smoothed signs near standstill, with M factorised.
 
     The trace of M⁻¹ D, D the steepest slopes of the signs in reach (not the local ones: a step that enters the band
     must not overshoot it): never below the largest eigenvalue. Springs of friction with memory count by four times
@@ -319,7 +319,7 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
 
 @njit(**OPTIONS)
 def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, out):
-    """Write the accelerations (n,) under the torques of the drives; M is left factorised. False: M not definite."""
+    """Write the accelerations (n,) under the drive torques, and factorise M; return False where M is not definite."""
     for j in range(q.shape[0]):
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
@@ -334,14 +334,14 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
 
 @njit(**OPTIONS)
 def _unstressed(kinds, acts, q, memory):
-    """Set the friction that depends on the past to rest at q (n,)."""
+    """Reset the memory of friction to unstressed at q (n,)."""
     for t in range(kinds.shape[0]):
         memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
 
 
 @njit(**JOINED)
 def _remember(kinds, acts, q, memory):
-    """Move the friction that depends on the past to q (n,)."""
+    """Update the memory of friction to positions q (n,)."""
     for t in range(kinds.shape[0]):
         if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
             place = seen(acts, t, q)
@@ -350,7 +350,7 @@ def _remember(kinds, acts, q, memory):
 
 @njit(**OPTIONS)
 def set_parameters(values, order, entries, shares, owners, body, linear, acts):
-    """Write parameters (p,) into body, linear and acts, which hold everything else.
+    """Write parameters (p,) into body, linear and acts, whose other entries are unchanged.
 
     order (B, 10): the standard parameter behind each of a body; entries (E, 3): row and column of `linear`, parameter;
     shares (E,): their weights; owners (T,): the parameter of each act.
@@ -367,7 +367,7 @@ def set_parameters(values, order, entries, shares, owners, body, linear, acts):
 
 @njit(**OPTIONS)
 def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, out):
-    """Fill out (N, n); return the first sample whose inertia is not positive definite, or -1.
+    """Write accelerations to out (N, n); return the first sample with an inertia not positive definite, or -1.
 
     values (N, p): parameters of each sample; (0, p): those that body, linear and acts hold.
     """
@@ -387,7 +387,7 @@ def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, ow
 def _advance(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
 ):  # fmt: skip
-    """Advance q, v (n,) by one control period under constant torques (Runge & Kutta's classical form).
+    """Advance q, v (n,) by one control period under constant torques (classical Runge-Kutta method).
 
     In as many steps as friction near standstill asks for. On the negative axis the form's stability function
     1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity creeps into the band of the smoothed
@@ -426,7 +426,7 @@ def _advance(
 def _advance_midpoint(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
 ):  # fmt: skip
-    """Advance q, v (n,) by the midpoint rule: half of the work of `_advance`, for periods short against the motion.
+    """Advance q, v (n,) by one short period with the midpoint rule, at half the cost of `_advance`.
 
     In steps of at most `MIDPOINT_STEP` reciprocals of friction's fastest decay: the rule's 1 + z + z²/2 has no zero, so
     that the velocity does not change its sign, and is 0.625 there.
@@ -453,7 +453,7 @@ def _advance_midpoint(
 
 @njit(**OPTIONS)
 def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, period, gain):
-    """Advance each state q, v (K, n) with parameters of its own (K, p) by a period under one torque (n,).
+    """Advance states q, v (K, n), each with its parameters (K, p), by a period under the same torque (n,).
 
     Writes M⁻¹ of the first into gain (n, n); returns (status, point reached).
     """
@@ -484,7 +484,7 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
 
 @njit(**OPTIONS)
 def command(gains, aim, speed, seen, rate, integral, period, wish):
-    """Write what feedback asks for (n,) from reference and measurement; rows of `gains` as in `closed_loop`."""
+    """Write the feedback command (n,) from reference and measurement; rows of `gains` as in `closed_loop`."""
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]
         integral[j] = min(max(integral[j] + period * error, -gains[5, j]), gains[5, j])
@@ -493,7 +493,7 @@ def command(gains, aim, speed, seen, rate, integral, period, wish):
 
 @njit(**OPTIONS)
 def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish):
-    """Replace wish (n,), with ahead an acceleration, by M(q) wish + c(q, v) + g(q) of the controller's model."""
+    """Replace the acceleration wish (n,) by the torque M(q) (wish + ahead) + c(q, v) + g(q) of the model."""
     n = wish.shape[0]
     wanted = wish + ahead
     for j in range(n):
@@ -508,7 +508,7 @@ def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish
 
 @njit(**JOINED)
 def _reading(place, encoder, quantum, k, j):
-    """Return what the encoder of joint j says of a position in period k, with its noise and resolution."""
+    """Return the encoder reading of joint j for a position in period k, with noise and resolution."""
     read = place + (encoder[k, j] if encoder.shape[0] else 0.0)
     return quantum[j] * np.floor(read / quantum[j] + 0.5) if quantum[j] > 0.0 else read
 

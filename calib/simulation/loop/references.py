@@ -1,4 +1,4 @@
-"""Where the robot shall be: references sampled at the controller's rate."""
+"""Reference motions sampled at the controller's rate."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from calib.errors import CalibError
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """N instants, evenly spaced.
+    """A reference motion at N equally spaced times.
 
     Attributes:
-        t: (N,) [s].
+        t: (N,) times [s].
         q, v, a: (N, n) [rad or m, and per s, per s²].
     """
 
@@ -28,7 +28,7 @@ class Reference:
             object.__setattr__(self, name, frozen(shaped(getattr(self, name), np.shape(self.q), name)))
         if len(self.t) != len(self.q) or len(self.t) < 2:
             raise CalibError(
-                f"a reference needs two instants and as many positions; found {len(self.t)}, {len(self.q)}"
+                f"a reference needs at least two times, one per position; found {len(self.t)}, {len(self.q)}"
             )
 
     @property
@@ -37,7 +37,7 @@ class Reference:
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     def at(self, tick: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, v, a (M, n) at control periods `tick` (M,), by cubic splines where they are not whole."""
+        """Return q, v, a (M, n) at control periods `tick` (M,), interpolated by cubic splines between integers."""
         whole = tick.astype(int)
         if np.all(tick == whole):
             return self.q[whole], self.v[whole], self.a[whole]

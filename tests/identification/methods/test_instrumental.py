@@ -216,7 +216,7 @@ def test_what_cannot_be_done_is_said():
         found(case, positive=("ZZ9",))
     with pytest.raises(UsageError, match="no regular inertia"):
         found(case, Loop(controllers.pd(PD.kp, np.zeros(2)), motion(), EVERY))
-    with pytest.raises(NotConverged, match="after 1 rounds"):
+    with pytest.raises(NotConverged, match="after 1 iterations"):
         found(case, limit=1)
     with pytest.raises(Exception, match="whole reference"):
         found(case, Loop(PD, motion(), 2 * EVERY))
