@@ -178,7 +178,7 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
         (("plan", "dualv", "--waypoints", "outside.csv"), "waypoint 2: joint 1 at 0.3"),
         (("plan", "dualv", "--waypoints", "way.csv", "--shorten", 5), "shorten is for serial arms"),
         (("fit", "dualv", "poses.csv", "--model", "stiffness"), "model 'stiffness' is for serial arms"),
-        (("fit", "dualv", "readings.csv", "--tolerance", 0.1), "a tolerance is of the platform's position"),
+        (("fit", "dualv", "readings.csv", "--tolerance", 0.1), "a tolerance needs a measured platform position"),
         (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
         (("select", "dualv"), "choosing poses is for serial arms"),
         (("new", "--robot", "dualv", "--instrument", "cmm"), "a guided session is for serial arms"),

@@ -52,7 +52,7 @@ def test_rows_that_are_there_are_not_run_again(study: Path, tmp_path: Path):
     study.write_text(FILE.replace("0.05", "0.06"))
     third = run_study([study], tmp_path / "out", runs=1, plots=False)
     assert third.progress.done == 2
-    assert "4 rows are of conditions that are not of this study" in " ".join(third.notes)
+    assert "4 rows belong to conditions outside this study" in " ".join(third.notes)
     assert third.conditions[0].methods[0].trials == 1
     study.write_text(FILE)
     assert run_study([study], tmp_path / "out", runs=2, plots=False).progress.done == 0

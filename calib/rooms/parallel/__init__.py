@@ -1,4 +1,4 @@
-"""Parallel robots: the verbs for serial arms, on closed loops (`calib.rooms.parallel.mechanism`)."""
+"""Parallel robots: the commands for serial arms, applied to closed loops (`calib.rooms.parallel.mechanism`)."""
 
 OFFERS = {"topics": ":TOPICS", "robots": "robots:find", "stages": "verbs:STAGES"}
 TOPICS = {

@@ -1,4 +1,4 @@
-"""Design an exciting motion of a parallel robot: the search of serial arms, on its platform's coordinates."""
+"""Design of an exciting motion of a parallel robot, by the search for serial arms in platform coordinates."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ MOTION = (ROBOT, METRICS, PLANNED, coefficients.NAME, FIGURES)
 
 @dataclass(frozen=True)
 class _Platform:
-    """The platform's coordinates as the joints of a serial arm, whose motion is searched for."""
+    """The platform's coordinates, treated as the joints of a serial arm in the search."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -60,7 +60,7 @@ class _Platform:
 
 @dataclass(frozen=True, eq=False)
 class _PlatformBox(BoxLimit):
-    """Limits of the platform's coordinates under their names."""
+    """Limits of the platform's coordinates, by name."""
 
     names: tuple[str, ...] = ()
 
@@ -111,7 +111,7 @@ class _ActuatorLimit:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ParallelExcitation(ExcitationDesign):
-    """An exciting motion of a parallel robot; what it holds of a design is its platform's coordinates'.
+    """An exciting motion of a parallel robot; the fields of the design refer to the platform's coordinates.
 
     Attributes:
         robot: with its file.
@@ -133,7 +133,7 @@ class ParallelExcitation(ExcitationDesign):
         return track.times, track.q, track.v, track.a
 
     def _actuators(self, track: Setpoints) -> Setpoints:
-        """Return the actuators' motion and torques of one of the platform's coordinates."""
+        """Return the actuators' motion and torques of a platform motion."""
         motion = self.plan.motion(track.q, track.v, track.a)
         own = self.robot.chain.actuated
         return Setpoints(
@@ -147,7 +147,7 @@ class ParallelExcitation(ExcitationDesign):
         return np.abs(self.plan.torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that the command writes: one period at the controller's rate, and the actuators' series."""
+        """Write the output folder of the command: one period at the controller's rate, and the actuators' series."""
         from calib.procedure.report import motion_figures
 
         one, bounds = folder.one_period(self), self.inputs.limits.bounds
@@ -176,7 +176,7 @@ class ParallelExcitation(ExcitationDesign):
         return coefficients.Periodic(names, self.period, rate, 1, "fourier", own)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the metrics as ``metrics.json`` holds them."""
+        """Return the metrics of ``metrics.json``."""
         torque, acceleration = (peaks.tolist() for peaks in self.peaks)
         own = {"robot": self.robot.chain.name, "peak_torque": torque, "peak_acceleration": acceleration}
         return super().to_dict() | own
@@ -198,7 +198,7 @@ def excite_parallel(
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelExcitation:
-    """Design a motion that excites a parallel robot within the torque limits and platform box of its file.
+    """Return an exciting motion of a parallel robot within the torque limits and platform box of its file.
 
     Args:
         settings: period, harmonics, drives, starts, evaluations, seed, rate; the others are for serial arms.
@@ -226,7 +226,7 @@ def design_parallel(
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelExcitation:
-    """Design a motion of the platform that excites the base parameters of a robot.
+    """Return a platform motion that excites the base parameters of a robot.
 
     The determinant of the information is optimised, rows in units of what equal noise of all torques makes of them at
     home; `GUARD` of the torque limits stays free.
@@ -266,7 +266,7 @@ def design_parallel(
 
 
 def actuator_bounds(known: ClosedRobot) -> MotionBounds:
-    """Return what limits the actuators: speeds and efforts of the robot's file.
+    """Return the limits of the actuators: speeds and efforts of the robot's file.
 
     Raises:
         UsageError: where nothing limits one.
@@ -294,7 +294,7 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         bodies = model.known_parameters()
         if bodies is None:
             raise UsageError(
-                f"{robot.source} has no inertias, so that efforts limit no acceleration; state them there, or name an "
+                f"{robot.source} has no inertias, so torque limits cannot be applied; state them there, or name an "
                 "identified model (--model)"
             )
         return model, np.append(bodies, np.zeros(len(model.terms)))
@@ -310,15 +310,15 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RobotError(
-            f"{path} holds no model of a parallel robot ({error!r}); give a folder of calib identify"
+            f"{path} contains no model of a parallel robot ({error!r}); give a folder of calib identify"
         ) from error
     if missing := [name for name in model.names[: model.inertial] if name not in known]:
-        raise RobotError(f"{path} is of another robot: it has no {missing[0]}")
+        raise RobotError(f"{path} is for another robot: it has no {missing[0]}")
     return model, np.array([known.get(name, 0.0) for name in model.names])
 
 
 def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for a motion, or that holds one of its inputs."""
+    """Refuse, before any work, an output folder with other content, or one that contains an input file."""
     check_target(out, MOTION, (METRICS, PLANNED), "motion", inputs)
 
 

@@ -1,4 +1,4 @@
-"""Identify a parallel robot from encoders and motor torques: rows on its platform, its actuators, or their power."""
+"""Identification of a parallel robot from encoders and motor torques: platform, actuator or power rows."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -51,7 +51,7 @@ class ParallelDynamics(DynamicsModel):
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the rows (N, rows) of a motion q, v, a (N, n) of the actuated joints, no payload on board.
+        """Return the rows (N, rows) of a motion q, v, a (N, n) of the actuated joints without payload.
 
         Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
         their power [W]: as the model was identified.
@@ -72,7 +72,7 @@ def identify_parallel(
     on_read: Callable[[IdentificationInputs], None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelDynamics:
-    """Identify the dynamics of a parallel robot from recordings of its actuated joints, and judge it.
+    """Return the identified dynamics of a parallel robot from recordings of its actuated joints, with a verdict.
 
     Args:
         recordings, validate: files with a cut if wanted, or recordings in memory.
@@ -108,7 +108,7 @@ def identify_parallel(
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
-    """Predict every recording, and judge."""
+    """Return the prediction errors of all recordings, with a verdict."""
     model, cases, unseen = found.dynamics.model, inputs.cases, inputs.unseen
     assert isinstance(model, ParallelModel)
     predictions = {case.name: predict(found.dynamics, case) for case in (*cases, *unseen)}
@@ -141,7 +141,7 @@ def _judged(
 def _driven_joints(
     model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case]
 ) -> tuple[str, ...]:
-    """Return names of joints whose friction gives energy, as a share of all that the actuators move."""
+    """Return the names of joints whose friction supplies more than a negligible share of the actuators' energy."""
     joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
     friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.terms])
     values, taken, moved = np.where(friction, found.dynamics.values, 0.0), np.zeros(len(joints)), 0.0
@@ -156,7 +156,7 @@ def _driven_joints(
 
 
 def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
-    """Refuse what the identification of serial arms knows and this one does not."""
+    """Refuse settings and options that apply to serial arms only."""
     read = {each.name for each in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     read = {each.name for each in fields(options)} - {"gain_pair", "cut_slow"}
@@ -171,12 +171,12 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
 
 
 def _of_arms(method: Method) -> bool:
-    """Return whether a method works with the model of a serial arm alone."""
+    """Return whether a method requires the model of a serial arm."""
     return method.needs_simulation or method.name == "ml"
 
 
 def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield whether redundant encoders agree, and which columns of the files take no part."""
+    """Yield findings on redundant encoders that contradict each other, and on unused columns."""
     robot = known.robot
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
@@ -189,7 +189,7 @@ def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
 
 
 def _payloads(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield what recordings with and without them say of the payloads."""
+    """Yield findings on the payloads, from recordings with and without them."""
     masses = dict(zip(found.base.names, zip(found.fitted.estimate.values, found.fitted.estimate.sigma)))
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)

@@ -1,4 +1,4 @@
-"""Fit the geometry of a parallel robot to a CSV of encoder readings, with or without measured platform poses.
+"""Geometric calibration of a parallel robot from a CSV of encoder readings, with or without platform poses.
 
 Columns: one per actuated joint, by its name [rad or m, or the unit in brackets behind it]; and, where the platform was
 measured, one per coordinate of its freedom (``x [mm]``, ``rz [deg]``), counted from home in the base's axes. Of the
@@ -55,7 +55,7 @@ HEADER = ("name", "unit", "value", "sigma")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParallelFit(Judged):
-    """A geometric calibration and its files.
+    """Result of a geometric calibration, and its files.
 
     Attributes:
         nominal: the robot before.
@@ -111,24 +111,24 @@ class ParallelFit(Judged):
 
     @property
     def measured(self) -> bool:
-        """Whether the platform was."""
+        """Whether the platform was measured."""
         return self.rows.shape[1] > self.nominal.chain.n
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """What the errors are of."""
+        """Names of the error components."""
         if self.measured:
             return self.nominal.chain.freedom
         return tuple(f"contradiction {k + 1}" for k in range(self.own.shape[2]))
 
     @property
     def judged(self) -> Mapping[str, np.ndarray]:
-        """Errors of unseen rows, by name; of the fitted ones where there are none."""
+        """Errors of unseen rows by name, or of the fitted rows without unseen ones."""
         return self.unseen or {"fitted": self.own}
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that the command writes, all files or none."""
+        """Write the output folder of the command, all files or none."""
         found = self.estimate
 
         def write(folder: Path) -> None:
@@ -185,7 +185,7 @@ class ParallelFit(Judged):
         return f"<ParallelFit of {self.nominal.chain.name}: {self.verdict.level}>"
 
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
-        """Return the same fit with its verdict on additional unseen files; nothing is fitted again."""
+        """Return the same fit with a verdict on additional unseen files, without refitting."""
         validate = _paths(unseen)
         proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
         for name, rows in _read_unseen(self.nominal.chain, self.rows, validate).items():
@@ -194,7 +194,7 @@ class ParallelFit(Judged):
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for a fit, or that holds one of its inputs."""
+    """Refuse, before any work, an output folder with other content, or one that contains an input file."""
     check_target(out, FIT, (METRICS, ROBOT), "fit", inputs)
 
 
@@ -208,7 +208,7 @@ def fit_parallel(
     poses: object = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelFit:
-    """Fit the geometry of a parallel robot to measured files, and judge it on rows it has not seen.
+    """Return the geometric calibration of a parallel robot from measured files, with a verdict on unseen rows.
 
     Args:
         settings: holdout, tolerance and seed; the others are for serial arms.
@@ -220,14 +220,14 @@ def fit_parallel(
         Unidentifiable: for readings alone of a robot without redundant encoders.
     """
     if poses is not None:
-        raise UsageError("poses of a parallel robot are not chosen here, so that nothing was predicted of its fit")
+        raise UsageError("no predicted accuracy: pose selection does not support parallel robots")
     say, settings, known = progress or (lambda words: None), settings or FitSettings(), robot.known
     measured, validate = _paths(measured), _paths(validate)
     held = _held(known, settings, options or FitOptions())
     rows = _stacked([read_rows(path, known.robot) for path in measured], measured)
     unseen = _read_unseen(known.robot, rows, validate)
     if settings.tolerance is not None and not (rows.shape[1] > known.robot.n and (known.robot.selected < 3).any()):
-        raise UsageError("a tolerance is of the platform's position, and none was measured")
+        raise UsageError("a tolerance needs a measured platform position; none was measured")
     if settings.holdout:
         order = np.random.default_rng(settings.seed).permutation(len(rows))
         kept = len(rows) - round(settings.holdout * len(rows))
@@ -252,7 +252,7 @@ def _paths(measured: Sequence[object]) -> tuple[Path, ...]:
 
 
 def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
-    """Return readings (m, n), and behind them the platform's coordinates (m, n + r) where the file has such columns.
+    """Return readings (m, n), or (m, n + r) with platform coordinates appended if the file has such columns.
 
     Raises:
         MeasurementError: naming the column that is missing, and which there are; or one that is not known.
@@ -262,15 +262,15 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for name in table.header:
         if name in passive:
-            table.fail("is of a passive joint, whose encoder the fit does not know yet; leave it out", name)
+            table.fail("is of a passive joint: its encoder cannot be used; remove the column", name)
         if name in COORDINATES and name not in robot.freedom:
-            table.fail(f"is none of the platform's coordinates ({', '.join(robot.freedom)}); leave it out", name)
+            table.fail(f"is not a platform coordinate ({', '.join(robot.freedom)}); remove the column", name)
     measured = any(name in table for name in robot.freedom)
     return np.column_stack([*readings, *(read_coordinates(table, robot).T if measured else ())])
 
 
 def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
-    """Return platform coordinates (m, r) [m, rad] of a table.
+    """Return the platform coordinates (m, r) [m, rad] of a table.
 
     Raises:
         MeasurementError: naming the column that is missing.
@@ -280,13 +280,13 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
 
 
 def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tuple[str, ...]:
-    """Return the names of constants that stay, after refusing what only serial arms know."""
+    """Return the names of fixed constants; refuse options that apply to serial arms only."""
     refuse_unread(settings, FitSettings(), READ)
     refuse_unread(options, FitOptions(), ("source", "fix"), options.source)
     names = [one.name for one in loop_parameters(known)]
     for name in options.fix:
         if name not in names:
-            refuse_option(options.source, f"fix '{name}' is no constant of the loops{suggestion(name, names)}")
+            refuse_option(options.source, f"fix '{name}' is not a constant of the loops{suggestion(name, names)}")
     return options.fix
 
 
@@ -298,11 +298,11 @@ def _stacked(parts: Sequence[np.ndarray], paths: Sequence[Path]) -> np.ndarray:
 
 
 def _read_unseen(robot: ParallelRobot, rows: np.ndarray, paths: Sequence[Path]) -> dict[str, np.ndarray]:
-    """Return the rows of unseen files by name, of the same columns as those that are fitted."""
+    """Return the rows of unseen files by name, with the same columns as the fitted rows."""
     unseen = {f"{path.name}, unseen": read_rows(path, robot) for path in paths}
     for name, own in unseen.items():
         if own.shape[1] != rows.shape[1]:
-            refuse_option(name, "platform coordinates are in it or in the fitted files, not in both")
+            refuse_option(name, "platform coordinates must be in both this file and the fitted files, or in neither")
     return unseen
 
 
@@ -321,7 +321,7 @@ def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> 
 
 
 def _cross_validated(known: ClosedRobot, rows: np.ndarray, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
-    """Return errors of all rows, each by a fit that has not seen it; nothing where a fold cannot be fitted."""
+    """Return the cross-validated errors of all rows; empty if a fold cannot be fitted."""
     folds_wanted = 4  # of the rows, where none are unseen
     folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), folds_wanted)
     found = []

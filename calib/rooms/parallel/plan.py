@@ -1,4 +1,4 @@
-"""Plan the fastest motion of a parallel robot through platform waypoints, within its actuators' speeds and torques.
+"""The fastest motion of a parallel robot through platform waypoints, within its actuators' speeds and torques.
 
 Waypoints are a CSV, a row each, in order: the platform's coordinates (``x [mm]``, ``rz [deg]``), counted from home in
 the base's axes; or readings of all actuators under their names. The path is a spline through them in the platform's
@@ -33,13 +33,13 @@ from trajectories.timing.path import check_within, spline, through
 from trajectories.timing.profile import track
 from trajectories.timing.time_scaling import time_optimal
 
-FRICTIONLESS = "friction not known (no model): planned without, a real robot needs more torque"
+FRICTIONLESS = "friction unknown (no model): a real robot needs more torque than planned"
 READ = ("payloads", "lines", "rate")  # of the settings
 
 
 @dataclass(frozen=True, eq=False)
 class _PlatformDynamics:
-    """Actuator torques along a path of their own joints; a `trajectories.timing.limits.Law`.
+    """Actuator torques along a path of the actuated joints; a `trajectories.timing.limits.Law`.
 
     Attributes:
         model: of the robot; values (p,) of its parameters.
@@ -60,7 +60,7 @@ class _PlatformDynamics:
         return self._torque(rigid, q, still, slope) - gravity, moved - gravity, gravity
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the actuator torques (N, n) that overcome friction, of passive joints too."""
+        """Return the actuator torques (N, n) against friction, including that of passive joints."""
         rubbing = self._rubbing() & (self.values != 0.0)
         return self._torque(np.where(rubbing, self.values, 0.0), q, v, a) if rubbing.any() else np.zeros_like(q)
 
@@ -79,7 +79,7 @@ class _PlatformDynamics:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ParallelPlan(MotionPlan):
-    """A planned motion of a parallel robot; what it holds of a plan is its actuators'.
+    """A planned motion of a parallel robot; the fields of the plan refer to the actuators.
 
     Attributes:
         robot: with its file.
@@ -90,7 +90,7 @@ class ParallelPlan(MotionPlan):
     coordinates: np.ndarray
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that the command writes."""
+        """Write the output folder of the command."""
         from calib.procedure.report import motion_figures
 
         def more(place: Path) -> None:
@@ -100,7 +100,7 @@ class ParallelPlan(MotionPlan):
         return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, self.to_dict(), more)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the metrics as ``metrics.json`` holds them."""
+        """Return the metrics of ``metrics.json``."""
         track: Any = self.track
         peaks = {
             f"peak_{key}": np.abs(x).max(axis=0).tolist() for key, x in (("torque", track.tau), ("speed", track.v))
@@ -118,7 +118,7 @@ def plan_parallel(
     drives: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelPlan:
-    """Plan the fastest motion of a parallel robot through the waypoints of a file.
+    """Return the fastest motion of a parallel robot through the waypoints of a file.
 
     Args:
         settings: payloads, lines and rate; the others are for serial arms.
@@ -175,14 +175,12 @@ def _read_waypoints(path: Path | np.ndarray, known: ClosedRobot) -> np.ndarray:
 
 
 def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...]) -> _PlatformDynamics:
-    """Return the dynamics, identified or of the file's inertias, with the payloads on board."""
+    """Return the identified dynamics, or those of the file's inertias, with the given payloads."""
     if folder is None and payloads:
-        raise UsageError(f"payloads {', '.join(payloads)}: they are identified ones: name the model")
+        raise UsageError(f"payloads {', '.join(payloads)}: only an identified model has payloads; give --model")
     model, values = read_model(robot, folder)
     if unknown := sorted(set(payloads) - set(model.payloads)):
-        refuse_option(
-            folder, f"no payload '{unknown[0]}' was identified; it knows {', '.join(model.payloads) or 'none'}"
-        )
+        refuse_option(folder, f"no payload '{unknown[0]}' was identified; known: {', '.join(model.payloads) or 'none'}")
     smoothing = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
     terms = tuple(replace(one, settings=(smoothing,)) if one.shape == "sign" else one for one in model.terms)
     return _PlatformDynamics(replace(model, terms=terms), values, payloads)

@@ -1,4 +1,4 @@
-"""Find a parallel robot by what a person types; what it is to the verbs (`calib.procedure.robot_kinds.Mechanism`)."""
+"""Parallel robots for the commands, found by name or file (`calib.procedure.robot_kinds.Mechanism`)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 
 INSTEAD = {
-    "choosing poses": "spread poses over its workspace by hand",
+    "choosing poses": "choose poses manually, spread over its workspace",
     "calib.read_poses": "calib.fit_geometry takes its files",
-    "compensation": "its controller takes the calibrated robot.toml",
-    "export": "a URDF holds no closed loops: take its robot.toml and dynamics.json",
+    "compensation": "use the calibrated robot.toml in its controller",
+    "export": "a URDF cannot contain closed loops: use its robot.toml and dynamics.json",
 }  # of the verbs that there are not
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParallelMechanism:
-    """A parallel robot with its loops closed, and the file it came from."""
+    """A parallel robot with its loops closed, and its file."""
 
     known: ClosedRobot
     source: Path
@@ -36,7 +36,7 @@ class ParallelMechanism:
 
     @property
     def chain(self) -> ParallelRobot:
-        """The actuated joints, as those of an arm."""
+        """The actuated joints in the form of an arm."""
         return self.known.robot
 
     def write(self, folder: Path) -> None:
@@ -44,7 +44,7 @@ class ParallelMechanism:
         parallel_files.write(folder / ROBOT, self.known.robot, f"from {self.source}")
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
-        """Return the model as ``dynamics.json`` holds it; `calib.rooms.parallel.excite.read_model` reads it."""
+        """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.excite.read_model` reads it."""
         from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.shapes import V0
         from calib.estimate_files import COVARIANCE
@@ -79,7 +79,7 @@ def path_of(robot: object) -> Path | None:
 
 
 def find(robot: object) -> ParallelMechanism | None:
-    """Return the parallel robot that `robot` names; None where it names another kind of robot, or none.
+    """Return the parallel robot that `robot` names; None if it is another kind of robot or unknown.
 
     Raises:
         RobotError: for a file that contradicts itself, loops that do not close at home.

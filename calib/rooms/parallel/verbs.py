@@ -1,4 +1,4 @@
-"""The verbs of parallel robots, as `calib.procedure.robot_kinds.stage_of` finds them, and what they leave in a folder.
+"""Commands for parallel robots, found by `calib.procedure.robot_kinds.stage_of`, and their output files.
 
 ``robot.toml`` comes first: each folder is a robot to the next command. identify: ``dynamics.json`` (values of all
 parameters, base expressions); the others are those of a serial arm (``calib formats identified``). fit:

@@ -1,4 +1,4 @@
-"""Studies: how identification methods compare over robots, noise, rates and wrong beliefs, by Monte Carlo.
+"""Monte Carlo studies that compare identification methods over robots, noise, sampling rates and model errors.
 
 A condition (`conditions`) is an experiment whose truth is known (`experiment`); one pure function makes a row of a
 condition, a method and a seed (`trial`); rows are keyed and kept (`rows`), run wherever workers are (`run`), and summed

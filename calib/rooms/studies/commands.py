@@ -1,4 +1,4 @@
-"""Comparing methods of identification: study (simulated, truth known), compare (recordings)."""
+"""Commands that compare identification methods: study (simulated, known truth), compare (recordings)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,19 +24,19 @@ def study(
     list_studies: Annotated[bool, typer.Option("--list")] = False,
     plots: bool = True,
 ) -> None:
-    """Compare identification methods where the truth is known. Runs STUDY, or what of it is missing (Monte Carlo).
+    """Compare identification methods on simulated robots. Runs STUDY, or what of it is missing (Monte Carlo).
 
     Rows go to the disk as they come: a study that was stopped, or lost workers, goes on from there when the same
     command is given again; asked for more runs, it adds them. What a study file holds: calib formats study.
 
     Args:
-        studies: study files, or shipped ones: MCS-TX40-1-1, 'MCS-*'
-        out: folder of its rows and report; default: the study's name
-        methods: in place of the file's: wls,iv,didim
-        runs: data sets per condition, in place of the file's
-        report_only: run nothing: report what is there
-        list_methods: all methods, and what each needs
-        list_studies: the studies that come with the toolkit
+        studies: study files, or names of shipped ones: MCS-TX40-1-1, 'MCS-*'
+        out: folder for rows and report; default: the study's name
+        methods: methods instead of the file's: wls,iv,didim
+        runs: data sets per condition, instead of the file's
+        report_only: report existing rows without running trials
+        list_methods: list all methods with their requirements
+        list_studies: list the studies shipped with the toolkit
     """
     from calib.identification.methods.registry import METHODS
     from calib.procedure.report import page
@@ -48,7 +48,7 @@ def study(
     if not studies:
         raise UsageError("no study named: give a file, or a name out of calib study --list")
     if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
-        raise UsageError("several studies together need a folder: --out DIR")
+        raise UsageError("several studies need one folder: give --out DIR")
     folder = out or Path(f"{Path(studies[0]).stem}-study")
     log_interval = 30.0  # [s] between two lines on progress where the output is no terminal
     with reporting(log_interval) as (_, progress):
@@ -80,17 +80,17 @@ def compare(
     tip: str | None = None,
     seed: Seed = 0,
 ) -> None:
-    """Rank identification methods on recordings of your robot. What counts is how well they predict other motion.
+    """Rank identification methods on recordings of your robot by their prediction of other motion.
 
-    The one to take is judged as calib identify judges it; where its verdict is fail, none is to take: exit code 1.
+    The recommended method gets the verdict of calib identify; if it is fail, none is recommended: exit code 1.
 
     Args:
         recordings: training recordings; log.npz@0:9.4 cuts
-        validate: recording of other motion; may be repeated
+        validate: recording of other motion (repeatable option)
         methods: wls,iv,didim; default: all that the options allow
-        friction: as of calib identify; loops are simulated with standard friction
-        options: TOML, as of calib identify; with [loop], all methods run
-        out: CSV to write the table to
+        friction: as for calib identify; loops are simulated with standard friction
+        options: TOML, as for calib identify; with [loop], all methods run
+        out: output CSV for the table
     """
     from calib import files
     from calib.identification.identify_options import read_options
@@ -120,7 +120,7 @@ def compare(
 
 
 def _names(text: str | None) -> list[str] | None:
-    """Return the methods of a list with commas, held against those there are; None for all."""
+    """Return the methods of a comma-separated list after a check of their names; None for all."""
     from calib.identification.methods.registry import method_named
 
     if text is None:
@@ -128,5 +128,5 @@ def _names(text: str | None) -> list[str] | None:
     found = [name.strip() for name in text.split(",") if name.strip()]
     for name in found:
         method_named(name)
-    require(found, "--methods names none; calib study --list-methods", UsageError)
+    require(found, "--methods is empty; see calib study --list-methods", UsageError)
     return found

@@ -1,4 +1,4 @@
-"""The study file: which methods are compared, on which simulated experiments, how often.
+"""The study file: compared methods, simulated experiments, and number of runs.
 
 TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismatch is a condition::
 
@@ -70,7 +70,7 @@ Count = Annotated[int, Whole(0, 1_000_000)]
 @strict
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the encoders [rad] and of the logged torques [N m]; its name goes into those of conditions."""
+    """Noise of the encoders [rad] and of the logged torques [N m]; its name is part of the conditions' names."""
 
     name: Name
     sigma_q: Annotated[float, Real(least=0, most=0.1, unit="rad", quantity="angle")]
@@ -80,7 +80,7 @@ class Noise:
 @strict
 @dataclass(frozen=True)
 class StudyFile:
-    """A study; the module says what each key means."""
+    """The content of a study file; see the module for the keys."""
 
     name: Name
     noise: Annotated[tuple[Noise, ...], Filled()]
@@ -102,7 +102,7 @@ class StudyFile:
 
 @dataclass(frozen=True)
 class Condition:
-    """One experiment, up to the seed of its noise.
+    """One experiment, without the seed of its noise.
 
     Attributes:
         name: what people call it; no part of what it is.
@@ -129,14 +129,14 @@ class Condition:
 
     @property
     def digest(self) -> str:
-        """What its rows are kept under: the same for conditions that differ in name alone."""
+        """Key of its rows in the store: the same for conditions that differ in name alone."""
         content = {key: value for key, value in asdict(self).items() if key not in ("name", "resimulated")}
         return hashlib.sha256(json.dumps([TRIAL, content], sort_keys=True).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
 class Study:
-    """Conditions, and how often each method runs on them.
+    """Conditions, and the number of runs of each method on them.
 
     Attributes:
         name, about: of the study.
@@ -153,13 +153,13 @@ class Study:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """All methods of it, in the registry's order."""
+        """All methods of the study, in the registry's order."""
         asked = {name for own in self.runs for name in own}
         return tuple(name for name in METHODS if name in asked)
 
 
 def shipped() -> dict[str, Path]:
-    """Return the study files that come with the toolkit, by name."""
+    """Return the study files shipped with the toolkit, by name."""
     folder = Path(str(resources.files("calib.rooms.studies").joinpath("library")))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -167,7 +167,7 @@ def shipped() -> dict[str, Path]:
 def read_study(
     files: Sequence[str | Path], methods: Sequence[str] | None = None, runs: int | None = None
 ) -> Study:  # fmt: skip
-    """Return the study of one file, or of several together.
+    """Return the study of one or several files.
 
     Args:
         files: paths, names of shipped ones, or patterns of these (``MCS-*``).
@@ -195,7 +195,7 @@ def read_study(
 
 
 def _check_cutoffs(conditions: Sequence[Condition]) -> None:
-    """Refuse what no data set could be filtered with.
+    """Refuse cutoff frequencies at or above half the logging rate.
 
     Raises:
         UsageError: for a cut-off that the robot's log is sampled too slowly for.
@@ -240,7 +240,7 @@ def _parse(path: Path) -> StudyFile:
 
 
 def _expanded(study: StudyFile) -> list[Condition]:
-    """Return all combinations, named by the study and by what varies in it."""
+    """Return all combinations, named by the study and its varying keys."""
     axes: dict[str, tuple[Any, ...]] = {
         "robot": study.robot, "noise": study.noise, "decimation": study.decimation, "cutoff": study.cutoff,
         "mismatch": study.mismatch,
@@ -272,7 +272,7 @@ def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -
 
 
 def _stated(study: StudyFile, name: str) -> int:
-    """Return the runs that a file states for a method: its own, else those of its kind."""
+    """Return the number of runs in a file for a method: its own, else those of its kind."""
     method = METHODS[name]
     kind = study.runs_loop if method.needs_controller else study.runs_filter if method.needs_simulation else None
     return study.runs_of.get(name, study.runs if kind is None else kind)

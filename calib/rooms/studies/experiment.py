@@ -1,4 +1,4 @@
-"""One data set of a condition: a robot with known parameters in its closed loop, and the problem a method is given.
+"""Simulated data set of a condition: a robot with known parameters in its loop, and the methods' input.
 
 The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40) or 140 Hz (RV-2SQ); the encoders'
 noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows decimated, as
@@ -51,7 +51,7 @@ PAYLOAD, AWAY = 1.0, 0.05  # [kg] a ball, [m] in front of the flange
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What the data sets of a condition share.
+    """Data shared by all data sets of a condition.
 
     Attributes:
         chain: the arm as it is believed to be.
@@ -70,7 +70,7 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One data set.
+    """One simulated data set.
 
     Attributes:
         problem: what a method is given; model: of it.
@@ -88,7 +88,7 @@ class Experiment:
 
 @lru_cache(maxsize=4)
 def set_up(robot: str, duration: float) -> Setup:
-    """Return what the data sets of a robot share."""
+    """Return the data shared by all data sets of a robot."""
     chain = load(robot)
     plant = known_robots.plant(robot)
     known = known_robots.truth(robot)["control"]
@@ -122,7 +122,7 @@ def _nominal_base(robot: str) -> Base:
 
 @lru_cache(maxsize=2)
 def make_experiment(condition: Condition, seed: int) -> Experiment:
-    """Return the data set of a condition with this number: the same at any place and time.
+    """Return the data set with a given number of a condition: the same at any place and time.
 
     Raises:
         CalibError: where the true robot cannot be recorded.
@@ -146,7 +146,7 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
 
 
 def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, IdentificationModel, Base, Plant]:
-    """Return the robot that moves, the model and its base as believed, and the robot with the model's parameters."""
+    """Return the true robot, the assumed model with its base, and the robot with the model's parameters."""
     plant, chain = setup.plant, setup.chain
     model, base = known_robots.model(plant), _nominal_base(condition.robot)
     size_factor = 3.0  # times 0.3 mm, 0.5 mrad and 3 mrad of joint offset (1 sigma): a drawing's robot, not calibrated
@@ -199,7 +199,7 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
 
 
 def _loop(condition: Condition, controller: Controller) -> LoopSettings:
-    """Return the loop settings that methods are given, wrong where the condition says so."""
+    """Return the loop settings for the methods, with the errors of the condition."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
     known = known_robots.truth(condition.robot)
     return LoopSettings(
@@ -215,7 +215,7 @@ def _validation(setup: Setup, model: IdentificationModel, base: Base, true: Plan
 
 
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
-    """Return the robot's parameters, each off by a normal relative error, of bodies that can be and drives that brake.
+    """Return the robot's parameters, each with a normal relative error, for consistent inertias and dissipative drives.
 
     A body is drawn until it can be (the survey's way, but body by body); where that takes long, from a smaller spread.
     """

@@ -14,7 +14,7 @@ from calib.workers import Workers
 
 @dataclass
 class Progress:
-    """How far a command has come.
+    """Progress of a study's command.
 
     Attributes:
         wanted: trials that this command has to run.
@@ -37,7 +37,7 @@ class Progress:
 
     @property
     def remaining(self) -> float:
-        """Seconds that remain, from each method's mean time so far and the number of trials in parallel."""
+        """Estimated remaining time [s], from each method's mean time so far and the number of trials in parallel."""
         paces = {name: sum(own) / len(own) for name, own in self.spent.items()}
         if not paces or self.seconds <= 0:
             return float("nan")
@@ -55,14 +55,14 @@ class Progress:
 
 
 def span(seconds: float) -> str:
-    """Return a time for people: 40 s, 12 min, 3.1 h."""
+    """Return a duration as text: 40 s, 12 min, 3.1 h."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
-    """Yield the tasks whose rows a store lacks, data set by data set, so that all conditions progress equally."""
+    """Yield the tasks without rows in the store, data set by data set, so that all conditions progress equally."""
     most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
     for number in range(most):
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):

@@ -34,7 +34,7 @@ _TYPES = [get_type_hints(TrialRow)[name] for name in COLUMNS]
 
 
 class RowStore:
-    """Rows of a folder, held by one process; made by `opened`.
+    """Rows of a folder, locked by one process; created by `opened`.
 
     Attributes:
         folder: where they are.
@@ -50,11 +50,11 @@ class RowStore:
         self._journal = _open_journal(folder / JOURNAL, good)
 
     def holds(self, key: tuple[str, str, int]) -> bool:
-        """Return whether the store holds a trial of the method's present version."""
+        """Return whether the store contains a trial of the method's current version."""
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:
-        """Keep rows, on the disk before this returns.
+        """Append rows; they are on the disk when this returns.
 
         Raises:
             CalibError: where the disk is full; rows of before are kept, none of these.
@@ -73,7 +73,7 @@ class RowStore:
         self.rows.update((row.key, row) for row in fresh)
 
     def _taken_back(self, size: int, error: OSError) -> CalibError:
-        """Cut the journal to its good part; say what happened."""
+        """Cut the journal to its intact part; return what happened."""
         path = self.folder / JOURNAL
         self._journal.close()
         os.truncate(path, size)
@@ -101,7 +101,7 @@ class RowStore:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[RowStore]:
-    """Hold a folder's store for one command; the lock is the kernel's, and ends with the process.
+    """Return a folder's store, locked for one command; the kernel releases the lock when the process ends.
 
     Raises:
         UsageError: while another command works on it; for a store of another version, or a damaged one.
@@ -132,7 +132,7 @@ def opened(folder: Path) -> Iterator[RowStore]:
 
 
 def read_rows(folder: Path) -> list[TrialRow]:
-    """Return all rows of a folder, while another command writes there, too."""
+    """Return all rows of a folder, even while another command writes to it."""
     journal = _read_journal(folder / JOURNAL)[0]  # first: what is emptied into the other meanwhile, is read there
     found = {row.key: row for row in (*_read_whole(folder / WHOLE), *journal)}
     return list(found.values())
@@ -150,7 +150,7 @@ def _open_journal(path: Path, size: int) -> IO[bytes]:
 
 
 def _read_journal(path: Path) -> tuple[list[TrialRow], int, int]:
-    """Return the rows, how many bytes of the file are good, and how many lines were half-written (0 or 1).
+    """Return the rows, the number of intact bytes, and the number of half-written lines (0 or 1).
 
     Raises:
         UsageError: for a file of another version, or one that is damaged before its last line.
@@ -191,7 +191,7 @@ def _check_columns(path: Path, found: Sequence[str]) -> None:
     if tuple(found) == _HEAD:
         return
     other = found[0].removeprefix("calib-study-") if found[0].startswith("calib-study-") else ""
-    require(other, f"{path} holds no rows of a study: run this one in another folder (--out)", UsageError)
+    require(other, f"{path} contains no rows of a study; give another folder (--out)", UsageError)
     missing = ", ".join(sorted(set(_HEAD[1:]) - set(found[1:]))[:5])
     lacks = f"; it lacks {missing}" if missing else ""
     raise UsageError(

@@ -30,7 +30,7 @@ FIGURES = (
 
 @dataclass(frozen=True)
 class Quartiles:
-    """Median and quartiles of a figure over runs; failures are infinite in errors, and left out elsewhere."""
+    """Median and quartiles of a figure over runs; failures count as infinite errors, and are excluded otherwise."""
 
     median: float
     lower: float
@@ -40,7 +40,7 @@ class Quartiles:
 
 @dataclass(frozen=True)
 class MethodSummary:
-    """One method on one condition.
+    """Summary of one method on one condition.
 
     Attributes:
         trials: number of its rows; failures: status → how many of them gave no estimate.
@@ -64,12 +64,12 @@ class MethodSummary:
 
     @property
     def enough(self) -> bool:
-        """Whether there are runs enough to distinguish it from others."""
+        """Whether the runs suffice to distinguish the method from others."""
         return self.trials >= MIN_DATA_SETS
 
     @property
     def estimates(self) -> bool:
-        """Whether its median torque error is of estimates, not of failures."""
+        """Whether the median torque error is finite, so not a failure."""
         return bool(np.isfinite(self.figures["torque_error"].median))
 
     @property
@@ -79,28 +79,28 @@ class MethodSummary:
 
 @dataclass(frozen=True)
 class ConditionSummary:
-    """All methods on one condition, best first."""
+    """Summaries of all methods on one condition, best first."""
 
     condition: Condition
     methods: tuple[MethodSummary, ...]
 
     @property
     def chosen(self) -> MethodSummary | None:
-        """The method to take; None where none is reliable."""
+        """The recommended method; None if none is reliable."""
         return next((one for one in self.methods if one.chosen), None)
 
     @property
     def best(self) -> MethodSummary | None:
-        """The first in rank of those with runs enough and an estimate; None without any."""
+        """The best method with enough runs and an estimate; None without any."""
         return next((one for one in self.methods if one.enough and one.estimates), None)
 
     @property
     def why_none(self) -> str:
-        """Why there is no method to take; "" where there is one, or no row."""
+        """Reason why no method is recommended; "" if one is, or without rows."""
         if self.chosen or not self.methods:
             return ""
         if not any(one.enough for one in self.methods):
-            return f"fewer than {MIN_DATA_SETS} runs of any method distinguish nothing: --runs {MIN_DATA_SETS} or more"
+            return f"fewer than {MIN_DATA_SETS} runs of each method are too few: --runs  {MIN_DATA_SETS} or more"
         return f"no method of {MIN_DATA_SETS} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
 
 
@@ -144,7 +144,7 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
 
 
 def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
-    """Return the median of a method's error over another's on the same data sets; infinite where there are none."""
+    """Return the median of a method's error over another's on the same data sets; infinite without common data sets."""
     both = [(one[seed], other[seed]) for seed in one.keys() & other.keys() if np.isfinite(other[seed])]
     return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
 
@@ -167,7 +167,7 @@ def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
 
 
 def spread(values: Sequence[float]) -> Quartiles:
-    """Return median and quartiles of what is not NaN; of nothing, NaN."""
+    """Return median and quartiles of the values without NaN; NaN if none remain."""
     found = np.sort([value for value in values if value == value])
     if not len(found):
         return Quartiles(float("nan"), float("nan"), float("nan"), 0)

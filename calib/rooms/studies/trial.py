@@ -1,4 +1,4 @@
-"""One trial: a method on one data set of a condition, as a row of figures of merit. Nothing it raises ends a study."""
+"""One trial: a method on one data set of a condition, as a row of figures of merit. Its errors never end a study."""
 
 import time
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ _CHANGED = " method "
 
 @dataclass(frozen=True)
 class TrialRow:
-    """One trial; NaN where there is no such number.
+    """Figures of merit of one trial; NaN if not available.
 
     Attributes:
         condition: name of the condition; digest: what it is.
@@ -76,17 +76,17 @@ class TrialRow:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """What distinguishes it from all other trials."""
+        """Unique key of the trial."""
         return self.digest, self.method, self.seed
 
     @property
     def toolkit(self) -> str:
-        """The toolkit's version that made it."""
+        """Version of the toolkit that wrote the row."""
         return self.version.partition(_CHANGED)[0]
 
     @property
     def current(self) -> bool:
-        """Whether its method has not changed since; a row of a method that has does not count, and is run again."""
+        """Whether the method is unchanged since the trial; otherwise the row does not count and is run again."""
         return (self.version.partition(_CHANGED)[2] or "1") == str(VERSIONS.get(self.method, 1))
 
     @property
@@ -169,7 +169,7 @@ def _survey_tau(data: Experiment, values: np.ndarray) -> float:
 
 
 def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, seed: int) -> float:
-    """Return the survey's d_q, without noise in the second simulation; NaN where it is not asked for, or cannot be."""
+    """Return the survey's d_q, without noise in the second simulation; NaN if not requested or not computable."""
     if seed >= condition.resimulated:
         return NAN
     setup, problem, model = set_up(condition.robot, condition.duration), data.problem, data.model
@@ -186,7 +186,7 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
 
 
 def _said(error: BaseException | None) -> str:
-    """Return an error in a line; of one that nobody foresaw, its class, too."""
+    """Return an error as one line, an unexpected one with its class."""
     if error is None:
         return ""
     words = str(error) if isinstance(error, CalibError) else f"{type(error).__name__}: {error}"

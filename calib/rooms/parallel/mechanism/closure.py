@@ -1,4 +1,4 @@
-"""Solve the loops: all joints and the platform's pose from its coordinates, or from the encoders, sample by sample.
+"""Solution of the closure equations: all joints and the platform pose from its coordinates or from encoders.
 
 Newton's method on the closure equations of all legs at once, eliminated leg by leg:
 
@@ -48,7 +48,7 @@ class ClosedRobot:
     fixed: bool
 
     def locate(self, readings: np.ndarray, near: Posture | None = None) -> Posture:
-        """Return the postures at which the encoders of the actuated joints read so.
+        """Return the postures for given encoder readings of the actuated joints.
 
         Args:
             readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
@@ -70,7 +70,7 @@ _Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Postur
 
 
 def closed(robot: ParallelRobot) -> ClosedRobot:
-    """Close a robot's loops at home, and find out what they leave free.
+    """Return a robot with its loops closed at home, after a check of its freedoms.
 
     Raises:
         RobotError: where a loop does not close there, home is singular, or the loops leave other freedoms than named.
@@ -89,7 +89,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
         if (apart := float(np.abs(one.gap).max())) > 1e3 * CLOSED:
             robot.refuse(
                 f"the loop of {leg.name} does not close at the platform's home: its end stays "
-                f"{1e3 * apart:.3g} mm (or mrad) from its attachment; look at its home, base, attachment and lengths"
+                f"{1e3 * apart:.3g} mm (or mrad) from its attachment; check its home, base, attachment and lengths"
             )
         if (rcond := float(_leg_rcond(one, one)[0])) < SINGULAR:
             robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
@@ -103,12 +103,12 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
 
 
 def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
-    """Say whether a leg is singular at home alone, or wherever its joints are."""
+    """Return the reason why a leg is singular: at home only, or in all postures."""
     rng, k = np.random.default_rng(0), robot.legs.index(leg)
     elsewhere = [Posture(home.q + rng.uniform(-1.0, 1.0, home.q.shape), home.pose) for _ in range(4)]
     if all(float(_leg_rcond(one, one)[0]) < SINGULAR for one in (leg_links(robot, own)[k] for own in elsewhere)):
         return (
-            f"is singular wherever its joints are: they do not move its {leg.end} end in {leg.chain.n} independent "
+            f"is singular in all postures: its joints do not move its {leg.end} end in {leg.chain.n} independent "
             "ways (parallel axes behind a spherical end?)"
         )
     return "is singular at home (stretched or folded)"
@@ -165,7 +165,7 @@ def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
 
 
 def _check_postures(known: ClosedRobot, posture: Posture) -> None:
-    """Refuse postures in a singularity, or beyond one.
+    """Refuse postures at a singularity, or beyond one.
 
     Raises:
         NoPosture: naming the sample, the leg or the platform, and the type: 1 (a leg is stretched or folded), 2 (the
@@ -219,7 +219,7 @@ def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim,
 
 
 def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
-    """Return solutions near `start`; of a rough one two steps are enough."""
+    """Return solutions near `start`; two steps suffice for a rough solution."""
     q, pose = np.array(start.q), np.array(start.pose)
     left = np.arange(len(q))
     max_steps = 60  # Newton steps
@@ -251,19 +251,19 @@ def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rc
     weak = [n for (n, one), home in zip(links.items(), at_home) if float(_leg_rcond(one, home)[0]) < max_rcond]
     why = f"{worst} stays {gap:.3g} mm from its attachment: out of reach" if gap > 1.0 else (
         f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach" if weak
-        else "Newton's steps do not settle: at a singularity (type 2), or readings that contradict each other"
+        else "Newton's method does not converge: singularity (type 2) or contradictory readings"
     )  # fmt: skip
     more = f" ({len(left)} of {len(found)} samples)" if len(left) > 1 else ""
     raise NoPosture(
         f"sample {left[0] + 1}: the loops of '{known.robot.name}' cannot be closed (last try: platform at "
-        f"{_where(known, own)}): {why}{more}; look at units, zeros and order of the encoders", left.tolist(),
+        f"{_where(known, own)}): {why}{more}; check units, zeros and order of the encoders", left.tolist(),
     )  # fmt: skip
 
 
 def _from_readings(
     known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
 ) -> np.ndarray:
-    """Return the twist's independent parts (N, r) that bring the readings nearest to `wanted`."""
+    """Return the twist's independent parts (N, r) that bring the readings closest to `wanted`."""
     rows, right = [], wanted - posture.q[:, known.robot.actuated]
     for leg, one in zip(known.robot.legs, links):
         rows.append(
@@ -330,7 +330,7 @@ def _best_rows(J: np.ndarray) -> np.ndarray:
 
 
 def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks]) -> bool:
-    """Return whether the loops leave the named twists everywhere, after checking how many they leave.
+    """Return whether the named freedoms hold everywhere in the workspace, after a check of their number.
 
     Raises:
         RobotError: for another number of freedoms than named, or names that do not distinguish them.
@@ -343,8 +343,8 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
         left = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
         if left != robot.r:
             robot.refuse(
-                f"its loops leave the platform {left} freedoms, but freedom names {robot.r} "
-                f"({', '.join(robot.freedom)}); the motions left are {_motions(values[2][6 - left :])}"
+                f"its platform has {left} freedoms, but freedom names {robot.r} "
+                f"({', '.join(robot.freedom)}); its free motions are {_motions(values[2][6 - left :])}"
             )
         if np.linalg.cond(values[2][6 - left :, robot.selected]) > 1e8:
             robot.refuse(
@@ -361,5 +361,5 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
 
 
 def _motions(rows: np.ndarray) -> str:
-    """Return which parts of a twist the rows (k, 6) hold."""
+    """Return the names of a twist's components that are nonzero in rows (k, 6)."""
     return ", ".join(name for name, size in zip(COORDINATES, np.linalg.norm(rows, axis=0)) if size > 1e-6) or "none"

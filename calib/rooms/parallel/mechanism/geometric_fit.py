@@ -67,7 +67,7 @@ class LoopFit:
 
 
 def loop_parameters(known: ClosedRobot) -> tuple[LoopParameter, ...]:
-    """Return the constants of a robot that can change without opening a loop for good."""
+    """Return the constants of a robot that can change while all loops stay closable."""
     robot = known.robot
     links, jacobians = leg_links(robot, known.home), loop_jacobians(known, known.home)
     found = []
@@ -86,7 +86,7 @@ def fit_loops(
     nominal: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray | None = None, *,
     held: Sequence[str] = (), loss: float = 1e-6,
 ) -> LoopFit:  # fmt: skip
-    """Fit the geometry of a parallel robot to encoder readings, with platform coordinates or without.
+    """Return the geometry of a parallel robot fitted to encoder readings, with or without platform coordinates.
 
     Args:
         nominal: to start from.
@@ -135,7 +135,7 @@ def fit_loops(
 
 
 def changed(robot: ParallelRobot, parameters: Sequence[LoopParameter], values: np.ndarray) -> ParallelRobot:
-    """Return a robot whose parameters are changed by values (p,)."""
+    """Return the robot with its parameters changed by values (p,)."""
     legs = list(robot.legs)
     for one, value in zip(parameters, values):
         if value != 0.0:
@@ -149,7 +149,7 @@ def platform_errors(known: ClosedRobot, readings: np.ndarray, coordinates: np.nd
 
 
 def contradictions(known: ClosedRobot, readings: np.ndarray) -> np.ndarray:
-    """Return what redundant encoder readings (m, n) contradict each other by, Nᵀ (q - q(x̂)) (m, n - r) [rad or m]."""
+    """Return the contradictions (m, n - r) Nᵀ (q - q(x̂)) of redundant encoder readings (m, n) [rad or m]."""
     posture = known.locate(readings)
     across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
     return times(across, readings - posture.q[:, known.robot.actuated])

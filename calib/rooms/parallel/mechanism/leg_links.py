@@ -1,4 +1,4 @@
-"""The legs at given postures: their Jacobians, their attachments, and by how much their ends miss them."""
+"""Jacobians, attachments and closure gaps of the legs at given postures."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
-    """Return one leg at joint values q (N, n) and poses of the platform (N, 4, 4)."""
+    """Return Jacobian, attachment and gap of a leg at joint values q (N, n) and platform poses (N, 4, 4)."""
     from calib.rooms.parallel.mechanism import closure_kernels
 
     count, n = q.shape
@@ -85,7 +85,7 @@ def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
 
 @lru_cache(maxsize=256)
 def compiled(leg: Leg) -> tuple[Bodies, np.ndarray]:
-    """Return a leg as the kernels read it: its bodies, and its end (4, 4) in its last body's turned frame."""
+    """Return a leg's arrays for the kernels: its bodies, and its end (4, 4) in its last body's turned frame."""
     bodies = bodies_of(leg.chain)
     turn = upright_turn(int(bodies.axes[-1]))
     return bodies, frozen(turn.T @ leg.chain.tail)

@@ -1,4 +1,4 @@
-"""The file of a parallel robot, in TOML: legs as MDH tables, a platform, where each leg is attached.
+"""The TOML file of a parallel robot: legs as MDH tables, platform, and attachment of each leg.
 
 kind = "parallel"                # required: distinguishes it from a serial arm
 name = "dualv"
@@ -49,18 +49,18 @@ _LEG = ("name", "base", "attachment", "end", "actuated", "home", "tail", "joint"
 
 
 def library() -> dict[str, Path]:
-    """Return the files of the parallel robots that come along, by name."""
+    """Return the files of the shipped parallel robots, by name."""
     return {path.stem: path for path in sorted(Path(__file__).with_name("library").glob("*.toml"))}
 
 
 def is_parallel(path: str | Path) -> bool:
-    """Return whether a TOML file says ``kind = "parallel"`` or has ``[[leg]]`` tables."""
+    """Return whether a TOML file contains ``kind = "parallel"`` or ``[[leg]]`` tables."""
     table = load(path)
     return table.get("kind") == KIND or "leg" in table
 
 
 def read(path: str | Path) -> ParallelRobot:
-    """Read a parallel robot from a TOML file (schema above); its loops are not solved here (`closure.closed`).
+    """Return the parallel robot of a TOML file (schema above), without solving its loops (`closure.closed`).
 
     Raises:
         RobotError: naming the table, the key and what is wrong with it.
@@ -73,7 +73,7 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
     check_keys(table, TOP, where)
     if table.get("kind") != KIND:
         refuse_robot(
-            where, f'kind is {shown(table.get("kind"))}; a robot of legs and a platform says kind = "parallel"'
+            where, f'kind is {shown(table.get("kind"))}; for a robot with legs and a platform state kind = "parallel"'
         )
     gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
     own, place = table.get("platform"), f"{where}, [platform]"
@@ -99,7 +99,7 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
 def write(
     path: str | Path, robot: ParallelRobot, source: str = "", provenance: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write a parallel robot, so that `read` returns the same one to the last bit."""
+    """Write a parallel robot as a TOML file that `read` reproduces to the last bit."""
     return files.write(path, dumps(to_table(robot, source) | ({"provenance": provenance} if provenance else {})))
 
 
@@ -154,7 +154,7 @@ def _actuated(entry: Mapping[str, Any], chain: Chain, place: str) -> tuple[int, 
     for one in named:
         if one not in chain.joint_names:
             near = suggestion(one, chain.joint_names)
-            refuse_robot(place, f"actuated '{one}' is none of its joints{near}: {', '.join(chain.joint_names)}")
+            refuse_robot(place, f"actuated '{one}' is not one of its joints{near}: {', '.join(chain.joint_names)}")
     return tuple(sorted(chain.joint_names.index(one) for one in dict.fromkeys(named)))
 
 

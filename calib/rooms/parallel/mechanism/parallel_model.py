@@ -1,4 +1,4 @@
-"""The identification model of a parallel robot: rows on the platform's coordinates, on its actuators, or their power.
+"""The identification model of a parallel robot, with rows for platform coordinates, actuators or power.
 
     platform   J_p^invᵀ τ = W χ      one row per freedom; unique, also with redundant actuators (eqs 24-28)
     motor      τ = W χ               one row per actuator, where there are as many as freedoms (eq. 14)
@@ -109,7 +109,7 @@ class ParallelModel:
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """Of the bodies: the legs', the platform's, the payloads'."""
+        """Labels of the bodies: the legs', the platform's, the payloads'."""
         robot = self.known.robot
         legs = [robot.labels[a + j] for leg, a in zip(robot.legs, robot.starts) for j in range(leg.bodies)]
         return (*legs, robot.platform_label, *self.payloads)
@@ -192,7 +192,7 @@ class ParallelModel:
     def platform_force(
         self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
     ) -> np.ndarray:
-        """Return the forces and moments (N, r) on the platform's coordinates that parameters (p,) need."""
+        """Return the forces and moments (N, r) in platform coordinates for parameters (p,)."""
         robot, J = self.known.robot, motion.jacobians
         values = np.asarray(values, dtype=float)
         tree = self.tree_torque(values, motion)
@@ -201,7 +201,7 @@ class ParallelModel:
         return np.einsum("ntr,nt->nr", J.joints, tree) + np.einsum("nkr,nk->nr", J.platform, wrench)
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
-        """Return the torques (N, n_t) of the opened legs with their drives, the platform taken off."""
+        """Return the torques (N, n_t) of the opened legs with their drives, without the platform."""
         own = [motion.posture.q, motion.v, motion.a]
         parts = [
             rigid_body.inverse_dynamics(bodies, parameters, *(x[:, joints] for x in own))
@@ -252,7 +252,7 @@ class ParallelModel:
         return np.asarray((np.abs(self.regressor(states.q, states.v, states.a)) > 1e-12).any(axis=0)).T
 
     def preference(self) -> np.ndarray:
-        """Return the columns in the order they are tried: platform, first moments, inertias, drives, masses, payloads.
+        """Return the columns in the order of selection: platform, first moments, inertias, drives, masses, payloads.
 
         Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
         """
@@ -284,7 +284,7 @@ class ParallelModel:
         return States(posture.q[:, own], motion.v[:, own], motion.a[:, own])
 
     def known_parameters(self) -> np.ndarray | None:
-        """Return the bodies' parameters of the robot's file (inertial,), payloads zero; None where it holds none."""
+        """Return the bodies' parameters of the robot's file (inertial,), payloads zero; None without inertias."""
         robot = self.known.robot
         parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
         if len(parts) < len(robot.legs) or robot.platform is None:
@@ -292,7 +292,7 @@ class ParallelModel:
         return np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
 
     def _on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
-        """Return rows (N, rows, p) of those on the platform's coordinates."""
+        """Return the regressor rows (N, rows, p) from those on the platform's coordinates."""
         if self.torque_rows.name == PLATFORM:
             return W
         if self.torque_rows.name == POWER.name:
@@ -304,7 +304,7 @@ PLATFORM = "platform"
 
 
 def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
-    """Return the rows that options call ``platform``, ``motor`` or ``power``; by default those a robot allows.
+    """Return the rows of the option ``platform``, ``motor`` or ``power``; by default those possible for a robot.
 
     Raises:
         UsageError: for motor rows of redundant actuators, whose torques no model determines; for other names.
@@ -316,7 +316,7 @@ def rows_named(known: ClosedRobot, name: str = "") -> TorqueRows:
         return projected(PLATFORM, Projection(robot.freedom, units, partial(_to_platform, known)))
     if name == POWER.name:
         return POWER
-    require(name == MOTOR.name, f"rows = '{name}': a parallel robot's are platform, motor or power", UsageError)
+    require(name == MOTOR.name, f"rows = '{name}': for a parallel robot expected platform, motor or power", UsageError)
     if robot.redundant:
         raise UsageError(
             f"rows = 'motor': '{robot.name}' has {robot.n} actuators for {robot.r} freedoms, so that the share of each "
@@ -353,11 +353,11 @@ def make_parallel_model(
 
 
 def _renamed(one: DriveTerm, labels: Sequence[str]) -> str:
-    """Return the name of a term with the label of its joint in place of its number."""
+    """Return the name of a term with its joint's label instead of its number."""
     joint = one.acts[0][0]
     return one.name.removesuffix(str(joint + 1)) + labels[joint]
 
 
 def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return J_p^invᵀ (N, r, n), which takes the actuators' torques to the platform's coordinates."""
+    """Return J_p^invᵀ (N, r, n), which maps actuator torques to platform coordinates."""
     return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)

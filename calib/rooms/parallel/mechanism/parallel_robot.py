@@ -1,4 +1,4 @@
-"""What a parallel robot is: legs from the base to a platform, each a serial chain whose end the platform holds.
+"""Description of a parallel robot: a platform and its legs, each a serial chain from base to platform.
 
     closure of leg k:   tip_k(q_k) = P · attachment_k        (six equations where the leg is rigid with the platform,
                                                               three where a spherical joint ends it)
@@ -61,18 +61,18 @@ class Leg(Frozen):
 
     @property
     def held(self) -> int:
-        """How many equations its closure has."""
+        """Number of closure equations of the leg."""
         return 6 if self.end == "rigid" else 3
 
     @property
     def bodies(self) -> int:
-        """How many of its links are bodies of their own: the last one of a rigid end is the platform."""
+        """Number of the leg's links that are separate bodies: the last one of a rigid end is the platform."""
         return self.chain.n - (self.end == "rigid")
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelRobot(Frozen):
-    """Legs and the platform they hold.
+    """A parallel robot: its legs and platform.
 
     Attributes:
         name: of the robot.
@@ -116,17 +116,17 @@ class ParallelRobot(Frozen):
             )
 
     def refuse(self, words: str) -> NoReturn:
-        """Refuse the robot for what `words` say of it."""
+        """Refuse the robot for the reason `words`."""
         refuse_robot(f"robot '{self.name}'", words)
 
     @property
     def r(self) -> int:
-        """Freedoms of the platform."""
+        """Number of the platform's freedoms."""
         return len(self.freedom)
 
     @property
     def n(self) -> int:
-        """Actuated joints."""
+        """Number of actuated joints."""
         return sum(len(leg.actuated) for leg in self.legs)
 
     @property
@@ -136,17 +136,17 @@ class ParallelRobot(Frozen):
 
     @cached_property
     def selected(self) -> np.ndarray:
-        """(r,) which parts of the platform's twist are the independent ones."""
+        """Indices (r,) of the independent components of the platform's twist."""
         return np.array([COORDINATES.index(name) for name in self.freedom])
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """(L + 1,) where each leg's joints begin among all joints of the tree; the last entry is their number."""
+        """Index (L + 1,) of each leg's first joint among all joints of the tree; the last entry is their number."""
         return np.concatenate([[0], np.cumsum([leg.chain.n for leg in self.legs])]).astype(int)
 
     @cached_property
     def actuated(self) -> np.ndarray:
-        """(n,) the actuated ones among all joints of the tree."""
+        """Indices (n,) of the actuated joints among all joints of the tree."""
         return np.array([self.starts[k] + j for k, leg in enumerate(self.legs) for j in leg.actuated], dtype=int)
 
     @property
@@ -156,12 +156,12 @@ class ParallelRobot(Frozen):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Of the actuated joints."""
+        """Names of the actuated joints."""
         return tuple(joint.name for joint in self.joints)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What the tree's joints are numbered with: joint j of leg k is ``jk``, as in the papers (``j.k`` above 9)."""
+        """Labels of the tree's joints: joint j of leg k is ``jk``, as in the papers (``j.k`` above 9)."""
         wide = len(self.legs) > 9 or max(leg.chain.n for leg in self.legs) > 9
         return tuple(
             f"{j + 1}.{k + 1}" if wide else f"{j + 1}{k + 1}"
@@ -171,9 +171,9 @@ class ParallelRobot(Frozen):
 
     @property
     def platform_label(self) -> str:
-        """What the platform's parameters are numbered with: the number after the legs' last joints."""
+        """Label of the platform's parameters: the number after the legs' last joints."""
         return str(max(leg.chain.n for leg in self.legs) + 1)
 
     def with_legs(self, legs: tuple[Leg, ...]) -> ParallelRobot:
-        """Return the robot on other legs: another geometry."""
+        """Return the robot with other legs: another geometry."""
         return replace(self, legs=legs)

@@ -1,4 +1,4 @@
-"""Motions given by the platform's coordinates x(t): what they need of the robot, with slopes to design them by."""
+"""Regressor rows and torques of motions in platform coordinates x(t), with gradients for motion design."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -64,11 +64,11 @@ class PlatformRegressor:
     carried: Collection[str] | None = None
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
-        """Return the robot's motion along x, v, a (N, r), brought back to the robot's box where a search left it."""
+        """Return the robot's motion along x, v, a (N, r), clipped to the robot's box."""
         return along(self.model.known, self._reachable(x), v, a)
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return W (N, r, b) in the columns that count."""
+        """Return W (N, r, b) in the selected columns."""
         return self._columns(self.motion(x, v, a))
 
     def regressor_gradient(
@@ -88,7 +88,7 @@ class PlatformRegressor:
         return motion.v[:, self.model.known.robot.actuated]
 
     def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
-        """Return coordinates brought back to the robot's box: a search may leave it.
+        """Return coordinates clipped to the robot's box: a search may leave it.
 
         `spare_share`: of the box's width, beyond it (our choice).
         """
@@ -102,7 +102,7 @@ class PlatformRegressor:
     def slopes(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray], weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · of(motion) by x, v, a; central differences, exact but for rounding by v, a.
+        """Return the slopes of Σ weights · of(motion) by x, v, a; central differences, exact to rounding for v, a.
 
         Args:
             of: the motion of N samples -> values (N, ...); weights: of the same shape.

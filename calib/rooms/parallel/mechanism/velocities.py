@@ -33,7 +33,7 @@ class LoopJacobians:
 
 @dataclass(frozen=True, eq=False)
 class LoopMotion:
-    """How N postures move.
+    """Velocities and accelerations of N postures.
 
     Attributes:
         posture: of joints and platform.
@@ -63,7 +63,7 @@ def loop_jacobians(known: ClosedRobot, posture: Posture) -> LoopJacobians:
 def of_platform(
     known: ClosedRobot, posture: Posture, rate: np.ndarray, change: np.ndarray, jacobians: LoopJacobians | None = None
 ) -> LoopMotion:
-    """Return the motion of postures from the platform's.
+    """Return the motion of postures from the platform's motion.
 
     Args:
         rate, change: (N, r) independent parts of its twist, and their derivatives.
@@ -73,7 +73,7 @@ def of_platform(
 
 
 def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
-    """Return the motion of postures from the encoders', redundant ones by least squares (eqs 16, 18).
+    """Return the motion of postures from the encoders' motion, for redundant encoders by least squares (eqs 16, 18).
 
     Args:
         v, a: (N, n) of the actuated joints.
@@ -132,7 +132,7 @@ def _end_bias(one: LegLinks, v: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a × b (N, 3); numpy's takes ten times as long for few samples."""
+    """Return a × b (N, 3); ten times as fast as numpy for few samples."""
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 

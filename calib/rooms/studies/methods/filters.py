@@ -1,4 +1,4 @@
-"""Parameters as states: the survey's nonlinear Kalman filters on the direct dynamic model.
+"""The survey's nonlinear Kalman filters on the direct dynamic model, with parameters as states.
 
     state x = [q, v, χ],   q, v ← one step under the measured torques with parameters χ,   χ ← χ,   seen: q
 
@@ -71,7 +71,7 @@ class _KalmanFilter(Method):
         max_innovation = 30.0  # times the stated mean square: innovations of a filter that has lost the robot
         if not np.isfinite(innovation) or innovation > max_innovation:
             raise Diverged(
-                f"{self.name} lost the robot: its innovations are {np.sqrt(innovation):.3g} times what it says",
+                f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones",
                 state.mean,
             )
         estimate = replace(
@@ -86,7 +86,7 @@ class _KalmanFilter(Method):
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What is known of the parameters between recordings; sizes of the innovations, passes over them."""
+    """Estimate and covariance of the parameters between recordings, with sizes of innovations and passes."""
 
     robot: BelievedRobot
     kind: Filter
@@ -97,7 +97,7 @@ class _State:
 
 
 def _inertia(problem: IdentificationProblem) -> np.ndarray:
-    """Return an inertia (n,) of each joint on average, from torques against accelerations alone."""
+    """Return the mean inertia (n,) of each joint, from the regression of torques on accelerations."""
     n = problem.cases[0].motion.n
     cross, size = np.zeros(n), np.full(n, 1e-12)
     for case in problem.cases:
@@ -108,7 +108,7 @@ def _inertia(problem: IdentificationProblem) -> np.ndarray:
 
 
 def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndarray) -> None:
-    """Compute accelerations along the recordings, or raise what stands against it."""
+    """Compute accelerations along the recordings; raise if the robot cannot be simulated."""
     for case in problem.cases:
         part = slice(None, None, max(1, len(case.motion) // 200))
         q, v = case.motion.q[part], case.motion.v[part]
@@ -116,7 +116,7 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
 
 
 def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield q (n,) as seen, and the mean torques (s, n) of s equal steps since the last one, of a segment.
+    """Yield measured q (n,) of a segment, and mean torques (s, n) of s equal steps since the previous sample.
 
     `max_step`: [s] of a step of the dynamics.
     """
@@ -168,7 +168,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
-    """Return the belief's spread with that of the parameters, a covariance, in its place."""
+    """Return the belief's spread with the parameters' part replaced by a covariance."""
     spread = np.array(belief.spread)
     spread[first:, first:] = np.linalg.cholesky(parameters) if belief.root else parameters
     return spread
@@ -217,7 +217,7 @@ class _Stepping:
             spread[:, :n], spread[:, n : 2 * n] = q, v
             noise = self._noise(gain, len(tau) * period, torque, spread.shape[1])
             return predicted(spread, noise, self.kind, narrower)
-        raise CannotSimulate(f"the filter believes in no robot: {failure}", before.mean)
+        raise CannotSimulate(f"the filter's parameters are not a possible robot: {failure}", before.mean)
 
     def _values(self, states: np.ndarray) -> np.ndarray:
         """Return the plant's parameters (K, p) of states (K, L)."""
@@ -234,8 +234,8 @@ class _Stepping:
 
 
 _ASSUMES = (
-    "torques drive the robot and are noisy by the residuals of least squares, positions by their spectrum, both white; "
-    "the model's friction is that of the robot"
+    "torque noise by the residuals of least squares, position noise by the spectrum, both white; "
+    "the robot has the model's friction"
 )
 EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
     _KalmanFilter(

@@ -1,4 +1,4 @@
-"""Nonlinear Kalman filters with a linear measurement, written once: three rules, each with covariance or its root.
+"""Nonlinear Kalman filters with a linear measurement: three rules, each with the covariance or its square root.
 
 A rule says what a nonlinear step makes of a mean m and deviations S, S Sᵀ = P:
 
@@ -30,7 +30,7 @@ Linearised = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Filter:
-    """A kind of filter.
+    """Type of a filter: rule and form of the covariance.
 
     Attributes:
         rule: one of `RULES`.
@@ -43,7 +43,7 @@ class Filter:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed of a state.
+    """Mean and covariance of a state.
 
     Attributes:
         mean: (L,).
@@ -88,7 +88,7 @@ def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
 
 
 def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: float = 1.0) -> Belief:
-    """Return the belief after a step, from what it made of `points` (2 L + 1, L), and noise N (L, k)."""
+    """Return the belief after a step, from the propagated `points` (2 L + 1, L) and noise N (L, k)."""
     size = images.shape[1]
     gamma = narrower * _gamma(kind, size)
     middle, ahead, behind = images[0], images[1 : size + 1] - images[0], images[size + 1 :] - images[0]
@@ -103,14 +103,14 @@ def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: flo
 
 
 def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noise: np.ndarray, kind: Filter) -> Belief:
-    """Return the belief after a step that makes `mean` (L,) of the old one, with slopes F (L, L)."""
+    """Return the belief after a step to `mean` (L,) with slopes F (L, L)."""
     if kind.root:
         return _packed(mean, slopes @ before.spread, noise, kind, 0.0, mean)
     return Belief(mean, slopes @ before.spread @ slopes.T + noise @ noise.T, False)
 
 
 def corrected(before: Belief, seen: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
-    """Return the belief after measuring the first `rows` components with noise std (rows,), and its innovation's size.
+    """Return the belief after measuring the first `rows` components with noise std (rows,), and the innovation's size.
 
     The size is eᵀ (H P Hᵀ + R)⁻¹ e, on average `rows` where the filter knows its noise.
     """

@@ -1,4 +1,4 @@
-"""The survey's methods that nobody calibrates by."""
+"""List of the survey's methods that serve for comparison only."""
 
 from calib.rooms.studies.methods.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF, UKF
 from calib.rooms.studies.methods.maximum_likelihood import ML

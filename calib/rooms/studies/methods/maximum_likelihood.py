@@ -1,4 +1,4 @@
-"""Maximum likelihood with noisy positions: errors in variables, every sample weighed by what its noise does to it.
+"""Maximum likelihood with noisy positions: errors in variables, each sample weighted by its propagated noise.
 
 What a sample leaves, r_k = y_k - W(x_k) β with x = (q, v, a) as measured, has to first order the covariance
 
@@ -40,14 +40,14 @@ class _MaximumLikelihood(Method):
     """Errors in variables; see the module."""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's columns; weights beside it are the torques' noise.
+        """Return the estimate of the problem's columns, with the torque noise as weights.
 
         Raises:
             UsageError: for a model whose rows have no slopes by q, v and a.
         """
         model = problem.model
         if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-            raise UsageError(f"method '{self.name}' explains motor torques of a serial arm; others take wls or tls")
+            raise UsageError(f"method '{self.name}' needs motor torques of a serial arm; otherwise take wls or tls")
         return attempted(self.name, problem, lambda: self._estimate(problem, model))
 
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:
@@ -69,7 +69,7 @@ class _MaximumLikelihood(Method):
                 break
         else:
             raise NotConverged(
-                f"maximum likelihood still moves by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
+                f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
                 values,
             )
         return MethodEstimate(
@@ -80,7 +80,7 @@ class _MaximumLikelihood(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Recording:
-    """One recording.
+    """Data of one recording.
 
     Attributes:
         own: its samples among all.
@@ -129,7 +129,7 @@ def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) ->
 
 
 def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
-    """Return the covariance (n, 3, 3) of q, v, a of each joint, as white noise of its positions leaves it.
+    """Return the covariance (n, 3, 3) of q, v, a of each joint, propagated from white position noise.
 
     From the impulse response of low-pass, differences and decimation; the noise's level is that of the log's spectrum.
     """
@@ -179,7 +179,7 @@ def _inverse(other: np.ndarray, noise: np.ndarray, used: np.ndarray) -> np.ndarr
 
 
 def _torque_noise(task: _NoisyStates, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Return the torque noise Σ_τ (n,) of maximum likelihood for fixed parameters and position noise."""
+    """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
     parts = [_residuals(task, part, values) for part in task.parts]
     residual, other = (np.concatenate(x) for x in zip(*((r, more) for r, _, more in parts)))
     left = max(1.0 - len(values) / task.present.sum(), 0.1)  # of the residuals, after the fit
@@ -205,7 +205,7 @@ class _Round:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(p,) standard deviations, were the residuals white."""
+        """Standard deviations (p,) for white residuals."""
         return np.sqrt(sum(np.sum((own @ self.bread.T) ** 2, axis=(0, 1)) for own in self.white))
 
 
@@ -244,7 +244,7 @@ def _change(task: _NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarr
 
 
 def _packed(problem: IdentificationProblem, found: _Round, noise: np.ndarray) -> LinearFit:
-    """Return the fit of the last round; its covariance knows of residuals correlated in time."""
+    """Return the fit of the last round, with a covariance for residuals correlated in time."""
     plain = wls(problem.pooled, np.sqrt(noise))
     p, rows = len(found.values), int(problem.pooled.rows.sum())
     meat = sum(scatter(own, left) for own, left in zip(found.white, found.residual))

@@ -22,7 +22,7 @@ EPOCHS = 60  # at most
 def adaline(
     data: Samples, triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, seed: int = 0
 ) -> tuple[LinearFit, int]:
-    """Train an adaptive linear neuron on samples in random order; return the estimate, and epochs.
+    """Return the estimate of an adaptive linear neuron trained in random order, and the number of epochs.
 
         w ← w + μ_k Z_kᵀ (y_k - Z_k w),    Z_k = R⁻¹ W_k T,    x = T w
 
@@ -67,7 +67,7 @@ def adaline(
 def hopfield(
     triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, bound: np.ndarray | None = None
 ) -> tuple[LinearFit, int]:
-    """Let a Hopfield-Tank network of p neurons come to rest; return the estimate, and steps.
+    """Return the estimate of a Hopfield-Tank network of p neurons at rest, and the number of steps.
 
         u̇ = -∂E/∂x = -(Wᵀ R⁻¹ W x - Wᵀ R⁻¹ y),    x_i = α_i tanh(u_i / α_i),    E = ½ ‖R^(-½) (y - W x)‖²
 
@@ -119,7 +119,7 @@ Train = Callable[[IdentificationProblem, np.ndarray, np.ndarray], tuple[LinearFi
 
 @dataclass(frozen=True)
 class _Network(Method):
-    """A method that comes to rest at weighted least squares.
+    """A method that converges to weighted least squares.
 
     Attributes:
         train: the problem, (rows,) standard deviations and inflation to the fit, and the number of rounds.
@@ -128,7 +128,7 @@ class _Network(Method):
     train: Train
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the weights of the network at rest, with the covariance of least squares and that of the training."""
+        """Return the estimate of the network at rest, with the covariances of least squares and of training."""
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:

@@ -39,7 +39,7 @@ from calib.simulation.loop.closed_loop import Sensing, simulate
 
 @dataclass(frozen=True)
 class _OutputError(Method):
-    """A method that fits the simulated closed loop to the recorded one; see the module.
+    """A method that fits the simulated closed loop to the recordings; see the module.
 
     Attributes:
         torques: whether torques are compared, and not positions.
@@ -93,7 +93,7 @@ class _OutputError(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """What is compared: recordings in their loops, positions or torques; `count` of simulations."""
+    """Compared signals: recordings in their loops, positions or torques; `count` of simulations."""
 
     problem: IdentificationProblem
     robot: BelievedRobot
@@ -102,7 +102,7 @@ class _Comparison:
     count: list[int] = field(default_factory=lambda: [0])
 
     def simulated(self, values: np.ndarray) -> None:
-        """Simulate the loops, or raise what stands against it."""
+        """Return the simulated loops; raise if they cannot be simulated."""
         for case, loop in self.loops.pairs:
             plant, controller = self.robot.at(values, case), loop.controller
             if loop.design is not None:
@@ -111,7 +111,7 @@ class _Comparison:
             simulate(plant, controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, n), zero where nothing is compared, and slopes (M, n, p) of what is simulated."""
+        """Return residuals (M, n), zero at samples not compared, and slopes (M, n, p) of the simulated signals."""
         residuals, slopes = [], []
         for case, loop in self.loops.pairs:
             plant, controller, relative = self.robot.at(values, case), loop.controller, None
@@ -140,7 +140,7 @@ class _Comparison:
         return np.array([self.robot.at(np.eye(p)[k]).inertia_diagonal(q) for k in range(p)]).T
 
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M n,) and slopes (M n, p) over (n,) std; of what cannot be simulated huge ones."""
+        """Return residuals (M n,) and slopes (M n, p) over (n,) std; huge values if the simulation fails."""
         p = len(values)
         impossible = 1e60  # residual of parameters that cannot be simulated: any step that can is better
         try:
@@ -168,7 +168,7 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss-Newton step in standard deviations, were residuals white: Qᵀ r."""
+    """Return the next Gauss-Newton step in standard deviations of white residuals: Qᵀ r."""
     p = slopes.shape[2]
     return np.linalg.qr(slopes.reshape(-1, p))[0].T @ residual.ravel()
 
@@ -199,12 +199,12 @@ def _packed(
     return LinearFit(estimate, std, *condition_numbers(flat))
 
 
-_LOOP = "controller and reference are those of the loop, the model's friction that of the robot; "
+_LOOP = "controller and reference as stated in the loop, the robot has the model's friction; "
 CLOE = _OutputError(
-    "cloe", _LOOP + "no measured torque takes part", False, source="Landau 1979; Leboutet et al. 2021",
+    "cloe", _LOOP + "measured torques are not used", False, source="Landau 1979; Leboutet et al. 2021",
     description="closed-loop output error: simulated positions meet measured ones",
 )  # fmt: skip
 CLIE = _OutputError(
-    "clie", _LOOP + "no measured position takes part", True, source="Leboutet et al. 2021",
+    "clie", _LOOP + "measured positions are not used", True, source="Leboutet et al. 2021",
     description="closed-loop input error: simulated torques meet measured ones",
 )  # fmt: skip

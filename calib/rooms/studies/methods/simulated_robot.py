@@ -1,4 +1,4 @@
-"""The simulated robot with a problem's parameters, and the values that methods which simulate it start from.
+"""The simulated robot of an identification problem, and initial parameters of simulating methods.
 
 Closed loops with their slopes by parameters: a whole run at once, or states advanced one at a time.
 """
@@ -41,7 +41,7 @@ def simulate_tangents(
     plant: Plant, controller: Controller, reference: Reference, columns: np.ndarray, every: float = 1,
     relative: np.ndarray | None = None,
 ) -> Sensitivities:  # fmt: skip
-    """Let the robot follow a reference without noise, and say what each parameter changes: exactly, in one pass.
+    """Return a noise-free simulated motion along a reference, with its slopes by the parameters: exactly, in one pass.
 
     Args:
         plant: whose friction hangs on position and velocity alone.
@@ -58,7 +58,7 @@ def simulate_tangents(
     from calib.simulation.loop import loop_kernels
 
     for one in plant.terms:
-        words = f"term '{one.name}' ({one.shape}): no tangents of friction that hangs on loads or the past"
+        words = f"term '{one.name}' ({one.shape}): no tangents for friction that depends on load or history"
         require(one.form.slopes, words)
     n, count, c = plant.bodies.n, len(reference.t), len(columns)
     find = np.full(len(plant.parameters), -1)
@@ -79,14 +79,14 @@ def simulate_tangents(
     if (
         not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope
     ):  # saturated torques keep the motion finite, not its slopes
-        raise Diverged(f"the loop is unstable, its slopes grow without bounds: {LOWER}", None)
+        raise Diverged(f"the loop is unstable, its slopes diverge: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
 
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """A plant made ready to be advanced many times with other parameters and states, one at a time."""
+    """A plant prepared for single steps with varying parameters and states."""
 
     parts: Packed
     layout: Packed
@@ -130,7 +130,7 @@ class Stepper:
 
 
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
+    """Return a plant prepared for single steps, with slopes by the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
     return Stepper(packed(plant), (*layout_of(plant), find))
@@ -142,7 +142,7 @@ SHARES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class BelievedRobot:
-    """A problem's columns as parameters of a robot.
+    """Robot model whose parameters are a problem's columns.
 
     Attributes:
         model: with richer friction, where the problem has any.
@@ -155,20 +155,20 @@ class BelievedRobot:
     plant: Plant
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Plant:
-        """Return the robot with the problem's parameters (p,), without payloads that the case does not carry."""
+        """Return the robot with the problem's parameters (p,), with the case's payloads only."""
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         return replace(self.plant, parameters=parameters * self.carried(case))
 
     def carried(self, case: Case | None) -> np.ndarray:
-        """Return (plant's parameters,) one for what is on board of a case, zero for payloads that are not."""
+        """Return (plant's parameters,) zero for payloads absent from a case, otherwise one."""
         if case is None:
             return np.ones(len(self.plant.parameters))
         return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
 
 
 def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationModel:
-    """Return the model of a problem, if it is one of motor torques of a serial arm.
+    """Return the model of a problem; refuse other models than motor torques of a serial arm.
 
     Raises:
         UsageError: for another.
@@ -180,7 +180,7 @@ def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationMod
 
 
 def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot:
-    """Return the robot of a problem.
+    """Return the robot model of an identification problem.
 
     Raises:
         UsageError: for a model that is no serial arm with motor torques.
@@ -193,7 +193,7 @@ def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot
 
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
-    """Return a problem's model with its richer friction, and the place (p,) of each of its columns there."""
+    """Return a problem's model with its richer friction, and the index (p,) of each problem column in it."""
     extra = [one for one in problem.terms[problem.base.b :] if one is not None]
     model = model.with_terms(*extra)
     return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
@@ -206,7 +206,7 @@ def start_of(
     inertia: np.ndarray,
     simulated: Callable[[np.ndarray], object],
 ) -> np.ndarray:
-    """Return values (p,) to start from: those stated, or those nearest to least squares that can be simulated.
+    """Return initial parameter values (p,): those stated, or those nearest to least squares that can be simulated.
 
     Args:
         method: name of the one that simulates.
@@ -237,11 +237,11 @@ def start_of(
             failure = failure or error
         else:
             return values
-    raise CannotSimulate(f"no robot between least squares and a regular one can be simulated: {failure}", plain)
+    raise CannotSimulate(f"no simulable robot between least squares and regular inertias: {failure}", plain)
 
 
 def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
-    """Return parameters (p,) of bodies with this inertia about their joint's axis alone, or this mass along it."""
+    """Return parameters (p,) of bodies with only this inertia about the joint axis, or this mass along it."""
     result = np.zeros(model.p)
     for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
         if coordinate >= 0:

@@ -1,4 +1,4 @@
-"""Compiled tangents of the closed loop (numba): what a simulated motion changes by per unit of each parameter.
+"""Compiled tangents of the closed loop (numba): derivatives of a simulated motion by each parameter.
 
 The exact derivative of what `loop_kernels` computes, step by step. With K = ∂tau/∂q, D = ∂tau/∂v and Y = ∂tau/∂χ of the
 inverse dynamics at a state and its accelerations,
@@ -290,7 +290,7 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
 def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
 ):  # fmt: skip
-    """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; slopes[0] are not known."""
+    """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; slopes[0] is not used."""
     tree, body, linear, kinds, acts = plant
     own, more, ten, by_q, by_v, columns, at, rate, dat, drate = rooms
     n, c = dq.shape
@@ -341,7 +341,7 @@ def _advance_tangent(
 
 @njit(**OPTIONS)
 def _workspace(bodies, n, c):
-    """Return the arrays that `_advance_tangent` works in."""
+    """Return the work arrays of `_advance_tangent`."""
     own, more, ten = np.empty((bodies, 10)), np.empty((bodies + 1, 36)), np.empty(10)
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
     return own, more, ten, square[0], square[1], wide, np.empty(n), np.empty(n), np.empty((n, c)), np.empty((n, c))
@@ -424,7 +424,7 @@ def _command_tangent(
 def closed_loop_tangent(
     plant, layout, model, gains, relative, reference, push, period, smoothing, late, every, q, v, count, out, dout
 ):  # fmt: skip
-    """Run the loop of `loop_kernels.closed_loop` without noise, with its tangents. Return (status, period reached).
+    """Write the noise-free motion of `loop_kernels.closed_loop` with its tangents. Return (status, period reached).
 
     relative (n, c): slopes of the gains' common factor, joint by joint, over that factor; zero for gains that stay.
     `out` (3, M, n): q, v, torque; `dout` (3, M, n, c) their tangents, every `every` periods.

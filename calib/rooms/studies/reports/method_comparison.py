@@ -1,4 +1,4 @@
-"""``calib compare``: every method on the same recordings, ranked by what they predict of other motion.
+"""``calib compare``: all methods on the same recordings, ranked by their error on unseen motion.
 
 All estimate the same columns (base parameters and standard friction, unless another is asked for), each as
 `calib identify --method` does it: wls regularises what the motion does not identify towards a prior. Errors are
@@ -40,7 +40,7 @@ NO_MODEL = 100.0  # error [%] of predicting no torque at all
 
 @dataclass(frozen=True)
 class ComparedMethod:
-    """One method.
+    """Result of one method.
 
     Attributes:
         name: of it.
@@ -92,7 +92,7 @@ def compare_methods(
     inputs: IdentificationInputs, methods: Sequence[str] | None = None, friction: str = "standard",
     say: Callable[[str], None] = lambda words: None, each: Callable[[ComparedMethod], None] = lambda one: None,
 ) -> list[ComparedMethod]:  # fmt: skip
-    """Return every method on these recordings, best first; those that failed, or that lack a [loop], last.
+    """Return the results of all methods on the recordings, best first; those that failed or need a [loop] last.
 
     Args:
         inputs: training recordings, and unseen ones.
@@ -105,7 +105,7 @@ def compare_methods(
         UsageError: where no recording is unseen, or one overlaps the training recordings; where a name is none of
             a method.
     """
-    require(inputs.unseen, "methods are ranked by motion that none has seen: give some with --validate", UsageError)
+    require(inputs.unseen, "methods are ranked on unseen motion: give a recording with --validate", UsageError)
     if shared := overlaps(inputs.cases, inputs.unseen):
         raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
     repeated = repeated_motion(inputs.cases, inputs.unseen)
@@ -142,22 +142,22 @@ def compare_methods(
 
 
 def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> list[str]:
-    """Return what a user should know of a ranking, and why none is to be taken where none is."""
+    """Return notes on a ranking, and the reason if no method is recommended."""
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
     notes += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
-        notes.append("none to take: give motion that is no repeat with --validate")
+        notes.append("none recommended: give motion that is no repeat with --validate")
     elif repeated:
-        notes.append(f"left out of the ranking: {', '.join(repeated)}")
+        notes.append(f"excluded from the ranking: {', '.join(repeated)}")
     judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
     if found and found[0].unseen >= NO_MODEL:
         notes.append(
-            f"none to take: the best is off by {found[0].unseen:.3g} % on unseen motion, no model by {NO_MODEL:g} %: "
+            f"none recommended: error of the best {found[0].unseen:.3g} % on unseen motion, no model {NO_MODEL:g} %: "
             "add training motion"
         )
     elif judged_one is not None:
-        notes.append(f"none to take: calib identify fails the model of {judged_one.name}, for the reason below")
+        notes.append(f"none recommended: the model of {judged_one.name} fails in calib identify, see the reason below")
     return list(dict.fromkeys(notes))
 
 
@@ -166,7 +166,7 @@ def _said(say: Callable[[str], None], name: str, words: str) -> None:
 
 
 def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
-    """Return the options' settings without what another method alone knows."""
+    """Return the options' settings that apply to a method."""
     settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
     if not method.takes_constraints:
         settings = replace(settings, constraints=None)
@@ -178,7 +178,7 @@ def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> Id
 def _held(
     one: ComparedMethod, inputs: IdentificationInputs, found: Identification, proven: bool, say: Callable[[str], None]
 ) -> ComparedMethod:
-    """Return the method that the rule comes to with the verdict on its model, to be taken where nothing speaks against.
+    """Return the method selected by the rule with its model's verdict, recommended unless the verdict is fail.
 
     Args:
         proven: whether the recordings are motion that it has not seen.
@@ -196,7 +196,7 @@ def _held(
 def _errors(
     found: Identification, inputs: IdentificationInputs, same_unit: np.ndarray
 ) -> tuple[ComparedMethod, _Sums]:  # fmt: skip
-    """Return a method's errors; nothing of other methods yet."""
+    """Return a method's errors, before the comparison with other methods."""
     unseen, training = (_sums(found, cases) for cases in (inputs.unseen, inputs.cases))
     joints = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
     worst = int(np.argmax(np.where(same_unit, joints, -1.0)))
@@ -243,7 +243,7 @@ def _jackknife(each: np.ndarray) -> float:
 
 
 def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
-    """Return the methods by rank; chosen is the first fast one among the good, whatever its verdict will be."""
+    """Return the methods by rank; chosen is the first fast one among the good, regardless of its verdict."""
     if not done:
         return []
     order = sorted(done, key=lambda pair: pair[0].unseen)
@@ -301,13 +301,13 @@ COLUMNS = (
 
 
 def line(one: ComparedMethod) -> str:
-    """Return what is known of a method before the others are done."""
-    words = one.failure or f"{one.unseen:.3g} % on other motion, {one.seconds:.2g} s"
+    """Return a line on a method's result before the ranking."""
+    words = one.failure or f"{one.unseen:.3g} % on unseen motion, {one.seconds:.2g} s"
     return f"{one.name}: {words}"
 
 
 def section(found: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
-    """Return the table, what a user should know, and the verdict on the model of the method that the rule comes to."""
+    """Return a report section: the table, notes, and the verdict on the selected method's model."""
     own = next((one for one in found if one.verdict is not None), None)
     shown = (*_blocks(found), Text("", notes, "note"))
     if own is None or own.verdict is None:
@@ -316,7 +316,7 @@ def section(found: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
 
 
 def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
-    """Yield the ranked table, and why methods are not in it."""
+    """Yield the ranked table, and the reasons for excluded methods."""
     good = [one for one in found if not one.failure]
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "

@@ -80,8 +80,8 @@ RULE = (
 )
 MEANING = (
     "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
-    "β: 100 ‖β̂ - β‖ / ‖β‖ of the base parameters; in σ: rms of their errors in stated standard deviations (1 where "
-    "these tell the error); covered: share within 1.96 σ (95 % where they do).",
+    "β: 100 ‖β̂ - β‖ / ‖β‖ of the base parameters; in σ: rms of their errors in stated standard deviations (1 if "
+    "these are right); covered: share within 1.96 σ (95 % if they are right).",
     "d_τ, d_q: the survey's figures, on the data set itself. d_τ compares with noisy torque, and has a floor that no "
     "method goes below: it cannot rank.",
     "All are medians over trials; CPU is processor time of the method alone; p is the sign test's against the best.",
@@ -131,7 +131,7 @@ ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered 
 
 
 def overview(conditions: Sequence[ConditionSummary]) -> Table:
-    """Return what to take on each condition."""
+    """Return the recommended method of each condition."""
     lines = []
     for one in conditions:
         if not one.methods:
@@ -174,7 +174,7 @@ def _median_cell(one: MethodSummary | None) -> str:
 
 
 def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
-    """Return why there is no method to take, and on which conditions."""
+    """Return the reasons for conditions without a recommended method."""
     found: dict[str, list[str]] = {}
     for one in conditions:
         if why := one.why_none:
@@ -186,7 +186,7 @@ def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
 
 
 def _described(one: Condition) -> str:
-    """Return a condition in a line."""
+    """Return a one-line description of a condition."""
     filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
     wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
     degrees = math.degrees(one.sigma_q)
@@ -194,7 +194,7 @@ def _described(one: Condition) -> str:
 
 
 def condition_table(one: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:
-    """Return all methods of a condition, best first; by default the columns that a terminal has room for."""
+    """Return a table of all methods of a condition, best first, by default with the columns for a terminal."""
     columns = [column for column in COLUMNS if column.name in names]
     title = f"Methods on {one.condition.name}"
     return table(title, columns, one.methods, _described(one.condition), lambda method: method.chosen)
@@ -265,7 +265,7 @@ OURS = (JOURNAL, WHOLE, LOCK, SUMMARY, REPORT)
 
 @dataclass(frozen=True)
 class StudyOutcome:
-    """What a study comes to.
+    """Result of a study.
 
     Attributes:
         study: what was asked.
@@ -284,7 +284,7 @@ class StudyOutcome:
     rows: str = ""
 
     def described(self) -> list[str]:
-        """Return what a command says of itself at its end."""
+        """Return the closing message of a command."""
         done = self.progress
         lines = [f"note: {note}" for note in self.notes]
         if done.wanted:
@@ -303,7 +303,7 @@ def run_study(
     plots: bool = True,
     say: Callable[[str], None] = lambda words: None,
 ) -> StudyOutcome:
-    """Run what a study lacks, and write its report.
+    """Run the missing trials of a study, and write its report.
 
     Args:
         named: study files, names of shipped ones, patterns of these.
@@ -327,7 +327,7 @@ def run_study(
     else:
         with opened(out) as store:
             if store.dropped:
-                notes.append(f"{store.dropped} half-written line was taken off: its trial is run again")
+                notes.append(f"{store.dropped} half-written line was removed: its trial is run again")
             say(f"{len(store.rows)} rows are there")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda found: say(str(found)))
@@ -340,10 +340,10 @@ def run_study(
     others, changed = len(kept) - len(own), Counter(row.method for row in own if not row.current)
     own = [row for row in own if row.current]
     if others:
-        notes.append(f"{others} rows are of conditions that are not of this study: kept, and not counted")
+        notes.append(f"{others} rows belong to conditions outside this study: kept, but not counted")
     if changed:
         named_rows = ", ".join(f"{count} of {name}" for name, count in changed.items())
-        words = "rows of methods that have changed since they ran do not count until they are run again"
+        words = "rows of methods changed since their run do not count until they are run again"
         notes.append(f"{words}: {named_rows}")
     if not progress.lost and not own:
         there = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
@@ -355,7 +355,7 @@ def run_study(
     if versions := sorted({row.toolkit for row in own}):
         notes += [f"rows were made by several versions: {', '.join(versions)}"] if len(versions) > 1 else []
     if progress.lost:
-        notes.append(f"{progress.lost} trials were lost with their workers: the same command runs them again")
+        notes.append(f"{progress.lost} trials were lost with their workers; run the same command again")
     conditions = tuple(summary.summarise(study, own))
     notes += reasons(conditions)
     header, lines = summary_table(conditions)
@@ -366,14 +366,14 @@ def run_study(
 
 
 def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
-    """Refuse, before any work is done, a folder that holds other files of these names, or a file."""
-    require(not out.is_file(), f"{out} is a file; a study's rows go into a folder (--out)", UsageError)
+    """Refuse, before any work, a file as output folder, or a folder with other files of these names."""
+    require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], named)
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
     if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
-        raise UsageError(f"{out} holds {', '.join(foreign)} which no study left there; choose another (--out)")
+        raise UsageError(f"{out} contains {', '.join(foreign)}, not written by a study; choose another folder (--out)")
 
 
 def study_lines() -> list[str]:
-    """Return a line per shipped study."""
+    """Return one line on each shipped study."""
     return [f"{name:16} {read_study([path]).about}" for name, path in shipped().items()]
