@@ -147,17 +147,17 @@ def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> li
     notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
     notes += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
-        notes.append("none recommended: give motion that is no repeat with --validate")
+        notes.append("none to take: give motion that is no repeat with --validate")
     elif repeated:
         notes.append(f"excluded from the ranking: {', '.join(repeated)}")
     judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
     if found and found[0].unseen >= NO_MODEL:
         notes.append(
-            f"none recommended: error of the best {found[0].unseen:.3g} % on unseen motion, no model {NO_MODEL:g} %: "
+            f"none to take: error of the best {found[0].unseen:.3g} % on unseen motion, no model {NO_MODEL:g} %: "
             "add training motion"
         )
     elif judged_one is not None:
-        notes.append(f"none recommended: the model of {judged_one.name} fails in calib identify, see the reason below")
+        notes.append(f"none to take: the model of {judged_one.name} fails in calib identify, see the reason below")
     return list(dict.fromkeys(notes))
 
 
