@@ -36,8 +36,8 @@ class Base:
         standard: names of the p parameters of the model.
         standard_units: their units.
         split: the kept and dropped columns, K = ``split.coefficients``, singular values and their gap.
-        remainder: (p - b,) what K leaves of each dropped column, relative to its norm: rounding on the chain the
-            columns were chosen on, more after `regroup`.
+        remainder: (p - b,) remainder of each dropped column after K, relative to its norm: rounding error on the
+            original chain, more after `regroup`.
         lost: (p - b,) the same as a torque: rms over the samples' rows per unit of the parameter [N m or N per unit].
     """
 
@@ -156,11 +156,11 @@ def find(
     """Return the base parameters of a model: independent columns of its regressor.
 
     Args:
-        samples: states to compare columns over; default `random_samples`. Recorded motion says what that motion
-            identifies instead of what any motion could.
+        samples: states to compare columns over; default `random_samples`. With recorded motion: the parameters that
+            this motion identifies.
         loads: the load cases stacked, each as `carried` of the regressor; default with all payloads and without, if
             the model has any.
-        tolerance: a column counts where, at unit norm, more than this of it is independent of the columns before.
+        tolerance: minimum part of a column of unit norm that is independent of the columns before.
     """
     samples = random_samples(model) if samples is None else samples
     cases = model.load_cases() if loads is None else loads

@@ -29,7 +29,7 @@ class Bodies:
     """B rigid bodies with n coordinates, ordered with parents before children.
 
     Attributes:
-        labels: (B,) what a body's parameters are numbered with: ``ZZ3`` belongs to body ``3``.
+        labels: (B,) suffix of a body's parameters: ``ZZ3`` belongs to body ``3``.
         parents: (B,) index of the parent body, -1 for the base.
         kinds: (B,) `FIXED`, `REVOLUTE` or `PRISMATIC`.
         axes: (B,) 0, 1, 2 for x, y, z of the body's own frame.
@@ -41,7 +41,7 @@ class Bodies:
         links: (B, 4 + n) parent, kind, coordinate, depth and path of every body, for the kernels.
         constants: (B + 1, 13) the first three rows of every placement, between frames turned so that each moving axis
             is z, and the scale; gravity in the last row; for the kernels.
-        order: (B, 10) where the parameters of the turned frames stand in `STANDARD`.
+        order: (B, 10) indices in `STANDARD` of the parameters in the kernels' frames.
     """
 
     labels: tuple[str, ...]
@@ -146,7 +146,7 @@ def standard_parameters(chain: Chain) -> np.ndarray:
         RobotError: where the chain has no inertias.
     """
     if chain.inertias is None:
-        raise RobotError(f"robot '{chain.name}'has no masses; add 'inertia' to its joints")
+        raise RobotError(f"robot '{chain.name}' has no masses; add 'inertia' to its joints")
     bodies = bodies_of(chain)
     result = np.zeros((bodies.count, 10))
     for row, label in enumerate(bodies.labels):

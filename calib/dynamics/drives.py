@@ -29,8 +29,7 @@ class DriveTerm:
     Attributes:
         name: of its parameter, e.g. ``Fc3``.
         shape: a key of `SHAPES`.
-        acts: pairs (torque row, motion seen there), the motion as pairs (joint, weight); empty for a parameter without
-            any effect.
+        acts: pairs (torque row, motion), the motion as pairs (joint, weight); empty for a parameter without effect.
         settings: the numbers that the shape needs; an ``edge`` may be omitted.
         side: "link" or "motor" of a joint torque sensor; without such a sensor all terms are on the motor side.
         linear: whether the joint is prismatic (units).
@@ -179,7 +178,7 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
     """Write the columns of terms into out (k, n, N), which must be zero.
 
     Args:
-        motions: q, v, a, load, each (n, N), load None where unknown.
+        motions: q, v, a, load, each (n, N), load None if unknown.
         states: (s, N), see `friction_states`.
     """
     state = 0

@@ -298,7 +298,7 @@ def from_chain(
     """
     each = [sets] * chain.n if isinstance(sets, str) else list(sets)
     if len(each) != chain.n:
-        raise CalibError(f"robot '{chain.name}' has {chain.n} joints, but drive sets are given for {len(each)}")
+        raise CalibError(f"robot '{chain.name}' has {chain.n} joints, but drive terms are given for {len(each)}")
     bodies = bodies_of(chain)
     bodies = bodies if payload is None else with_payload(bodies, payload)
     linear = [joint.kind == "prismatic" for joint in chain.joints]

@@ -44,12 +44,12 @@ class RegressorModel(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(p,) of the parameters."""
+        """Names of the parameters (p,)."""
         ...
 
     @property
     def units(self) -> tuple[str, ...]:
-        """(p,) of the parameters."""
+        """Units of the parameters (p,)."""
         ...
 
     @property

@@ -56,10 +56,10 @@ class Shape:
     Attributes:
         unit: of the parameter for a revolute joint, and `unit_linear` for a prismatic one.
         settings: names of the numbers it needs, with units; ``v0`` smooths Coulomb's sign.
-        slopes: whether it has any (it has none where it depends on the past or on torques).
+        slopes: whether it has derivatives (none if it depends on past motion or torques).
         loaded, remembers: whether it needs `Joined.load`, `Joined.state`.
         friction: whether it depends on speed; else a motion along a path is affine in it.
-        dissipative: friction, which takes energy out of the joint where its parameter is above zero.
+        dissipative: whether it is friction, which dissipates energy for a positive parameter.
         of_velocity: whether it is a function of v alone (a constant is one).
         nonnegative: whether its parameter is above zero in every robot: inertia, viscous and Coulomb friction.
         exact: whether its columns are free of the noise of q, v and a: ones, and signs but for reversals.

@@ -63,7 +63,7 @@ class TorqueRows:
     """Definition of the torques that a model explains, for any number of joints.
 
     Attributes:
-        name: what options and files call them.
+        name: name in options and files.
         blocks: one row per joint each.
         drives: standard drive terms of a joint that such rows distinguish (`calib.dynamics.drives.standard`).
         projection: a map of the blocks' rows; None: the blocks themselves.

@@ -196,8 +196,8 @@ class Constrained:
     Attributes:
         values: (p,) b.
         multipliers: (c,) μ of the constraints, >= 0 but for equalities.
-        slack: (c,) what bounds leave, and smallest eigenvalues above their least.
-        binding: (c,) bool; where the data want to go on, symptom of a constraint too tight or of a biased estimate.
+        slack: (c,) distances to the bounds, and smallest eigenvalues minus their limit.
+        binding: (c,) bool; active constraints, a symptom of a constraint too tight or of a biased estimate.
         normals: (c, p) slopes of the slack at the optimum; of a matrix that binds <A, Z> / trace Z, Z its multiplier.
     """
 
@@ -223,7 +223,7 @@ def within(
         matrices: that must be positive definite; None: none.
 
     Raises:
-        CalibError: for crossed bounds, and for equalities that contradict each other or leave nothing to estimate.
+        CalibError: for crossed bounds, and for equalities that contradict each other or fix all parameters.
         NotConverged: where inequalities contradict each other, or no point makes the matrices definite.
     """
     p = len(factor) - 1

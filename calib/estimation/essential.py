@@ -56,8 +56,8 @@ class Elimination:
     Attributes:
         base, essential: the fit before and after, with the same weights for the rows.
         kept: (b_e,) indices of the essential columns.
-        steps: those left out, in order.
-        refused: the step that was not made and ended the elimination; None where nothing was left to leave out.
+        steps: dropped parameters, in order.
+        refused: the rejected step that ended the elimination; None if all candidates were dropped.
     """
 
     base: LinearFit
@@ -91,10 +91,10 @@ def eliminate(
         rule: see `Rule`.
         ratio: r_σ.
         level: probability of keeping a parameter that is zero, per step.
-        keep: names never left out.
-        drop: names left out first, whatever the rule says.
-        std: (g,) of the groups; None: settled on the base model, then held.
-        inflation: (g,) see `linear`; without it autocorrelated residuals keep too many.
+        keep: names of parameters that are never dropped.
+        drop: names of parameters dropped first, whatever the rule.
+        std: (g,) of the groups; None: converged on the base model, then kept.
+        inflation: (g,) see `linear`; without it too many parameters are kept for autocorrelated residuals.
     """
     _check_lists(data.names, keep, drop)
     sigma = settled_std(data) if std is None else np.asarray(std, dtype=float)

@@ -28,12 +28,12 @@ class Estimate(Frozen):
 
     @property
     def sigma(self) -> np.ndarray:
-        """(p,) standard deviations."""
+        """Standard deviations (p,)."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     @property
     def rsd(self) -> np.ndarray:
-        """(p,) relative standard deviations 100 σ / |value| [%]; infinite at zero."""
+        """Relative standard deviations (p,) 100 σ / |value| [%]; infinite at zero."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.values == 0.0, np.inf, 100.0 * self.sigma / np.abs(self.values))
 

@@ -103,7 +103,7 @@ class Instruments:
 
         Args:
             std: as in `iv`.
-            fit: what `iv` made of them.
+            fit: the result of `iv`.
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
@@ -155,7 +155,7 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
 
     Args:
         problem: triangles of [Z W y].
-        std: (g,) of the groups; None: alike. Those of the weighted least squares of W are the usual choice.
+        std: (g,) of the groups; None: equal. Those of the weighted least squares of W are the usual choice.
         inflation: >= 1, see `linear`; one number for all groups.
 
     Raises:

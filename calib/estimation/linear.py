@@ -69,7 +69,7 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
     Args:
         data: triangles of W and y.
         mean: (p,).
-        covariance: (p, p); an infinite diagonal entry says that nothing is known beforehand.
+        covariance: (p, p); an infinite diagonal entry means no prior knowledge.
         std: (g,) noise of each group in units of y; None: `settled_std` of the data, which must then determine x alone.
     """
     p = data.parameters
@@ -154,7 +154,7 @@ def _pack(
         advice = "record longer or estimate fewer parameters"
         if independent > data.parameters:  # the rows would do: what is left of them is no noise
             advice = (
-                "the residuals of neighbouring rows are strongly correlated, as for the model of another robot or for "
+                "the residuals of neighbouring rows are strongly correlated, as with another robot's model or "
                 "swapped columns; check both, then record longer"
             )
         raise Unidentifiable(

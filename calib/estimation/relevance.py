@@ -66,8 +66,8 @@ class Condensed:
         groups: (r,) group of each coordinate; -1 for no ridge.
         sizes: (r,) first guess of its prior standard deviation, one per group.
         counts: (r,) how many columns of x it stands for.
-        blocks: columns of x, and what they are in the coordinates that follow one another (columns, coordinates);
-            None where each stays as it is.
+        blocks: columns of x, and their matrix (columns, coordinates) in consecutive coordinates; None for unchanged
+            columns.
     """
 
     groups: np.ndarray
@@ -135,8 +135,8 @@ def relevance(
         start: (p,) first guess of each column's prior standard deviation, one per group (`condensed` for others); read
             where there is a ridge.
         iterations: of the fixed point, at most.
-        settled: it ends where values move by less than this share of their standard deviations, rms (`SETTLED`);
-            0: never before.
+        settled: the search ends when values change by less than this share of their standard deviations, rms
+            (`SETTLED`); 0: never early.
         counts: (p,) how many columns each stands for (`Condensed`); None for one.
     """
     counts = np.ones(len(groups)) if counts is None else counts

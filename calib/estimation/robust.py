@@ -24,7 +24,7 @@ def variance_weights(
     Args:
         squares: (m,) squared errors.
         shapes: (m, k) columns whose non-negative combination is the variance; not negative.
-        start: (k,) not negative; what is zero stays.
+        start: (k,) not negative; zeros stay zero.
         counts: (m,) how many errors each is worth.
         rounds: of the fixed point; fewer will do from weights of nearly the same errors.
     """

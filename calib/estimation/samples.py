@@ -116,8 +116,8 @@ def irls(
         data, noise, inflation: as in `gls`.
         loss: one of `robust.LOSSES`.
         gate: probability of a good sample to stay in; None: no gate.
-        solve: triangle [R z; 0 ρ] of a round -> its x (p,); None: that of least squares. Others keep x within
-            constraints, of which the covariance then says nothing.
+        solve: triangle [R z; 0 ρ] of a round -> its x (p,); None: that of least squares. Other functions keep x within
+            constraints; the covariance ignores these.
     """
     return _iterate(data, row_irls(data), loss, gate, noise, inflation, solve)
 

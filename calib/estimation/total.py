@@ -30,11 +30,11 @@ def tls(
         data: triangles of W and y.
         noise: (p + 1,) standard deviation of the noise in each column and in y, in their units, up to one common
             factor; zero for exact ones.
-        std: (g,) factor by which the noise of each group of rows exceeds `noise`; None: alike.
+        std: (g,) factor by which the noise of each group of rows exceeds `noise`; None: one.
         inflation: (g,) >= 1, τ, see `linear`; None: every row counts.
 
     Raises:
-        Unidentifiable: where the noise, not the data, decides on the solution.
+        Unidentifiable: if the noise, not the data, determines the solution.
     """
     p, count = data.parameters, int(data.rows.sum())
     noise = shaped(noise, (p + 1,), "noise of the columns and of y")

@@ -78,10 +78,10 @@ def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.nd
     Columns that are zero in all rows of a group (a joint does not feel the links before it) cost nothing.
 
     Args:
-        data: what was absorbed before.
+        data: triangles of the previous rows.
         matrix: (r, p) rows of W.
         target: (r,) rows of y.
-        group: (r,) integers saying whose rows they are, or one integer for all.
+        group: (r,) group index of each row, or one integer for all.
     """
     matrix = shaped(matrix, (None, data.parameters), "observation matrix W")
     target = shaped(target, (len(matrix),), "target y")

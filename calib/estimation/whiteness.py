@@ -37,7 +37,7 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
 
     Args:
         residual: (N,) with N > lags and N >= 20.
-        lags: autocorrelations looked at.
+        lags: number of autocorrelations.
     """
     x = shaped(residual, (None,), "residuals")
     if len(x) < max(lags + 1, 20):

@@ -118,7 +118,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
 
     Args:
         chain: the nominal arm.
-        block: of any kind; only full poses are looked at.
+        block: measurements of any kind; only full poses are checked.
 
     Raises:
         MeasurementError: if the orientations contradict the arm as read, and agree in another reading.

@@ -48,10 +48,10 @@ def fit(
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
-        drawn: keep all independent parameters, regularised towards their nominal as strongly as the data themselves say
-            (`_shrunk_fit`), in place of sending the unidentified ones back.
-        prior: standard deviations of the whole parameter vector about its present values, where something is known
-            beforehand; infinite elsewhere. Parameters with a prior always take part.
+        drawn: keep all independent parameters, regularised towards nominal with the most probable strength
+            (`_shrunk_fit`), instead of fixing the unidentified ones at nominal.
+        prior: prior standard deviations of the whole parameter vector about its present values; infinite without a
+            prior. Parameters with a prior are always fitted.
 
     Raises:
         MeasurementError: fewer rows than unknowns.
@@ -181,7 +181,7 @@ def fit_with_prior(
         free: (f,) positions in the parameter vector.
         prior: (f,) standard deviations; infinite for none.
         settings: see `Settings`.
-        nominal: what the prior draws to; None for `cell`.
+        nominal: mean of the prior; None for `cell`.
     """
     settings = settings or Settings()
     weigher = Weigher(settings, nominal or cell, blocks, free, prior)
@@ -268,7 +268,8 @@ def without_corrections(
 
     Args:
         cell: the calibrated installation.
-        rigid: the best geometry without corrections; that inside `cell` is good only together with them.
+        rigid: the best geometry without corrections; the geometry in `cell` is valid only together with its
+            corrections.
         blocks: the fit's rows.
         settings: of the fit.
     """

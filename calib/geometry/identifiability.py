@@ -103,7 +103,7 @@ def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str
 
 
 def _orientation_range(found: GeometricFit) -> float | None:
-    """Return the 95 % range of the flange's orientation over the poses an instrument saw [deg]; None without any."""
+    """Return the 95 % range of the flange's orientation over an instrument's poses [deg]; None without poses."""
     q = [block.measured.q for block in found.blocks if block.measured.has_instrument]
     if not q:
         return None

@@ -61,16 +61,16 @@ class NoOptics:
 
 @dataclass(frozen=True, eq=False)
 class Installation:
-    """T_i = station_{s(i)} · arm(q_i + deflection) · tool_{t(i)}.
+    """An arm in a cell, with target poses T_i = station_{s(i)} · arm(q_i + deflection) · tool_{t(i)}.
 
     Attributes:
         chain: the arm, base to tip.
         stations: (S, 4, 4) poses of the arm's base in each instrument's frame.
         tools: (T, 4, 4) poses of each target in the tip's frame.
         station_names, tool_names: S and T strings.
-        deflection: what q does not say (stiffness, coupling, harmonics), to be fitted.
-        known: deflections found earlier, which stay as they are.
-        optics: cameras and boards, where images were taken: parameters with what `NoOptics` has.
+        deflection: joint corrections as functions of q (stiffness, coupling, harmonics), to be fitted.
+        known: deflections of an earlier fit, kept fixed.
+        optics: parameters of cameras and boards for images, with the interface of `NoOptics`.
     """
 
     chain: Chain

@@ -33,9 +33,9 @@ class Goal:
 
     Attributes:
         cell: the arm with one station and one tool; targets are the tool's poses in the station's frame.
-        dof: 6; 5 where the turn about the tool's z axis is free; 3 where only the position counts.
+        dof: 6; 5 if the rotation about the tool's z axis is free; 3 for the position only.
         lower, upper: (n,) limits [rad or m]; infinite for none.
-        torques: gravity torques (m, n) [N m] at joint values (m, n), where a deflection needs them.
+        torques: function from joint values (m, n) to gravity torques (m, n) [N m], if a deflection needs them.
     """
 
     cell: Installation

@@ -30,8 +30,8 @@ class Observation:
 
     Attributes:
         cell: the nominal arm, its base at the instrument's origin, with its targets; rigid.
-        full: whether orientations are seen, too: six rows per target, not three.
-        free: (p,) the parameters that such measurements can identify, in the full vector.
+        full: whether orientations are measured, too: six rows per target instead of three.
+        free: (p,) indices of the identifiable parameters in the full vector.
         sigmas: of a position [m] and of an orientation [rad].
     """
 

@@ -23,7 +23,7 @@ class Block:
 
     Attributes:
         measured: m rows.
-        station: index of their station; -1 for kinds without an instrument, which are seen from the arm's base.
+        station: index of their station; -1 for kinds without an instrument, which refer to the arm's base.
         tool: (m,) index of each row's target among the installation's tools.
         torque: (m, n) gravity torques [N m], or None.
         bases: (E, m) the deflection's bases, evaluated once.
@@ -41,7 +41,7 @@ class Block:
 def prepare(
     cell: Installation, measured: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None] | None = None
 ) -> list[Block]:
-    """Match measurements to the installation's stations and tools by name, and evaluate the deflection's bases.
+    """Return blocks of measurements matched to stations and tools by name, with evaluated deflection bases.
 
     Raises:
         UsageError: for a station or tool the installation does not have.
@@ -115,7 +115,7 @@ def target_jacobian(
 
 
 def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
-    """Fill the column (6, m) of one displacement of a station, applied in the station's fitted frame."""
+    """Fill the column (6, m) of a unit displacement of a station along or about one of its own axes."""
     direction = placement[:3, axis % 3]
     if axis < 3:
         column[:3] = direction[:, None]
@@ -156,7 +156,7 @@ def pose_sigmas(
         free: (f,) positions in the parameter vector (`calib.geometry.parameters`).
         covariance: (f, f) of steps along them.
         torque: (m, n) gravity torques [N m], for compliance terms.
-        station: seen from which station; -1 for the arm's base.
+        station: index of the station of reference; -1 for the arm's base.
         tool: which of its tools, one or (m,).
     """
     values, vectors = np.linalg.eigh(covariance)

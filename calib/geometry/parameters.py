@@ -69,7 +69,7 @@ class ParameterLayout:
         """
         table = {name: k for k, name in enumerate(self.names)}
         for name in names:
-            require(name in table, f"no geometric parameter '{name}'; there are {', '.join(self.names)}", UsageError)
+            require(name in table, f"unknown parameter '{name}'; expected one of {', '.join(self.names)}", UsageError)
         return np.array([table[name] for name in names], dtype=int)
 
 

@@ -28,10 +28,10 @@ class Part:
         label: ``position``, ``orientation``, ``consistency``, ``distance``, ``plane`` or ``pixel``.
         value: (rows, m) [m] or [rad].
         jacobian: (f, rows, m) derivative of the prediction.
-        sigma: (rows, m) stated standard deviations; None where they are to be estimated.
+        sigma: (rows, m) stated standard deviations; None if they are to be estimated.
         nuisances: unknowns that were eliminated.
         index: (m,) the measurement's rows these residuals belong to.
-        noise: errors that rows have in common, as `fill` whitens by, see `common_noise`; None for none.
+        noise: common errors of rows, used by `fill` for whitening, see `common_noise`; None without.
     """
 
     label: str
@@ -83,7 +83,7 @@ class Part:
             sigma: (rows, m) standard deviations.
             unknowns: parameters fitted to the residuals.
             loss, scale: of a robust fit.
-            start: whether a fit begins here, where residuals do not yet show what they have in common.
+            start: whether a fit begins here, before residuals show their common errors.
         """
         return None
 

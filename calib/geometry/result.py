@@ -44,8 +44,8 @@ class GeometricFit:
         free: (f,) positions of the fitted parameters in the full vector (`calib.geometry.parameters`).
         estimate: values and covariance of the fitted parameters; stations and tools as displacements from the fitted
             placement, hence with value 0.
-        split: which candidate columns were kept; None where the caller named the free ones.
-        candidates: what ``split`` indexes.
+        split: which candidate columns were kept; None if the caller chose the free parameters.
+        candidates: parameters to which the indices of ``split`` refer.
         solution: the last Levenberg–Marquardt pass.
         blocks: the prepared measurements.
         pieces: their residual parts at the solution.
@@ -112,7 +112,7 @@ def calibrated_chain(
 
     Args:
         found: the fit that predicts best.
-        rigid: the best fit without joint corrections; None where `found` has none.
+        rigid: the best fit without joint corrections; None if `found` has no corrections.
         nominal: the arm before any calibration; None for the one that the fit began with.
 
     Raises:

@@ -135,7 +135,7 @@ def test_model_of_a_chain():
     assert model.names[-10:] == ("Ia1", "Fc1", "Ia2", "Fc2", "Ia3", "Fc3", "Ia4", "Fc4", "Ia5", "Fc5")
     assert model.units[-8:-6] == ("kg", "N") and model.names[50] == "XX6"
     assert from_chain(TX40, ["Ia"] * 5 + [""]).p == 65
-    with pytest.raises(CalibError, match="has 6 joints, but drive sets are given for 2"):
+    with pytest.raises(CalibError, match="has 6 joints, but drive terms are given for 2"):
         from_chain(TX40, ["Ia", "Ia"])
 
 

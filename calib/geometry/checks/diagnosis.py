@@ -29,7 +29,7 @@ def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
 
 
 def _setup_change(block: Block, part: Part, max_chance: float = 1e-3, min_ratio: float = 1.6) -> list[Finding]:
-    """Find a change of set-up: compare residuals before and after every cut, by size and ranks (Mann–Whitney).
+    """Return the finding of a changed set-up: residuals before and after every cut differ in size and ranks.
 
     `max_chance`: probability that the same rows in another order show such a change (our choice).
 
@@ -59,9 +59,9 @@ def _setup_change(block: Block, part: Part, max_chance: float = 1e-3, min_ratio:
 
 
 def _systematic(block: Block, part: Part, max_times: float = 5.0) -> list[Finding]:
-    """Compare residuals of neighbouring poses: noise differs between neighbours, a missing effect does not.
+    """Return findings on systematic residuals: noise differs between neighbouring poses, a missing effect does not.
 
-    `max_times`: times a stated uncertainty, or a fraction, that residuals are remarked on from (our choice).
+    `max_times`: factor above a stated uncertainty from which residuals give a finding (our choice).
     """
     floor, rms = neighbour_floor(block.measured.q, part), float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
     stated = None if part.sigma is None else float(np.sqrt(np.mean(np.sum(part.sigma**2, axis=0))))

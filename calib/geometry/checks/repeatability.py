@@ -41,7 +41,7 @@ class Drift:
 
     Attributes:
         poses: pairs of measurements.
-        rms: of the measured points' distances, less what differing joints explain [m].
+        rms: rms distance of the measured points, minus the displacement by differing joint values [m].
     """
 
     poses: int
@@ -65,7 +65,7 @@ def drift_between(chain: Chain, first: Sequence[PoseMeasurements], later: PoseMe
 
     Args:
         chain: the nominal arm.
-        first, later: measured poses or positions; other kinds are left out.
+        first, later: measured poses or positions; other kinds are ignored.
     """
     return _compared(chain, _points(first), _points([later]), own=False)
 
@@ -178,8 +178,8 @@ def repeated_poses(
     """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without such poses.
 
     Args:
-        cells: the nominal and the calibrated arm, whose commands are meant.
-        measured: blocks; those without an instrument say nothing of it.
+        cells: the nominal and the calibrated arm, whose predictions are compared.
+        measured: blocks; those without an instrument are ignored.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
     """
     ready = zip(measured, *(prepare(cell, measured, torques) for cell in cells))
@@ -289,7 +289,7 @@ class _Aside(Protocol):
 
 
 def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> tuple[set[str], list[str]]:
-    """Return unseen files that mostly repeat rows of the fit, and notes on repeated rows.
+    """Return the names of unseen files that mostly repeat rows of the fit, and notes on repeated rows.
 
     Args:
         fit: the fit's blocks.

@@ -81,7 +81,8 @@ class FoldStatistics:
         groups: (E,) ridge group of each term.
         sizes: (E,) first guess of each coefficient.
         coordinates: of geometry and terms, in which the statistics are.
-        plausible: (rigid,) wide prior on the geometry, so that what a fold cannot identify stays at the optimum.
+        plausible: (rigid,) wide prior on the geometry, which keeps parameters that a fold does not identify at the
+            optimum.
         training: per fold, statistics of the other folds' rows, whitened.
         held_out: per fold, statistics of its rows [m], and how many.
         rows: per fold.

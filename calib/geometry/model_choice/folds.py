@@ -21,10 +21,10 @@ class Folds:
     """A partition of the rows of all blocks.
 
     Attributes:
-        kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (one left out) on request.
+        kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (leave-one-out) on request.
         count: number of folds.
         members: per block, (m,) fold of each row.
-        blind: names of what is not left out as a whole, since the rest does not determine where its tool would be.
+        blind: names of groups that are not held out as a whole, since the other rows do not determine their tool.
     """
 
     kind: str
@@ -63,8 +63,8 @@ def divide(
     one orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
 
     Args:
-        scattered: in place of a region leave out every third row of one, for rows that do not determine a tool of their
-            own.
+        scattered: hold out every third row of a region instead of the region, if the other rows do not determine its
+            tool.
     """
     members, count = [np.array(fold) for fold in folds.members], 0
     for fold in range(folds.count):
@@ -148,7 +148,7 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
 
 
 def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
-    """Keep the two rows of a distance in one fold."""
+    """Return the fold of each row, with both rows of a distance in one fold."""
     if not isinstance(block, Distances):
         return fold
     _, first, inverse = np.unique(block.group, return_index=True, return_inverse=True)

@@ -96,8 +96,8 @@ class ModelStep:
     Attributes:
         model: its name, e.g. ``geometry`` or ``+ harmonics``.
         parameters: how many it fits.
-        cross_validated_mm: rms error on unseen rows; None where an earlier version did not keep it.
-        kept: whether the climb goes on from here.
+        cross_validated_mm: rms error on unseen rows; None in files of earlier versions.
+        kept: whether the next steps include it.
         note: why, in words.
         corrections: how many of the parameters are small joint corrections, shrunk by a ridge.
     """
@@ -122,8 +122,8 @@ class ModelSelection:
     Attributes:
         fit: the chosen model, fitted to all rows.
         nominal: the nominal arm with its frames fitted to all rows.
-        rigid: the best fit without effects, to all rows. The geometry inside ``fit`` is good only together with its
-            effects, which trade with it; what has to do without them (a URDF) takes this one.
+        rigid: the best fit without effects, to all rows. The geometry in ``fit`` is valid only together with its
+            effects, with which it is correlated; use this one without effects (for a URDF).
         rungs: all models tried, in order.
         chosen: name of the chosen model, e.g. ``geometry + harmonics``.
         folds: how the unseen rows were set aside.
@@ -176,12 +176,12 @@ def select_model(
     Args:
         cell: nominal arm, frames placed (`calib.geometry.first_guess.install`).
         measured: blocks of measurements.
-        model: ``auto``, or one of `MODELS`: that rung and all below it.
-        settings: of every fit. With loss ``auto``, rows beyond `MAX_RESIDUAL` robust sigmas of the rigid fit turn it
-            into ``cauchy``, for the fits and for the errors on unseen rows alike.
-        torques: gravity torques (m, n) per block [N m]; None where the masses are not known.
+        model: ``auto``, or one of `MODELS`: that step and all before it.
+        settings: of every fit. With loss ``auto``, rows beyond `MAX_RESIDUAL` robust sigmas of the rigid fit change it
+            to ``cauchy``, for fits and errors on unseen rows.
+        torques: gravity torques (m, n) per block [N m]; None for unknown masses.
         fixed: positions in the parameter vector that stay at their nominal.
-        prior: standard deviations of the parameter vector about its nominal; infinite where nothing is known.
+        prior: standard deviations of the parameter vector about its nominal; infinite without a prior.
         seed: of the regions.
         folds: how unseen rows are set aside; None for the most demanding way (`calib.geometry.model_choice.folds`).
         progress: called with (done, total, what).
@@ -304,7 +304,7 @@ class _Climber:
         """Return the effects that reduce the error on unseen rows, best first (greedy selection).
 
         Args:
-            place: where the terms of each effect stand among those of the statistics.
+            place: indices of each effect's terms among those of the statistics.
         """
         kept: list[str] = []
         none = np.array([], dtype=int)
@@ -331,8 +331,8 @@ class _Climber:
         """Return `kept` if geometry and effects together beat the chosen model on unseen rows; else an empty list.
 
         Args:
-            kept: effects that pay on the geometry.
-            climbed: rungs tried before them, the geometry last.
+            kept: effects that improve the geometry model.
+            climbed: number of steps tried before them, the geometry last.
         """
         pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - MIN_GAIN)
         note = "better together with the next effects" if pays else "no better on unseen rows than without the geometry"

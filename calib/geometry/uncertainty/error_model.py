@@ -42,15 +42,15 @@ class Discrepancy:
 
     Attributes:
         parameters: κ, by which the parameters' covariance counts.
-        floor: v_0 [m²], what remains among the poses of the fit, the instrument's noise included, where s is 1.
+        floor: v_0 [m²], error variance at the fitted poses for s = 1, with the instrument's noise.
         far: v_1 [m²/m²], per squared distance from the nearest of them.
         beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
-        radii: sigmas within which 95 % of the errors on held-out rows were, near and far.
+        radii: number of sigmas that contained 95 % of the errors on held-out rows, near and far.
         reach: median of d² + g² of the near rows, and of the far ones [m²].
         levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
-        profile: log s by joint; empty where errors are even.
-        placed: the radii where base and tool are placed on the rows; None where they are the same.
-        wider: by joint, how many times as wide an interval is below and above its range; empty where nothing is known.
+        profile: log s by joint; empty for equal errors everywhere.
+        placed: the radii if base and tool are fitted to the rows; None if equal to `radii`.
+        wider: widening factors of the interval below and above each joint's range; empty if unknown.
     """
 
     parameters: float
@@ -95,7 +95,7 @@ class ErrorModel:
         Args:
             q: joint values.
             torque: (m, n) gravity torques [N m], for compliance terms.
-            station: seen from which station; -1 for the arm's base.
+            station: index of the station of reference; -1 for the arm's base.
             tool: which of its tools, one or (m,).
         """
         own = pose_sigmas(self.cell, q, self.free, self.covariance, torque, station, tool)[:, 0] ** 2

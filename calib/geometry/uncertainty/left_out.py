@@ -107,12 +107,12 @@ class LeftOut:
 
     Attributes:
         squares: (m,) |e|² [m²].
-        shapes: (m, 4) with what their variances may grow: trace J Σ Jᵀ, 1, squared distances from the rest.
+        shapes: (m, 4) quantities on which the variance depends: trace J Σ Jᵀ, 1, squared distances to the other rows.
         away: (m,) the sum of these distances [m²].
         pose: (m,) which pose.
         fold: (m,) which fold.
-        near: (m,) whether it was drawn at random.
-        joint: (m,) of which joint an end was left out; -1 for none.
+        near: (m,) whether the row is from a random fold.
+        joint: (m,) joint whose range end was held out; -1 for none.
     """
 
     squares: np.ndarray
@@ -128,7 +128,7 @@ class LeftOut:
         """Return the errors from arrays (rows, 5) by fold: |e|², trace J Σ Jᵀ, two squared distances, pose number.
 
         Args:
-            joints: of which joint an end was left out, for each of `far`; -1 for none.
+            joints: joint whose range end was held out, for each of `far`; -1 for none.
         """
         folds = [*near, *far]
         rows, number = np.concatenate(folds), np.repeat(np.arange(len(folds)), [len(each) for each in folds])
