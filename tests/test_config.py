@@ -151,7 +151,7 @@ def test_places_are_named_as_toml_names_them() -> None:
         ({"target": {"height": [1, 0]}}, "target: height: 1 is not below 0"),
         ({"target": {"height": "1 rad"}}, "target.height: cannot read '1 rad' as a number .here .*: m, mm, um, cm, in"),
         ({"instrument": {"xyz": [0, 0, 1], "sight": "-10 deg"}}, "instrument.sight: expected a number above 0"),
-        ({"instrument": {"sight": "40 deg"}}, "instrument: sight needs the place of the instrument, xyz"),
+        ({"instrument": {"sight": "40 deg"}}, "instrument: sight needs the position of the instrument, xyz"),
         ({"collision": {"margin": -1}}, "collision.margin: expected 0 or more, found -1"),
         ({"joints": {"q1": [1, 2, 3]}}, "joints.q1: expected a list of 2 numbers, lower and upper"),
     ],

@@ -101,7 +101,7 @@ def test_the_cell_as_told_becomes_tables():
     [
         ({"instrument_at": "3000,0,1"}, "are these mm"),
         ({"instrument_at": "3,0"}, "expected x,y,z in metres, or unknown"),
-        ({"cone": "30"}, "sight needs the place of the instrument"),
+        ({"cone": "30"}, "sight needs the position of the instrument"),
         ({"instrument_at": "3,0,1", "cone": "wide"}, "instrument.sight: cannot read"),
         ({"instrument_at": "3,0,1", "cone": "0"}, "instrument.sight: expected"),
         ({"facing": "up"}, "--facing up: cannot read"),
