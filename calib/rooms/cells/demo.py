@@ -125,7 +125,7 @@ def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     folder = session.folder
     return (
         *asks(session, waiting),
-        f"(or simulate this step:  {command_line('demo', '--bring', folder)}; then: {command_line('next', folder)})",
+        f"(or simulate this step: {command_line('demo', '--bring', folder)}; then: {command_line('next', folder)})",
     )
 
 

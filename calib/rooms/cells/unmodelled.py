@@ -35,7 +35,7 @@ CABLE = 0.5  # [rad]
 def _named(parts: Sequence[tuple[float, str]]) -> str:
     """Return a clause that lists the effects (size, words) with a size above 0; empty without any."""
     named = ", ".join(words for size, words in parts if size)
-    return f"; unmodelled:  {named}" if named else ""
+    return f"; unmodelled: {named}" if named else ""
 
 
 @dataclass(frozen=True)

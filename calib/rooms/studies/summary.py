@@ -100,7 +100,7 @@ class ConditionSummary:
         if self.chosen or not self.methods:
             return ""
         if not any(one.enough for one in self.methods):
-            return f"fewer than {MIN_DATA_SETS} runs of each method are too few: --runs  {MIN_DATA_SETS} or more"
+            return f"fewer than {MIN_DATA_SETS} runs of each method are too few: --runs {MIN_DATA_SETS} or more"
         return f"no method of {MIN_DATA_SETS} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
 
 

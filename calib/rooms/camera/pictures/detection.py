@@ -176,7 +176,7 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
         if board.kind != "chessboard":
             if (seen := _markers(coarse, board.dictionary)) >= MIN_MARKERS:
                 return (
-                    f"{seen} markers of {board.dictionary} are seen, but not at their places by board.toml: are kind, "
+                    f"{seen} markers of {board.dictionary} are seen, but not where board.toml has them: are kind, "
                     "columns and rows (squares, not inner corners) those of the print?"
                 )
             if other := _other_dictionary(coarse, board):
