@@ -292,7 +292,7 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
     assert cli.run(["run", "command", "--no-plots"]) == 0
     assert "command: waits" in capsys.readouterr().out
     assert (made / "2-poses/poses.csv").read_bytes() == (tmp_path / "command/2-poses/poses.csv").read_bytes()
-    with pytest.raises(calib.CalibError, match="named twice"):
+    with pytest.raises(calib.CalibError, match="given twice"):
         calib.run_sessions(["script", "script/session.toml"])
 
 

@@ -291,7 +291,7 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ('[frequency]\nresonance = "0.25 Hz"', (), "take fewer harmonics or a period above 16 s"),
         ("[target]\nreach = nan", (), "target.reach: expected a number above 0, found nan"),
         ("", ("--goal", "wrist=2"), "above 0 and below 1"),
-        ("", ("--goal", "elbow=0.1"), "none of raw"),
+        ("", ("--goal", "elbow=0.1"), "unknown; use raw"),
         ("", ("--goal", "wrist"), "expected NAME=NUMBER"),
         ("", ("--goal", "logdet", "--goal", "raw=30"), "'logdet' replaces the others"),
         ("", ("--hard", "logdet"), "expected NAME=NUMBER"),

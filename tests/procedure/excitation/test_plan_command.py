@@ -92,7 +92,7 @@ def test_model_and_stated_drives_plan_the_same_motion(room):
     assert one.track.duration == two.track.duration and "no covariance" in one.notes[1]
     assert "collisions and floor are NOT checked" in one.notes[0]
     bare = planning.plan("lwr4plus", room / "way.csv")
-    assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[1]
+    assert bare.track.duration < one.track.duration and "friction unknown" in bare.notes[1]
 
 
 def test_lines(room):
@@ -151,7 +151,7 @@ def test_waypoints_of_the_tool(room, capsys):
         (WAYPOINTS[[0, 0]], "waypoints 1 and 2 are the same"),
         (np.where(WAYPOINTS == 1.0, np.nan, WAYPOINTS), "row 2, column 'q2': found an empty or NaN cell"),
         (WAYPOINTS * 2, "beyond"),
-        (["--drives", "drives.toml"], "take one of them away"),
+        (["--drives", "drives.toml"], "leave one of them out"),
         (["--model", "."], "contains no identified model"),
         (["--payload", "tool"], "no payload 'tool'"),
         (["--rate", "0"], "rate: expected"),
@@ -233,7 +233,7 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
         ({"M": -2.0}, "body behind A4: a negative mass"),
         ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is no limit)"),
         ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is no limit)"),
-        ({"velocity": np.inf}, "no limit for the speed of A4, and"),
+        ({"velocity": np.inf}, "no limit for the speed of A4; without it"),
         ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is no limit)"),
     ],
 )
@@ -273,7 +273,7 @@ def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
 
 def test_a_motion_beyond_its_bounds_is_not_written(room):
     planned = planning.plan("lwr4plus", room / "way.csv")
-    with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .* and it is not written"):
+    with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .*; it is not written"):
         motion_folder.write_plan(replace(planned, track=replace(planned.track, v=2 * planned.track.v)), room / "out")
     assert not (room / "out").exists()
 

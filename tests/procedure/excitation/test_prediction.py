@@ -83,5 +83,5 @@ def test_a_folder_without_a_prediction_is_refused(motion, outcome, tmp_path):
         prediction.check_folder(tmp_path)
     fitted = SimpleNamespace(estimate=SimpleNamespace(sigma=np.ones(2)))
     other = replace(outcome, found=SimpleNamespace(names=["one", "two"], fitted=fitted))
-    with pytest.raises(UsageError, match="none of the 2 parameters identified"):
+    with pytest.raises(UsageError, match="none of the 2 identified parameters"):
         prediction.compared_with_identification(motion, other)

@@ -136,7 +136,7 @@ def test_the_fit_states_them_beside_its_own_errors(files, capsys):
     assert stated["repeatability_mm"]["mean"] == pytest.approx(noise, rel=0.2)
     assert stated["accuracy_mm"]["calibrated"]["mean"] < 0.3 * stated["accuracy_mm"]["nominal"]["mean"]
     (table,) = iso9283_tables(read_record(FitMetrics, found))
-    assert len(table.rows) == 5 and "100 and more" in table.note
+    assert len(table.rows) == 5 and "100 or more" in table.note
 
 
 def test_a_validation_at_the_fits_joints_proves_nothing(files, capsys):

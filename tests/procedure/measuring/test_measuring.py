@@ -212,7 +212,7 @@ BOX = "[[obstacle]]\nname = 'wall'\nkind = 'box'\nsize = {}\nxyz = {}\n"
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[collision]\nfloor = -300\n", "floor: 300 m from the arm's base"),
+        ("[collision]\nfloor = -300\n", "floor: 300 m from the base"),
         (BOX.format([4000, 100, 3000], [0, 1500, 1500]), "wall: 1.45e"),
         ("[collision]\nradius = 60\n", "links of radius 60 m"),
     ],
@@ -226,4 +226,4 @@ def test_what_never_acts_is_told_and_not_said_to_be_kept(tmp_path):
     far, near = (_limits(BOX.format([1, 1, 1], [x, 0, 0]), tmp_path) for x in (50, 1.3))
     assert any("wall: 49.5 m" in note for note in far.notes) and not any("wall" in kept for kept in far.checked)
     assert not any("wall:" in note for note in near.notes) and any("wall" in kept for kept in near.checked)
-    assert any("degrees?" in note for note in _limits("[joints]\nq1 = [-90, 90]\n", tmp_path).notes)
+    assert any("if in degrees" in note for note in _limits("[joints]\nq1 = [-90, 90]\n", tmp_path).notes)

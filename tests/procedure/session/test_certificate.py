@@ -77,7 +77,7 @@ def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, fin
 
 def test_what_was_noticed_on_arrival_stands_on_it(text: str, finished_folder: Path) -> None:
     lines = (finished_folder / "3-measured/checked.txt").read_text().splitlines()
-    assert "What was noticed when the files came" in text
+    assert "Notes on the files when they were read" in text
     assert all(line in text for line in lines) and any(re.match("drift.csv: .* measured again", line) for line in lines)
     noted = json.loads((finished_folder / "5-validation/metrics.json").read_text())["warnings"]
     assert noted and all(text.count(line) == 1 for line in noted), "nothing is noted twice"

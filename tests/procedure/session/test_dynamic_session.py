@@ -103,7 +103,7 @@ def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> 
     stopped = go_on(session)
     assert stopped is not None and stopped.step.name == "record"
     assert not session.path("6-excitation").exists()
-    assert "unseen one" in commands.asks(session, stopped)[0]
+    assert "a different one for validation" in commands.asks(session, stopped)[0]
 
 
 @pytest.mark.slow
@@ -189,7 +189,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
     ("change", "message"),
     [
         (reheaded(lambda header: [name.replace("[deg]", "[rad]") for name in header]), "looks like deg"),
-        (reheaded(swapped), r"columns are swapped \(the column of joint3 holds joint2, .*joint2 holds joint3"),
+        (reheaded(swapped), r"columns are swapped \(the column of joint3 contains joint2, .*joint2 contains joint3"),
         (scaled("t [", 2.0), "0.5 times its speed"),
         (scaled("tau_joint", -1.0), "reverse their sign"),
         (scaled("tau_joint4", -1.0), "training.csv: torque of joint4 .* reverse the sign of the column of joint4"),

@@ -80,7 +80,7 @@ def test_torques_in_amperes_are_good_for_prediction_only(tmp_path: Path, capsys:
 
 def test_no_file_says_another_verdict_than_that_of_what_is_delivered(session: Session) -> None:
     for tolerance, exports, verdict, why in (
-        (1e-6, True, "fail", "the exported robot leaves"), (0.0, False, PREDICTION_ONLY, "no such robot"),
+        (1e-6, True, "fail", "the exported robot has an error"), (0.0, False, PREDICTION_ONLY, "no such robot"),
     ):  # fmt: skip
         path = session.path("session.toml")
         path.write_text(re.sub("tolerance_percent = [^ ]+", f"tolerance_percent = {tolerance}", path.read_text()))
@@ -99,7 +99,10 @@ def refuse(*arguments: object) -> None:
 
 
 def test_a_session_has_something_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for others, said in ((("--instrument", "cmm"), "measures nothing"), (("--geometry-only",), "nothing is left")):
+    for others, said in (
+        (("--instrument", "cmm"), "measures nothing"),
+        (("--geometry-only",), "neither geometry nor dynamics"),
+    ):
         assert run("new", tmp_path / "cell", "--robot", "ur5", "--dynamics-only", *others) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "cell").exists()

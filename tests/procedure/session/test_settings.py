@@ -96,10 +96,10 @@ def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ('constraints = ""', 'constraints = "/data/l.toml"', "poses.constraints: expected a file beside"),
+        ('constraints = ""', 'constraints = "/data/l.toml"', "poses.constraints: expected a file next to"),
         ('limits = ""', 'limits = "sub"', "dynamics.limits: expected a file, found the folder 'sub'"),
         ('file = "1-robot/robot.toml"', 'file = ""', "robot.file: expected a text, found ''"),
-        ('options = ""', 'options = "a\\u0000b"', "fit.options: expected a file beside"),
+        ('options = ""', 'options = "a\\u0000b"', "fit.options: expected a file next to"),
         ("seed = 1", "seed = -1", "seed: expected a whole number, 0 or more, found -1"),
         ("tool = [0.3, 0.05, 0.02]", "tool = [0.1, 0.2]", r"instrument.tool: expected three numbers \[m\]"),
         ("tool = [0.3, 0.05, 0.02]", "tool = ['a', 'b', 'c']", r"instrument.tool: expected three numbers \[m\]"),
@@ -111,7 +111,7 @@ def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
         ("rate = 10.0", "rate = 1e12", "dynamics.rate: expected Hz, at most 100000"),
         ("period = 2.0", "period = 1e9", "dynamics.period: expected s, at most 3600"),
         ("[poses]", "poses = 3\n[poss]", "instrument: there is no key 'poses'"),
-        ("schema = 2", "schema = true", "not known"),
+        ("schema = 2", "schema = true", "is unknown"),
         ("schema = 2", "schema = 3", "newer version"),
         ("[poses]", "[poses", "is not a TOML file"),
         ("tolerance_mm = 0.0", "tolerance_mm = -1.0", "expected 0 or more"),
