@@ -120,7 +120,7 @@ def test_geometry_that_is_exact_adds_nothing():
     arm, case = planted.arm(), planted.case("a", 0)
     found = identify(arm, [case], PLAIN)
     without = geometry_uncertainty.propagate(found, arm, [case])
-    assert without.geometry is None and "taken as exact" in geometry_tables.summary(without)
+    assert without.geometry is None and "assumed exact" in geometry_tables.summary(without)
     np.testing.assert_array_equal(without.covariance, found.fitted.estimate.covariance)
     tiny = geometry_uncertainty.propagate(found, CalibratedChain(arm, covariance=1e-16 * np.eye(6)), [case])
     assert not tiny.changed.any() and "no matter" in geometry_tables.summary(tiny)
@@ -187,7 +187,7 @@ def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
 def test_the_command_says_where_the_geometry_is_taken_as_exact(tmp_path, capsys):
     found, rows, out = run(fitted_folder(tmp_path, None), tmp_path, "--no-plots")
     assert not found["propagated"] and {row["sigma_geometry"] for row in rows} == {""}
-    assert "taken as exact" in capsys.readouterr().out.replace("\n", " ")
+    assert "assumed exact" in capsys.readouterr().out.replace("\n", " ")
     assert not (out / calibrated.COVARIANCE).exists()
 
 

@@ -1,4 +1,4 @@
-"""The folder of an identification: written whole, beside its place, then moved there."""
+"""Folder of an identification: written completely next to its final place, then moved there."""
 
 from __future__ import annotations
 
@@ -48,38 +48,38 @@ HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "s
 
 @dataclass(frozen=True)
 class IdentificationFolder:
-    """The folder that an identification leaves: where its files are, and what they say."""
+    """Folder of an identification: paths of its files, and their content."""
 
     path: Path
 
     @property
     def robot(self) -> Path:
-        """The robot it was identified on."""
+        """Path of the identified robot."""
         return self.path / calibrated.ROBOT
 
     @property
     def model(self) -> Path:
-        """The model."""
+        """Path of the model."""
         return self.path / MODEL
 
     @property
     def numbers(self) -> Path:
-        """Numbers, verdict and findings."""
+        """Path of the metrics: numbers, verdict and findings."""
         return self.path / METRICS
 
     @property
     def tables(self) -> tuple[Path, Path]:
-        """The estimate, and its covariance."""
+        """Paths of the estimate and of its covariance."""
         return self.path / ESTIMATE, self.path / COVARIANCE
 
     @property
     def torques(self) -> list[Path]:
-        """Torques measured and predicted on motion that is unseen, where there is any."""
+        """Paths of measured and predicted torques on unseen motion, if there is any."""
         return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
 
     @property
     def unseen(self) -> UnseenFolder:
-        """What the model comes to on motion it has not seen."""
+        """Folder of the model's results on unseen motion."""
         return UnseenFolder(self.path / "unseen")
 
     def dynamics(self) -> Dynamics:
@@ -91,12 +91,12 @@ class IdentificationFolder:
         return read_json(self.numbers, "identify again", ModelMetrics, with_current_keys)
 
     def findings(self) -> ModelFindings:
-        """Read what is known of the model; an older folder says it in its warnings alone."""
+        """Read the findings on the model; older folders contain them only as warnings."""
         metrics = self.metrics()
         return metrics.findings or ModelFindings(Resting(), metrics.warnings)
 
     def errors(self) -> TorqueErrorModel | None:
-        """Read what errors the model's torques are expected to have; None where nobody could say."""
+        """Read the model's expected torque errors; None if they are unknown."""
         stated = self.findings().errors
         found = None if stated is None else read_uncertainty(self.path, self.dynamics(), ())
         return stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
@@ -104,7 +104,7 @@ class IdentificationFolder:
 
 @dataclass(frozen=True)
 class UnseenFolder:
-    """The folder that holds an identified model against motion it has not seen."""
+    """Folder of an identified model's validation on unseen motion."""
 
     path: Path
 
@@ -126,7 +126,7 @@ class UnseenFolder:
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for an identification, or that holds one of its inputs."""
+    """Refuse, before any work is done, a folder not for an identification, or one that contains an input."""
     check_target(out, OURS, (METRICS, MODEL), "identification", inputs)
 
 
@@ -134,7 +134,7 @@ def write_folder(
     outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None,
     *, owned: bool = False,
 ) -> Path:  # fmt: skip
-    """Write all files of an identification, all or none; see `calib.folders`.
+    """Write all files of an identification, or none on an error; see `calib.folders`.
 
     An `owned` folder is ours, whatever is left in it.
     """
@@ -199,14 +199,14 @@ def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals 
 
 
 def read_torques(path: Path) -> dict[str, np.ndarray]:
-    """Read what `_write_torques` has left: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
+    """Read the table of `_write_torques`: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
     table = read_table(path)
     found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}
     return {name.rstrip("_"): one for name, one in found.items() if one is not None} if found["v"] is not None else {}
 
 
 def _instrumental_rows(found: Instrumental) -> Iterator[tuple[Any, ...]]:
-    """Yield both estimates of the standard model, parameter by parameter."""
+    """Yield the rows of both estimates of the standard model, one for each parameter."""
     estimate = found.fit.estimate
     columns = (estimate.values, estimate.sigma, found.ordinary.estimate.values, found.shift)
     explained = 100.0 * found.strength.partial_r2

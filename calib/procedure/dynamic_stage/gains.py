@@ -1,4 +1,4 @@
-"""Currents become torques: by gains that are stated, that the file brings, or that a known payload tells."""
+"""Drive gains that convert currents to torques: stated, from the file, or identified with a known payload."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,14 +21,14 @@ from calib.units import TORQUE, without_gains
 
 @dataclass(frozen=True, eq=False)
 class FoundGains:
-    """How currents become torques.
+    """Drive gains that convert currents to torques.
 
     Attributes:
-        options: the options, payload parameters found beside the gains put in.
-        gains: (n,) for recordings that state none of their own; None where none are needed.
-        found: the identification of gains; None where there was none.
+        options: the options, with payload parameters identified together with the gains.
+        gains: (n,) for recordings without stated gains; None if not needed.
+        found: the identification of gains; None without one.
         unit: of the torques.
-        notes: what a user should know.
+        notes: remarks for the user.
     """
 
     options: IdentifyOptions
@@ -39,11 +39,11 @@ class FoundGains:
 
     @property
     def own(self) -> tuple[int, ...]:
-        """Joints, from 0, whose torques are in a unit of their own."""
+        """Joints (from 0) without an identified gain, whose torques are in separate units."""
         return () if self.found is None else self.found.own
 
     def for_motion(self, motion: Motion, own: FileSettings) -> np.ndarray | None:
-        """Return the gains (n,) for a motion: the options', those found, or the file's; None for torques."""
+        """Return the gains (n,) for a motion, from options, identification or file; None for torques."""
         if own.gains is not None:
             if len(own.gains) not in (1, motion.n):
                 raise UsageError(f"gains: {len(own.gains)} values for {motion.n} joints ({motion.file})")
@@ -60,7 +60,7 @@ def find_gains(
     training: Sequence[str],
     say: Callable[[str], None],
 ) -> FoundGains:
-    """Return how the currents of `motions` (path → motion) become torques."""
+    """Return the drive gains that convert the currents of `motions` (path → motion) to torques."""
     currents = [path for path, motion in motions.items() if motion.kind == "current"]
     stated = [path for path in currents if options.file_settings(path).gains is not None]
     if options.gain_pair is not None:
@@ -72,8 +72,8 @@ def find_gains(
     if len(bare) < len(motions):
         rest = [path for path in motions if path not in bare]
         raise UsageError(
-            f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): amperes and N m do "
-            "not go into one model; state gains for all of them"
+            f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): one model cannot "
+            "use both A and N m;  state gains for all of them"
         )
     if not isinstance(chain, Chain):
         raise UsageError(f"{bare[0]}: currents without drive gains; state gains = [...] (N m/A) in the options file")
@@ -114,15 +114,15 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
 
 
 def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
-    """Return gains relative to the joint with the largest current: torques in its amperes."""
+    """Return gains relative to the joint with the largest current, so that all torques are in its amperes."""
     if not currents:
-        return FoundGains(options, None, None, "A", ("no drive gains are known: torques are currents [A]",))
+        return FoundGains(options, None, None, "A", ("drive gains are unknown: torques are currents [A]",))
     cases = [make_case(path, motion, carried=options.file_settings(path).payload) for path, motion in currents]
     squares = sum(np.sum(np.asarray(case.target) ** 2, axis=0) for case in cases)
     reference = int(np.argmax(squares))
     found = _identify(chain, cases, options.settings, {}, reference)
     told = ", ".join(
-        "not told" if j in found.own else "1" if j == reference else f"{gain:.4g} ± {sigma:.2g}"
+        "unknown" if j in found.own else "1" if j == reference else f"{gain:.4g} ± {sigma:.2g}"
         for j, (gain, sigma) in enumerate(zip(found.gains, found.sigma))
     )
     note = (
@@ -131,8 +131,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
     )
     apart = [f"joint {j + 1}" for j in sorted(found.own)]
     own = (
-        f"this motion does not tell the gain of {', '.join(apart)}: torques there are in amperes of their own, and "
-        "totals leave them out",
+        f"this motion does not identify the gain of {', '.join(apart)}: torques there are in the joint's own "
+        "amperes and omitted from totals",
     )
     notes = (note, *(own if apart else ()), *_unsure(found))
     options = replace(options, settings=replace(options.settings, apart=tuple(found.own)))
@@ -150,7 +150,7 @@ def _identify(
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known if name not in [model.names[k] for k in base.kept]]
     if missing:
-        raise UsageError(f"'{missing[0]}' is no parameter of its own in these recordings; is the loaded run loaded?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     tau = first_fit(rows)[1]
@@ -162,14 +162,14 @@ def _identify(
 def _case(
     name: str, chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion], carried: tuple[str, ...]
 ) -> Case:
-    """Return the currents of a recording of the command line, or of a file beside the options file."""
+    """Return the currents of a recording on the command line, or of a file in the folder of the options file."""
     path = next((path for path in motions if path == name or Path(parse_cut(path)[0]).name == parse_cut(name)[0]), None)
     if path is not None:
         return make_case(name, motions[path], carried=carried)
     beside = Path(options.source).parent / name if options.source else Path(name)
     where = str(beside) if Path(parse_cut(str(beside))[0]).exists() else name
     if not Path(parse_cut(where)[0]).exists():
-        raise UsageError(f"{options.source}: gain_identification names {name}, which is neither given nor a file")
+        raise UsageError(f"{options.source}: gain_identification names {name}, neither a given nor an existing file")
     own = options.file_settings(where)
     motion = make_motion(read_recording(where, Joints(chain.joint_names), own.recording), own.filter)
     return make_case(name, motion, carried=carried)
@@ -180,4 +180,4 @@ def _unsure(found: DriveGains) -> list[str]:
     if not unsure:
         return []
     shown = ", ".join(f"joint {j + 1} ({100 * found.sigma[j] / abs(found.gains[j]):.0f} %)" for j in unsure)
-    return [f"these runs tell some gains badly: {shown}"]
+    return [f"these runs identify some gains poorly:  {shown}"]

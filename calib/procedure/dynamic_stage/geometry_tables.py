@@ -1,6 +1,6 @@
-"""What the geometry's uncertainty does to an identification, as tables, as metrics and in words.
+"""Effect of the geometry's uncertainty on an identification, as tables, metrics and text.
 
-Beside what every identification writes (``calib identify --out``)::
+Files in addition to those of every identification (``calib identify --out``)::
 
     estimate.csv          sigma and rsd are totals; sigma_torque is the part of the torques' noise, sigma_geometry that
                           of the geometry, empty where the robot came without a covariance (no folder of a fit)
@@ -37,7 +37,7 @@ MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque,
 
 @dataclass(frozen=True)
 class TiltEffect:
-    """The parameter that 1 mrad of the base's tilt moves most, and by how many of its sigmas of torque noise."""
+    """Parameter that a base tilt of 1 mrad changes most, and this change in its sigmas of torque noise."""
 
     parameter: str
     sigmas: float
@@ -45,7 +45,7 @@ class TiltEffect:
 
 @dataclass(frozen=True)
 class ParameterChange:
-    """A parameter's change from the nominal to the calibrated geometry, in its total σ and in percent."""
+    """Change of a parameter from the nominal to the calibrated geometry, in its total σ and in percent."""
 
     name: str
     sigmas: float
@@ -54,7 +54,7 @@ class ParameterChange:
 
 @dataclass(frozen=True)
 class GeometryMetrics:
-    """What the geometry's uncertainty adds to the estimate; the entry ``geometry`` of ``metrics.json``.
+    """Effect of the geometry's uncertainty on the estimate: the entry ``geometry`` of ``metrics.json``.
 
     Attributes:
         propagated: whether the robot came with a covariance of its geometry.
@@ -89,7 +89,7 @@ class TwoGeometries(NamedTuple):
 
 
 class GeometricEffect(NamedTuple):
-    """A row of ``geometry_effects.csv``: what one sigma of a geometric element does to the dynamics."""
+    """A row of ``geometry_effects.csv``: the effect of one sigma of a geometric element on the dynamics."""
 
     rank: int
     element: str
@@ -105,7 +105,7 @@ class GeometricEffect(NamedTuple):
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write sensitivities, the ranked effects and the two geometries' estimates."""
+    """Write the tables of sensitivities, of ranked effects, and of the estimates on both geometries."""
     carried = outcome.carried
     if carried is None:
         return
@@ -119,7 +119,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
 
 
 def _ranking(carried: GeometryUncertainty) -> np.ndarray:
-    """Return the elements' indices: by the largest shift that one σ of theirs causes, then the ones without any σ."""
+    """Return the elements' indices, sorted by the largest shift that one σ causes; elements without σ last."""
     known = np.isfinite(carried.deviations)
     unit = _per_sigma(carried).max(axis=0, initial=0.0)
     size = np.where(known, unit * np.where(known, carried.deviations, 0.0), unit)
@@ -167,7 +167,7 @@ def _geometries(found: GeometryComparison, essential: Sequence[str]) -> list[Two
 
 
 def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
-    """Return the names of the essential parameters; all, where none were left out."""
+    """Return the names of the essential parameters; all names if none were removed."""
     found = outcome.found
     if found.elimination is None:
         return found.names
@@ -176,7 +176,7 @@ def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
 
 
 def metrics(carried: GeometryUncertainty, compared: GeometryComparison | None) -> GeometryMetrics:
-    """Return the record of what the geometry's uncertainty adds to the estimate."""
+    """Return the metrics of the geometry's uncertainty in the estimate."""
     growth = carried.sigma / np.where(carried.sigma_torque > 0.0, carried.sigma_torque, 1.0)
     return GeometryMetrics(
         carried.geometry is not None,
@@ -190,15 +190,15 @@ def metrics(carried: GeometryUncertainty, compared: GeometryComparison | None) -
 
 
 def summary(carried: GeometryUncertainty) -> str:
-    """Say in a sentence what the geometry's uncertainty changes."""
+    """Return a sentence on the effect of the geometry's uncertainty."""
     if carried.geometry is None:
         return (
-            "the geometry is taken as exact: the robot comes without a covariance of its geometry (give the folder of "
-            "a fit); sigmas are of the torques' noise alone"
+            "the geometry is assumed exact, sigmas contain torque noise only: the robot has no covariance of its "
+            "geometry (give the folder of a fit)"
         )
     count, p = int(carried.changed.sum()), len(carried.names)
     if count == 0:
-        return f"the geometry's uncertainty changes no sigma by more than {100 * NOTHING:g} %: propagation is no matter"
+        return f"the geometry's uncertainty changes no sigma by more than {100 * NOTHING:g} %: no propagation needed"
     over = [name for name, yes in zip(carried.names, carried.dominated) if yes]
     more = f"; it exceeds the torque noise's part in {len(over)}: {', '.join(over)}" if over else ""
     rest = f"; in the other {p - count} propagation changes nothing" if count < p else ""
@@ -206,20 +206,20 @@ def summary(carried: GeometryUncertainty) -> str:
 
 
 def _tilt(carried: GeometryUncertainty) -> TiltEffect:
-    """Return which parameter 1 mrad of tilt of the base against gravity moves most, and by how many σ of torque."""
+    """Return the parameter that 1 mrad of base tilt against gravity changes most, and its change in σ of torque."""
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))
     return TiltEffect(carried.names[worst], float(size[worst]))
 
 
 def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
-    """Return |dφ/dg| in σ of torque noise (p, K + 2); zero where a parameter has no σ."""
+    """Return the sensitivities |dφ/dg| in σ of torque noise (p, K + 2); zero if a parameter has no σ."""
     sigma = carried.sigma_torque[:, None]
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
 def _largest(compared: GeometryComparison) -> tuple[ParameterChange, ...]:
-    """Return the five parameters that differ most between the geometries, in their total σ, and by how much [%]."""
+    """Return the five parameters that differ most between the geometries, with the differences in total σ and [%]."""
     size = (compared.values[0] - compared.values[1]) / np.where(compared.sigma[1] > 0.0, compared.sigma[1], np.inf)
     worst = np.argsort(-np.abs(size))[:5]
     return tuple(ParameterChange(compared.names[k], float(size[k]), float(compared.relative[k])) for k in worst)

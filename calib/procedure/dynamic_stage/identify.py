@@ -1,4 +1,4 @@
-"""The identification as the guided procedure runs it: read, identify, predict other motion, say how far to trust it."""
+"""Identification of the guided procedure: reading, identification, prediction of other motion, verdict."""
 
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -22,16 +22,16 @@ from calib.units import TORQUE
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IdentificationOutcome(Assessment):
-    """What an identification came to: the model beside the recordings, its verdict, and how it came about.
+    """Outcome of an identification: the model, its errors on the recordings, its verdict, and its inputs.
 
     Attributes:
-        inputs: what it worked on.
-        found: the model and how it came about.
-        findings: what a verdict needs of it beside the recordings.
-        carried: what the geometry's uncertainty adds; None for an identification that was not asked for it.
-        geometries: the estimate on the nominal geometry beside it; None where there is no other than the nominal.
-        errors: what errors the torques are expected to have; None where too little was recorded to say.
-        seed: that reproduces it.
+        inputs: robot, recordings and options.
+        found: the model and its estimation.
+        findings: findings on the model that the verdict needs besides the recordings.
+        carried: effect of the geometry's uncertainty; None if it was not requested.
+        geometries: comparison with the estimate on the nominal geometry; None if the geometry is nominal.
+        errors: expected torque errors; None if too little was recorded to estimate them.
+        seed: of all random numbers.
     """
 
     inputs: IdentificationInputs
@@ -47,14 +47,14 @@ T = TypeVar("T", bound=IdentificationOutcome)
 
 
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
-    """Identify, predict every recording, and judge."""
+    """Return the outcome of an identification: the model, its prediction of every recording, and the verdict."""
     return judged(inputs, identify(inputs.robot, inputs.cases, inputs.options.settings, progress), progress)
 
 
 def judged(
     inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
 ) -> IdentificationOutcome:
-    """Predict every recording by the training data the inputs, and judge.
+    """Return the outcome of an identification `found`: its prediction of every recording, and the verdict.
 
     Raises:
         MeasurementError: where friction would drive most joints.
@@ -63,7 +63,7 @@ def judged(
     wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
     carried, geometries = _carry(inputs, found, say)
     loops = found.bias.loops
-    say("errors on time left out")
+    say("errors on held-out time")
     errors = learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
         resting_parameters(found), (), model_findings(inputs.cases, found),
@@ -78,7 +78,7 @@ def judged(
 
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:
-    """Return an outcome judged anew on the unseen recordings of `inputs`; nothing is identified."""
+    """Return an outcome with a new verdict on the unseen recordings of `inputs`; nothing is identified."""
     if (stage := stage_of(inputs.robot, "identify")) is not None and stage.judge is not None:
         result = stage.judge(inputs, outcome.found, outcome.findings)
     else:
@@ -89,7 +89,7 @@ def assessed(outcome: T, inputs: IdentificationInputs) -> T:
 def _carry(
     inputs: IdentificationInputs, found: Identification, say: Progress
 ) -> tuple[GeometryUncertainty, GeometryComparison | None]:
-    """Return what the geometry's uncertainty adds to the estimate, and the estimate on the nominal geometry beside."""
+    """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry."""
     carried = propagate(found, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:
         return carried, None

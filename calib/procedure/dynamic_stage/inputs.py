@@ -1,4 +1,4 @@
-"""What an identification works on: the robot, the training recordings, and those it must not see."""
+"""Inputs of an identification: the robot, the training recordings, and the unseen recordings."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class IdentificationInputs:
-    """A robot and its recordings.
+    """Robot, recordings and options of an identification.
 
     Attributes:
-        robot: `CalibratedChain` as a geometric fit has left it, or as it was described, joint corrections left out;
+        robot: `CalibratedChain` from a geometric fit or from a description, without joint corrections;
             or a `calib.procedure.robot_kinds.Mechanism`.
         source: the file it came from.
         cases: training recordings.
         unseen: recordings to be predicted.
-        options: the options file's content, the command's choices put in.
-        notes: what a user should know about how the files were understood.
-        currents: how currents become torques.
+        options: content of the options file, updated by the command's options.
+        notes: remarks for the user on the interpretation of the files.
+        currents: drive gains that convert currents to torques.
     """
 
     robot: Any
@@ -60,12 +60,12 @@ class IdentificationInputs:
 
     @property
     def unit(self) -> str:
-        """Of the torques."""
+        """Unit of the torques."""
         return self.currents.unit
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        """Of each torque row; amperes of its own where its joint's gain is not told."""
+        """Unit of each torque row; separate amperes for a joint without an identified gain."""
         rows = self.options.settings.torque_rows.units([joint.kind == "prismatic" for joint in self.chain.joints])
         if self.unit == TORQUE:
             return tuple(rows)
@@ -74,16 +74,16 @@ class IdentificationInputs:
 
     @property
     def gains(self) -> DriveGains | None:
-        """Drive gains that were identified; None where none were."""
+        """Identified drive gains; None if none were identified."""
         return self.currents.found
 
     @property
     def chain(self) -> Any:
-        """The arm that is identified; of another robot its actuated joints, with names and limits like an arm's."""
+        """Identified arm; for other robots the actuated joints, with names and limits like an arm's."""
         return self.robot.chain
 
     def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
-        """Return inputs with more recordings that were not used for training.
+        """Return inputs with additional unseen recordings.
 
         Args:
             validate: paths, each with a cut if wanted, or recordings in memory.
@@ -112,7 +112,7 @@ def gather(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> IdentificationInputs:
-    """Read the robot and all recordings, and make motions of them.
+    """Return the inputs of an identification from files: the robot, and all recordings as motions.
 
     Args:
         robot: see `calib.robot.load`; or as a geometric fit returns it.
@@ -160,19 +160,19 @@ def gather(
 
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
-    """Refuse a recording that carries what neither the training recordings nor the options say the weight of."""
+    """Refuse an unseen recording with a payload that is neither in the training recordings nor in the options."""
     known = {*settings.payload_values, *(label for label, load in settings.payloads.items() if load.parameters)}
     known.update(label for case in cases for label in case.carried)
     for case in unseen:
         for label in set(case.carried) - known:
             raise UsageError(
-                f"{case.name} carries '{label}', which no recording to learn from carries: state mass and com under "
-                f"[payload.{label}], or learn from a recording with it"
+                f"payload '{label}' of {case.name} is in no training recording; state its mass and com under "
+                f"[payload.{label}], or add a training recording with it"
             )
 
 
 def _path(each: str | Path | Recording) -> str:
-    """Return the path of a recording; of one in memory its file and span, so that two cuts of a file differ."""
+    """Return the path of a recording; in memory, its file and time span (so that two cuts of a file differ)."""
     if not isinstance(each, Recording):
         return str(each)
     file, t = each.file or "recording", each.t[np.isfinite(each.t)]
@@ -180,7 +180,7 @@ def _path(each: str | Path | Recording) -> str:
 
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
-    """Return the options with the command's choices in them, held against what exists."""
+    """Return the options updated by the command's choices, and check the names in them."""
     from calib.identification.friction.friction_ladder import NAMES
     from calib.identification.methods.registry import METHODS
 
@@ -195,7 +195,7 @@ def _with_choices(options: IdentifyOptions, method: str | None, friction: str | 
 
 
 def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
-    """Return the case of one recording; payload and gains as the options, or the gain identification, say."""
+    """Return the case of one recording, with payload and gains from the options or from the gain identification."""
     own = options.file_settings(path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
     try:
@@ -210,7 +210,7 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, f
 def read_motion(
     given: str | Path | Recording, chain: Chain | Joints, own: FileSettings, like: Motion | None = None
 ) -> Motion:
-    """Return the motion of a recording, held against the robot's joints and limits.
+    """Return the motion of a recording, checked against the robot's joints and limits.
 
     Args:
         given: a path, with a cut if wanted, or the recording.
@@ -246,13 +246,13 @@ def _joints(values: np.ndarray) -> tuple[float, ...]:
 
 
 def joints_of(chain: Any) -> Joints:
-    """Return what a recording is held against: names and limits of an arm's, or a mechanism's, joints."""
+    """Return the names and limits of the joints of an arm or mechanism, for checking recordings."""
     limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
     return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
-    """Return the motion with a higher f_q, where the encoders are quiet enough: f_q ≥ 5 f_dyn is a least value.
+    """Return the motion with a higher f_q if the encoders have low noise: f_q ≥ 5 f_dyn is a minimum.
 
     f_q is doubled where noise stays below `QUIET` of every moving joint's rms acceleration (our choice).
     """
@@ -271,7 +271,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
 
 
 def _referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
-    """Return the motion with the reference of a file of its own, where the options name one."""
+    """Return the motion with its reference from a separate file, if the options name one."""
     own, loop = options.file_settings(path), options.settings.loop
     named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
     if not named or loop is None:
@@ -290,5 +290,5 @@ def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
         wanted = Path(name).parts
         if not any(path.parts[-len(wanted) :] == wanted for path in plain):
             shown = [path.name for path in plain]
-            message = f'{options.source}: files."{name}" is none of the recordings{suggestion(name, shown)}'
+            message = f'{options.source}: files."{name}" names none of the recordings{suggestion(name, shown)}'
             raise UsageError(f"{message}: {', '.join(shown)}")

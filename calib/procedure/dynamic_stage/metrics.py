@@ -39,7 +39,7 @@ MAX_POINTS = 400  # samples per curve of the certificate (our choice)
 
 @dataclass(frozen=True)
 class ParameterCounts:
-    """How many parameters the model has, are identifiable from any motion, and were kept."""
+    """Numbers of parameters: in the model, identifiable from any motion, and kept."""
 
     standard: int
     base: int
@@ -56,7 +56,7 @@ class ColumnCounts:
 
 @dataclass(frozen=True)
 class ConditionNumber:
-    """Of the observation matrix, in its units and with columns of unit norm."""
+    """Condition number of the observation matrix, in its units and with columns of unit norm."""
 
     raw: Number
     normalised: Number
@@ -74,13 +74,13 @@ class FilterMetrics:
 
     @classmethod
     def of(cls, motion: Motion) -> FilterMetrics:
-        """Return those of a motion."""
+        """Return the filter metrics of a motion."""
         return cls(motion.rate, motion.cutoff, motion.band, motion.decimator.factor, motion.velocity_cutoff)
 
 
 @dataclass(frozen=True, eq=False)
 class ConstraintMetrics:
-    """All constraints of an estimate, those at their bounds, and in how many postures M(q) is at its bound."""
+    """Constraints of an estimate, those at their bounds, and the number of postures with M(q) at its bound."""
 
     names: tuple[str, ...]
     binding: tuple[Binding, ...]
@@ -89,7 +89,7 @@ class ConstraintMetrics:
 
 @dataclass(frozen=True, eq=False)
 class LoopMetrics:
-    """What instruments from a simulated loop say of an estimate; a record.
+    """Results of a test of an estimate with instruments from a simulated loop.
 
     Attributes:
         failure: why there are no instruments.
@@ -124,7 +124,7 @@ class LoopMetrics:
 
     @classmethod
     def of(cls, bias: LoopTest, beside: bool) -> LoopMetrics | None:
-        """Return the record of a test by simulation; None where no loop was stated."""
+        """Return the metrics of a test by simulation; None if no loop was stated."""
         found, loops = bias.found, bias.loops
         notes = () if loops is None else loops.notes
         if found is None or loops is None:
@@ -139,13 +139,13 @@ class LoopMetrics:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JudgedMetrics:
-    """What a model beside recordings came to, as both files store it.
+    """Results of a model on recordings, as stored in both files.
 
     Attributes:
         verdict, reason: of the model.
         code, advice: of the finding that decided the verdict; empty for a pass, and in files of earlier versions.
-        noticed: the findings behind the warnings; what else is known of recordings and estimate is text only.
-        rows: what the torque rows are called.
+        noticed: the findings of the warnings; other remarks on recordings and estimate are text only.
+        rows: names of the torque rows.
         tracking: by recording that was replayed; or why none was.
     """
 
@@ -162,7 +162,7 @@ class JudgedMetrics:
 
 
 def _judged(found: Assessment) -> dict[str, Any]:
-    """Return what both records say of an assessment, but for the names of the rows."""
+    """Return the entries of an assessment common to both records, without the names of the rows."""
     replays = {one.name: one for one in found.tracking.replays}
     return {
         **dict(zip(("verdict", "reason", "code", "advice"), vars(found.verdict).values())),
@@ -199,7 +199,7 @@ class ModelMetrics(JudgedMetrics):
 
 
 def on_bounds(found: Identification) -> tuple[str, ...]:
-    """Return parameters that a constraint holds where they are: the data do not identify them, and have no σ of them.
+    """Return the parameters fixed by a constraint at its bound: the data do not identify them, and they have no σ.
 
     The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
     """
@@ -210,7 +210,7 @@ def on_bounds(found: Identification) -> tuple[str, ...]:
 
 
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
-    """Return the record of an identification."""
+    """Return the content of ``metrics.json`` for an identification."""
     found, inputs, held = outcome.found, outcome.inputs, outcome.found.fitted.held
     base, count = found.base, found.base.b + len(found.friction.terms)
     kept = count if found.elimination is None else len(found.elimination.kept)
@@ -251,7 +251,7 @@ class TorqueCurves:
 
     @classmethod
     def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
-        """Return them of a case and its prediction (N, rows)."""
+        """Return the curves of a case and its prediction (N, rows)."""
         picked = np.unique(np.linspace(0, len(case.target) - 1, MAX_POINTS).astype(int))
         shown = (np.asarray(x)[picked].T for x in (case.target, predicted))
         return cls(case.name, np.round(case.motion.t[picked], 4), *(_five_digits(x) for x in shown))
@@ -281,7 +281,7 @@ class UnseenReport(JudgedMetrics):
 
     @property
     def proofs(self) -> dict[str, Score]:
-        """Recordings that the model has not seen, by name; repeats of the training motion are none."""
+        """Scores on unseen recordings by name, without repeats of the training motion."""
         return {name: one for name, one in self.validation.items() if one.evidence}
 
 

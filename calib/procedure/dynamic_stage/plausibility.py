@@ -1,4 +1,4 @@
-"""What sizes, signs and clocks of recordings mean for a verdict: values for the catalogue's ninth chapter.
+"""Findings on sizes, signs and clocks of recordings (catalogue, chapter 9).
 
 The limits and sentences stand there. A finding that makes the numbers of a model wrong by far fails the verdict, or
 holds it at marginal, until the options' ``accept`` says that it is intended.
@@ -21,7 +21,7 @@ from calib.robot.description import impossible_bodies
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
-    """Return what is odd with recordings."""
+    """Return the findings on implausible recordings."""
     found: list[Finding] = []
     for each in sizes:
         speed = list(_speed(each, joints))
@@ -36,7 +36,7 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
 
 
 def wrong_joints(found: Mapping[str, Explanation | None], joints: Sequence[str]) -> list[Finding]:
-    """Return what it means that joints of recordings, by name, have another sign, or count from another joint."""
+    """Return the findings on joints, by name, with a reversed sign or an angle relative to another joint."""
     wrong = []
     for name, each in found.items():
         if each is None:
@@ -55,7 +55,7 @@ def wrong_joints(found: Mapping[str, Explanation | None], joints: Sequence[str])
 
 
 def impossible(found: Contradiction | None) -> list[Finding]:
-    """Return what it means that an estimate is far from every possible robot."""
+    """Return the finding that an estimate is far from every physically consistent robot."""
     if found is None:
         return []
     one = finding(
@@ -66,13 +66,13 @@ def impossible(found: Contradiction | None) -> list[Finding]:
 
 
 def described(chain: Chain) -> list[Finding]:
-    """Return what it means that bodies of the robot's description cannot exist."""
+    """Return the finding on physically inconsistent bodies in the robot's description."""
     wrong = impossible_bodies(chain)
     return [finding("inconsistent-bodies", bodies=wrong)] if wrong else []
 
 
 def another_loop(found: LoopDisagreement | None) -> list[Finding]:
-    """Return what it means that recorded torques refute an estimate that takes the loop for granted."""
+    """Return the finding that recorded torques contradict an estimate that relies on the stated loop."""
     if found is None:
         return []
 
@@ -93,7 +93,7 @@ def another_loop(found: LoopDisagreement | None) -> list[Finding]:
 
 
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Compare with the robot's own masses: signs, then sizes."""
+    """Yield findings on the signs and sizes of torques compared with the robot's masses."""
     share = each.masses
     sure = np.flatnonzero(np.isfinite(share)).tolist()
     if not sure:
@@ -108,7 +108,7 @@ def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 
 
 def _off(ratio: np.ndarray | np.floating) -> float:
-    """Return by how many times a ratio, the worst of several, is too large or too small."""
+    """Return the largest factor by which one of several ratios differs from 1."""
     sizes = np.maximum(np.abs(ratio), 1e-300)
     return float(np.maximum(sizes, 1.0 / sizes).max())
 
@@ -156,7 +156,7 @@ def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 
 
 def _against(clock: ClockRatio | None, usual: float) -> str:
-    """Return whether inertias over masses speak against the stamps or the velocities; empty where they cannot say."""
+    """Return which is wrong by the ratio of inertias to masses, stamps or velocities; empty if undecided."""
     if clock is None:
         return ""
     rods_sigma = 0.17  # relative, of a robot's inertias over masses from its lengths (our choice)
@@ -167,7 +167,7 @@ def _against(clock: ClockRatio | None, usual: float) -> str:
 
 
 def _unlike(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Name the joints whose measured velocities do not follow the positions."""
+    """Yield the finding on joints whose measured velocities do not match the positions."""
     backwards = [joints[j] for j in np.flatnonzero(each.follows < -FOLLOWS).tolist()]
     others = [joints[j] for j in np.flatnonzero(np.abs(each.follows) <= FOLLOWS).tolist()]
     if backwards or others:

@@ -1,6 +1,6 @@
-"""A model beside recordings, and what that comes to: one assessment for all who ask.
+"""Assessment of a model on recordings: predictions, errors, and the verdict.
 
-`assess` is called of a model that was just identified and of one read back from its folder; they get the same answer.
+`assess` returns the same result for a new model and for one read from its folder.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,11 +52,11 @@ MAX_REPLAYS = 3  # recordings that are replayed
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """What replaying recordings came to.
+    """Result of replaying recordings.
 
     Attributes:
         replays: one per recording.
-        failure: why there is none.
+        failure: reason for a missing replay.
     """
 
     replays: tuple[Replay, ...] = ()
@@ -65,15 +65,15 @@ class Tracking:
 
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
-    """What an identification says of its model and a verdict needs beside the recordings; a record of its folder.
+    """Findings of an identification that the verdict needs besides the recordings; stored in its folder.
 
     Attributes:
         rests: its parameters that rest on a prior.
-        notes: what folders of earlier versions say of the model, as text.
+        notes: remarks on the model in folders of earlier versions, as text.
         noticed: findings on the model, whatever the unseen recordings are.
         controller: that was stated or identified; None without any.
         errors: what makes errors of its torques likely; None where too little was recorded to say.
-        contradiction: how far it is from every possible robot; None where nobody knows.
+        contradiction: its distance from every physically consistent robot; None if unknown.
         unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
     """
 
@@ -88,13 +88,13 @@ class ModelFindings:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """A model beside the recordings, and what that comes to.
+    """Errors of a model on the recordings, and the verdict.
 
     Attributes:
         fit, validation: case name → its score.
         predictions: case name → predicted torques (N, rows) at the full rate.
         repeated: validation case → share of its states that the training motion has been in, where it is no proof.
-        excitation: case name → what the motion can tell.
+        excitation: case name → what the motion can identify.
         verdict: as of `calib.procedure.dynamic_stage.verdict`.
         warnings: what a user should know of the recordings, and of the model.
         noticed: the findings behind the warnings.
@@ -115,13 +115,13 @@ class Assessment:
 
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
-    """Return the unseen recordings that are no evidence: name → share of the states that training has been in."""
+    """Return the unseen recordings that repeat training motion: name → share of their states in the training."""
     shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
     return {name: share for name, share in shares.items() if share >= REPEAT}
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
-    """Return which samples of files are to be unseen and yet training data."""
+    """Return the findings on samples that are both unseen and training data."""
     found = []
     for case, own in product(unseen, cases):
         first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
@@ -138,7 +138,7 @@ def assess(
     wrong: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Assessment:
-    """Predict every recording and judge: in the command, and of a model read from its folder.
+    """Return the predictions of every recording by a model, their errors, and the verdict.
 
     Args:
         inputs: training recordings (for the model's own error) and unseen ones.
@@ -213,7 +213,7 @@ def track(
     predictions: Mapping[str, np.ndarray],
     controller: Controller | None = None,
 ) -> Tracking:
-    """Replay unseen recordings (or, without any, one of the fit's own); see `calib.identification.loop.replay`.
+    """Return replays of unseen recordings (else of a training recording); see `calib.identification.loop.replay`.
 
     Args:
         predictions: case name → torques by the model.

@@ -1,4 +1,4 @@
-"""May one trust an identified model? The rules' limits and sentences stand in the catalogue, chapters 9 to 11.
+"""Verdict on an identified model; its limits and sentences are in the catalogue, chapters 9 to 11.
 
 The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
 validation recording in which the robot moves and which does not repeat the training, beside the training's own error in
@@ -34,7 +34,7 @@ SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb frict
 
 @dataclass(frozen=True)
 class Resting:
-    """Base parameters that rest on a prior, not on the motion.
+    """Base parameters determined by a prior, not by the motion.
 
     Attributes:
         names: theirs.
@@ -48,7 +48,7 @@ class Resting:
 
     @property
     def origin(self) -> str:
-        """What their values come from, in words."""
+        """Source of their values, as text."""
         return "CAD values" if self.source == "cad" else "the usual sizes of such parameters"
 
 
@@ -60,7 +60,7 @@ def judge(
     rows: Sequence[str] = (),
     coordinate: str = "joint",
 ) -> tuple[str, list[Finding]]:
-    """Judge an identification by motion it has not seen: return the figures in a sentence, and what speaks against it.
+    """Return the torque errors on unseen motion as a sentence, and the findings against the model.
 
     Recordings in which the robot stands are left aside. Of the sum over joints the worst of the findings
     ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained``, ``no-torque-transfer``, of equals the
@@ -100,13 +100,13 @@ def judge(
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:
-    """Return the finding that friction drives joints; `payload`: what a robot may be carrying besides."""
+    """Return the finding that friction of joints adds energy; `payload`: label of a possible payload."""
     names = [str(one) for one in joints]
     return [finding("friction-drives", joints=names, payload=payload)] if names else []
 
 
 def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) -> Verdict:
-    """Return a verdict that is no pass with its likely cause first: training motion that is too short."""
+    """Return the verdict; if it is not pass and the training motion is too short, with this cause first."""
     seconds = sum(report.seconds for report in excitation.values())
     min_motion = 3.0  # of all training files together [s] (our choice)
     if verdict.level == "pass" or not excitation or seconds >= min_motion:
@@ -116,7 +116,7 @@ def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) 
 
 
 def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -> list[Finding]:
-    """Return the joints that the model does not explain.
+    """Return the finding on joints whose torque the model does not explain.
 
     Taken in the band, since noise is no fault of the model, and moving, since friction at rest takes any value.
     """
@@ -135,7 +135,7 @@ def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -
 
 
 def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> list[Finding]:
-    """Return the first unseen case whose errors are larger than the model states, beyond chance.
+    """Return the finding on the first unseen case with errors larger than their intervals, beyond chance.
 
     Args:
         expected: by unseen case.
@@ -161,7 +161,7 @@ def extrapolates(name: str, expected: TorqueIntervals) -> list[Finding]:
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
-    """Return the verdict with it said where most parameters are not the motion's: what they are worth, CAD knows."""
+    """Return the verdict, with a remark if most parameters come from a prior instead of the motion."""
     if 2 * len(rests.names) <= rests.of:
         return verdict
     one = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
@@ -169,7 +169,7 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
 
 
 def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
-    """Return what a user should know of the recordings' motion, whatever the robot."""
+    """Return the findings on the motion of recordings, for any robot."""
     return [
         *(finding("repeats-training", file=name, share=share) for name, share in repeated.items()),
         *(finding("stands", file=name) for name, one in validation.items() if one.motion_share < MOVES),
@@ -177,18 +177,18 @@ def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, floa
 
 
 def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
-    """Return what training motion cannot tell, by file."""
+    """Return remarks on what the training motion cannot identify, by file."""
     return [f"{name}: {note}" for name, report in excitation.items() for note in report.notes]
 
 
 def model_findings(cases: Sequence[Case], found: Identification) -> tuple[Finding, ...]:
-    """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
+    """Return the findings on the model and its training motion, independent of unseen motion."""
     loop = found.bias.findings(found.fitted.instrumental is not None)
     return *parameter_findings(found), *loop, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)
 
 
 def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
-    """Return what a user should know of the parameters, whatever the robot: condition, bounds, signs, prior."""
+    """Return the findings on the parameters, for any robot: condition, bounds, signs, prior."""
     rests = resting_parameters(found)
     prior = finding("regularised", count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
     condition = settle([finding("motion-condition", condition=found.condition[1])])
@@ -197,7 +197,7 @@ def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:
-    """Return the joints that a recording takes far beyond the robot's limits."""
+    """Return the finding on joints that a recording moves far beyond the robot's limits."""
     q = np.asarray(case.motion.q)
     over = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
     far = np.flatnonzero(np.isfinite(over) & (over > BEYOND * (chain.upper - chain.lower)))
@@ -217,7 +217,7 @@ def resting_parameters(found: Identification[Any]) -> Resting:
 
 
 def _negative(found: Identification[Any]) -> list[Finding]:
-    """Return the inertia and friction of drives that are below zero by more than `SURELY` sigmas."""
+    """Return the finding on drive inertias and friction that are negative by more than `SURELY` sigmas."""
     estimate = found.fitted.estimate
     wrong = [
         f"{name} = {value:.3g} ± {sigma:.2g}"
@@ -228,7 +228,7 @@ def _negative(found: Identification[Any]) -> list[Finding]:
 
 
 def _unmodelled(found: Identification) -> list[Finding]:
-    """Return the joints with autocorrelated residuals, whose sigmas hold for this motion alone."""
+    """Return the finding on joints with autocorrelated residuals, whose sigmas are valid for this motion only."""
     alike = np.nan_to_num(found.fitted.inflation)
     rows = found.settings.torque_rows.numbered(found.dynamics.model.n)
     joints = [f"{rows[k]} (effective samples 1/{alike[k]:.0f})" for k in np.flatnonzero(alike >= MAX_CORRELATED_ROWS)]
@@ -236,7 +236,7 @@ def _unmodelled(found: Identification) -> list[Finding]:
 
 
 def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
-    """Yield where second encoders show that joints bend."""
+    """Yield the findings on joints whose second encoders show elasticity."""
     for case in cases:
         if case.motion.q_link is None:
             continue
@@ -246,7 +246,7 @@ def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
 
 
 def _slow_bias(cases: Sequence[Case], found: Identification) -> list[Finding]:
-    """Notice that rows of joints near standstill, where friction takes any value, are in the fit."""
+    """Return the finding that rows near standstill, where friction can have any value, are in the fit."""
     total = np.zeros(cases[0].motion.n)
     size = 0
     for case in cases:
@@ -262,14 +262,14 @@ def _slow_bias(cases: Sequence[Case], found: Identification) -> list[Finding]:
 
 
 def _coulomb(found: Identification) -> dict[int, int]:
-    """Return by joint where the estimate holds its Coulomb friction, of models of the motors' torques."""
+    """Return the index of each joint's Coulomb friction in the estimate, for models of motor torques."""
     if not found.settings.torque_rows.motors_alone:
         return {}
     return {one.joint: k for k, one in enumerate(found.terms) if one and one.shape == "sign" and one.joint is not None}
 
 
 def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[Finding]:
-    """Notice that the few rows near standstill move Coulomb friction by more than its sigma.
+    """Return the finding that few rows near standstill change Coulomb friction by more than its sigma.
 
     Where a joint's friction is richer, they are modelled, not cut.
     """

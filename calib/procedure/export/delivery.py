@@ -1,4 +1,4 @@
-"""The calibrated robot in the forms other programs read; each file is read back before it is put in place.
+"""Export of the calibrated robot to the formats of other programs; each file is verified by reading it back.
 
 ``calib export FIT --into DIR [--urdf SOURCE.urdf]`` writes, from the folder of a fit, robot.toml, robot.urdf,
 joint_offsets.csv, the joint corrections where there are any, and ur_kinematics.yaml of a UR arm;
@@ -81,13 +81,13 @@ DRIVE_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Export:
-    """What the files of an export are made of.
+    """Sources of an export: nominal robot, fit and identification.
 
     Attributes:
         source: description of the nominal robot: a URDF is edited in place, else a URDF is written anew.
         fit: folder of the fit; None: identified dynamics alone.
         identified: folder of the identification; None: geometry alone.
-        prior: what masses that the torques do not identify are regularised towards, see
+        prior: regularisation of masses that the torques do not identify, see
             `calib.identification.possible.solve.PRIORS`.
         remark: for the head of files that a robot or a simulation moves by.
     """
@@ -112,12 +112,12 @@ class Export:
 
     @property
     def urdf(self) -> Path | None:
-        """The source where it is a URDF."""
+        """Path of the source if it is a URDF; else None."""
         return self.source if self.source is not None and self.source.suffix == ".urdf" else None
 
     @cached_property
     def with_masses(self) -> tuple[str, list[str]]:
-        """The URDF with identified masses and friction, and notes."""
+        """URDF with identified masses and friction, and remarks."""
         found = self.dynamics
         if self.urdf is None:
             return as_urdf(found, urdf_write.write_new(found.chain), "the chain's own URDF", found.chain)
@@ -125,7 +125,7 @@ class Export:
 
     @property
     def files(self) -> list["ExportFile"]:
-        """The files this export may leave, in the order they are written."""
+        """Files that this export may write, in the order of writing."""
         stages = {GEOMETRY: self.fit is not None, DYNAMICS: self.identified is not None}
         return [one for one in FILES if any(stages[stage] for stage in one.stages)]
 
@@ -207,15 +207,15 @@ def _parameters(export: Export, path: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class ExportFile:
-    """A file that an export leaves.
+    """One file of an export.
 
     Attributes:
         name: in the folder.
-        write: writes it at a path where the robot has such, and returns what to know of it.
+        write: writes it to a path if the robot has such data, and returns remarks.
         use: for README.txt.
-        stages: of which it is made.
+        stages: stages whose results it contains.
         deliverable: whose verdict holds for it; empty: neither robot nor simulation moves by it.
-        marked: its head states a verdict that is no pass.
+        marked: its head states a verdict other than pass.
     """
 
     name: str
@@ -248,7 +248,7 @@ FILES = (
 
 
 def deliver(export: Export, out: Path) -> list[str]:
-    """Write the calibrated robot into the folder `out`, in all forms (see the module).
+    """Write the calibrated robot into the folder `out`, in all formats (see the module).
 
     Returns:
         What was written and what to know of it, in words.
@@ -268,7 +268,7 @@ def deliver(export: Export, out: Path) -> list[str]:
 
 
 def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
-    """Write files by the names they have in `FILES`, each to a path of its own.
+    """Write the named files of `FILES`, each to its own path.
 
     Returns:
         What was written and what to know of it, in words.
@@ -277,7 +277,7 @@ def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
 
 
 def check_into(export: Export, into: Path, folder: Path) -> None:
-    """Refuse, before any work is done, a folder for exports that cannot be one, or holds what is read or another's.
+    """Refuse, before any work is done, an export folder that is not usable, or that contains inputs or other files.
 
     Args:
         into: where the files are to go.
@@ -292,7 +292,7 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
 
 
 def verdicts(folder: Path) -> Verdicts:
-    """Return what was judged of a fit or an identification, by its folder; in a session by unseen rows.
+    """Return the verdicts on a fit or an identification, from its folder; in a session, on unseen rows.
 
     Empty where the folder is of an earlier version and does not say it, or where its session has yet to judge it.
     """
@@ -310,21 +310,21 @@ def verdicts(folder: Path) -> Verdicts:
 
 
 def by_file(out: Path, found: Verdicts) -> dict[str, Verdicts]:
-    """Return what was judged of each exported file that is there, and that a robot or a simulation may move by."""
+    """Return the verdicts on each existing exported file that a robot or a simulation uses for motion."""
     dynamic = (out / PARAMETERS).exists()
     judged = [file for file in FILES if file.deliverable and (out / file.name).exists()]
     return {file.name: found.of(file.deliverable, dynamic and "dynamics" in file.stages) for file in judged}
 
 
 def prediction(out: Path) -> ExportedPrediction | None:
-    """Return how well an exported robot predicts torques; None without dynamics, or where that is not known."""
+    """Return the torque prediction errors of an exported robot; None without dynamics, or if unknown."""
     path = out / PARAMETERS
     found = json.loads(path.read_text(encoding="utf-8")).get("prediction") if path.exists() else None
     return None if found is None else ExportedPrediction(**found)
 
 
 def mark(out: Path, found: Verdicts) -> list[str]:
-    """Write verdicts that are no pass at the head of the exported files, and what each file is for into a README.txt.
+    """Write verdicts other than pass at the head of the exported files, and the use of each file into a README.txt.
 
     Args:
         out: the folder of the export.
@@ -347,7 +347,7 @@ def mark(out: Path, found: Verdicts) -> list[str]:
 
 
 def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
-    """Yield what each exported file is for, and the verdict on it."""
+    """Yield the use of each exported file, and the verdict on it."""
     holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses as in the source"
     for file in FILES:
         name = file.name

@@ -1,4 +1,4 @@
-"""The calibrated geometry in the forms other programs read: a URDF in place, UR's kinematics YAML, joint offsets."""
+"""Export of the calibrated geometry: an edited URDF, UR's kinematics YAML, joint offsets."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ MAX_DIFFERENCE = 1e-9  # of poses read back [m, and as a rotation matrix], and o
 
 
 class NoSuchArm(UsageError):
-    """The arm is none of the kind that a file format is for."""
+    """Error for an arm of a kind that a file format does not support."""
 
 
 def read(folder: Path) -> CalibratedChain:
@@ -34,7 +34,7 @@ def read(folder: Path) -> CalibratedChain:
         UsageError: where it is none, or does not say what it was calibrated from.
     """
     if not FitFolder(folder).robot.is_file():
-        raise UsageError(f"{folder} holds no robot.toml; give the folder that `calib fit --out` has written")
+        raise UsageError(f"{folder} contains no robot.toml; give the folder written by `calib fit --out`")
     robot = calibrated.read(folder)
     if robot.nominal is None:
         raise UsageError(f"{folder}/robot.toml does not say which nominal robot it was calibrated from; fit again")
@@ -42,12 +42,12 @@ def read(folder: Path) -> CalibratedChain:
 
 
 def results(folder: Path) -> list[Path]:
-    """Return the files of a fit's or an identification's folder that make it one: no export replaces them."""
+    """Return the essential files of a fit's or an identification's folder, which no export may replace."""
     return [folder / name for name in files_of(folder, (*OURS, *identification.OURS))]
 
 
 def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = False) -> tuple[bytes, str]:
-    """Return the XML of `source` with the calibrated geometry, and who has read it back.
+    """Return the XML of `source` with the calibrated geometry, and a sentence on the programs that verified it.
 
     Only the origins of the arm's joints change. The base link stays where the nominal robot has its base, and the fixed
     joints behind the last moving one stay as they are: the choice of base and flange is the source's.
@@ -64,10 +64,10 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
-    """Refuse a URDF text in which Pinocchio or yourdfpy sees other poses than this toolkit does (`MAX_DIFFERENCE`).
+    """Refuse a URDF text with other poses in Pinocchio or yourdfpy than in this toolkit (`MAX_DIFFERENCE`).
 
     Returns:
-        Who has read it; a text that yourdfpy cannot read is not refused, and why is said.
+        The programs that have read it. A text that yourdfpy cannot read is accepted, and the reason is stated.
     """
     tree = read_tree(edited, where)
     named = chain.joint_names if chain.joint_names[0] in tree.joints else None
@@ -76,7 +76,7 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     q = random_joints(own, 20, 0)
     error = float(np.abs(tip_poses(edited, own, q) - forward(own, q)).max())
     if error > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: Pinocchio reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
+        raise RobotError(f"{where}: poses differ by {error:.2g} when Pinocchio reads the URDF; nothing was written")
     few = q[:5]
     try:
         seen = link_poses(edited, (*own.links, own.tip), own.base, own.joint_names, few)
@@ -85,12 +85,12 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     straight = np.stack([invert(urdf.align(tree.above[link].axis)) for link in own.links])[:, None]  # of slanted axes
     error = float(np.abs(seen - np.concatenate([joint_frames(own, few) @ straight, forward(own, few)[None]])).max())
     if error > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: yourdfpy reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
+        raise RobotError(f"{where}: poses differ by {error:.2g} when yourdfpy reads the URDF; nothing was written")
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
 def export_offsets(robot: CalibratedChain, out: Path) -> Path:
-    """Write calibrated minus nominal of each joint's own value: what a controller adds to the angle it reads.
+    """Write the offset (calibrated minus nominal) of each joint, to be added to the controller's joint value.
 
     Where the fit has joint corrections, offsets and their sigmas are those of the best geometry without them: for
     whoever does not apply them.
@@ -115,12 +115,12 @@ def ur_kinematics(robot: CalibratedChain) -> str:
     Raises:
         NoSuchArm: for an arm that has not UR's axes.
     """
-    with refused_as(NoSuchArm, RobotError, f"'{robot.chain.name}' has not the axes of a UR arm: {{}}"):
+    with refused_as(NoSuchArm, RobotError, f"'{robot.chain.name}' does not have the axes of a UR arm: {{}}"):
         return origin_files.kinematics(nominal_of(robot), robot.chain)
 
 
 def flange_note(robot: CalibratedChain) -> str:
-    """Say where UR's flange was taken to be, where the robot's file has something behind its last joint."""
+    """Return a remark on the assumed position of UR's flange, if a fixed joint follows the last joint."""
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]

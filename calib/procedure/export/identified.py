@@ -1,4 +1,4 @@
-"""An identification made ready for export: its estimate, all parameters of possible bodies, and what to say of them."""
+"""Preparation of an identification for export: estimate, physically consistent parameters, and remarks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,13 +26,13 @@ MAX_MASS_RATIO = 3.0  # times a body's mass in the description from which on it 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedRobot:
-    """An identified robot, ready to be written.
+    """Identified robot with physically consistent bodies, ready for export.
 
     Attributes:
         robot: the geometry, with that before calibration.
         information: the estimate.
-        found: all its parameters, of possible bodies.
-        bodies: (B, 10) of the arm's own bodies, payloads left out.
+        found: all its parameters, of physically consistent bodies.
+        bodies: (B, 10) of the arm's bodies, without payloads.
         drives: by joint.
     """
 
@@ -48,17 +48,17 @@ class IdentifiedRobot:
 
     @property
     def arm(self) -> Bodies:
-        """The arm's bodies under the gravity it was identified with."""
+        """Bodies of the arm with the gravity of the identification."""
         return bodies_of(self.chain).with_gravity(self.found.dynamics.model.bodies.gravity)
 
 
 def is_identified(folder: Path) -> bool:
-    """Say whether a folder is that of an identification."""
+    """Return whether a folder is that of an identification."""
     return (folder / MODEL).is_file()
 
 
 def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
-    """Return what an identification left, all parameters made those of possible bodies by a prior (`find_possible`)."""
+    """Return the robot of an identification's folder, made physically consistent by a prior (`find_possible`)."""
     refuse_currents(folder, "an export of masses")
     information = read_information(folder)
     found = find_possible(information, prior=prior)
@@ -84,7 +84,7 @@ class ExportedPrediction:
 
 
 def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
-    """Return how well the exported robot predicts torques, of the worst recording beside the model in `folder`.
+    """Return the torque prediction error of the exported robot, on the worst recording in `folder`.
 
     None where these recordings carry payloads or are by a version that did not keep their speeds.
     """
@@ -101,7 +101,7 @@ def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPredict
 
 
 def notes_of(given: IdentifiedRobot) -> list[str]:
-    """Return what consistency cost, what the bodies written weigh, and what is in none of the robot files."""
+    """Return findings on the exported inertias and masses, and on parameters that no robot file contains."""
     solved, chain, bodies = given.found, given.chain, given.found.dynamics.model.bodies
     masses, theirs = given.bodies[:, 9], [] if chain.inertias is None else chain.inertias[:, 9]
     found = [

@@ -1,4 +1,4 @@
-"""Masses and friction of an identified robot in a URDF and in MJCF, each checked against what Pinocchio reads."""
+"""Export of identified masses and friction to URDF and MJCF, each verified by reading it with Pinocchio."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -56,7 +56,7 @@ def as_urdf(given: IdentifiedRobot, content: str, where: str, nominal: Chain) ->
 
 
 def _own_chain(tree: UrdfTree, chain: Chain) -> Chain:
-    """Return the chain as the URDF has it, in the frames of its links, under the identified chain's gravity."""
+    """Return the chain of the URDF, in its link frames, with the gravity of the identified chain."""
     named = chain.joint_names if chain.joint_names[0] in tree.joints else None
     base = chain.base if chain.base in tree.bodies else None
     own = urdf.build(tree, *urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
@@ -83,26 +83,26 @@ def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[di
         if others and not pseudo_inertia.margin(links[joint.child]) > 0.0:
             links |= {joint.child: rest, **{name: np.zeros(10) for name in others}}
             notes.append(
-                f"link {joint.child}: with what {', '.join(others)} weigh in the URDF the rest would be no possible "
-                "body, so it takes all, and they have mass zero"
+                f"link {joint.child}: it has the whole mass, and {', '.join(others)} have mass zero: with their masses "
+                "in the URDF the remaining body is not physically consistent"
             )
         if not pseudo_inertia.margin(links[joint.child]) > 0.0:
             raise RobotError(
-                f"{tree.where}: link '{joint.child}' would have to be no possible body, since what hangs on it "
-                f"({', '.join(loose)}) is heavier than what was identified: are the drives' gains "
-                "known? Correct those masses, or leave the URDF out (--urdf) for all other files"
+                f"{tree.where}: link '{joint.child}' is not physically consistent, since the attached links "
+                f"({', '.join(loose)}) are heavier than the identified mass: are the drive gains "
+                "right? Correct those masses, or omit --urdf to write all other files"
             )
     return links, notes
 
 
 def _sum(tree: UrdfTree, placed: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the standard parameters (10,) of links together, as the URDF has them."""
+    """Return the summed standard parameters (10,) of links in the URDF."""
     found = [(tree.bodies[name], pose) for name, pose in placed.items()]
     return sum((transform_body(body, pose) for body, pose in found if body is not None), np.zeros(10))
 
 
 def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
-    """Compare with what Pinocchio reads: frames and torques of random motion, motor inertia where there is some."""
+    """Refuse a file if Pinocchio reads other frames, torques, motor inertias or friction, on random motion."""
     rng = np.random.default_rng(0)
     q = random_joints(given.chain, 20, 0)
     v, a = rng.uniform(-1.0, 1.0, (2, *q.shape))
@@ -112,12 +112,12 @@ def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         wanted = wanted + given.drives.values[:, 0] * a
         away = float(np.abs(frames - moving_frames(given.chain, q)).max())
         if away > MAX_DIFFERENCE:
-            raise RobotError(f"{where}: Pinocchio reads other poses, by {away:.2g}; nothing was written")
+            raise RobotError(f"{where}: poses differ by {away:.2g} when Pinocchio reads the file; nothing was written")
     off = float(np.abs(torques - wanted).max()) / max(1.0, float(np.abs(wanted).max()))
     if off > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: Pinocchio reads other torques, by {off:.2g} of the largest; nothing was written. Do other "
-            "joints of the file carry mass that the arm's identification has not seen?"
+            f"{where}: torques differ by {off:.2g} of the largest when Pinocchio reads the file; nothing was written. "
+            "Do other joints of the file have masses that were not part of the identification?"
         )
     for what, read_back, own in (("damping", damping, 1), ("friction", friction, 2)):
         if not np.allclose(read_back, given.drives.values[:, own], rtol=MAX_DIFFERENCE, atol=1e-12):

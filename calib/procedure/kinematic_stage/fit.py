@@ -1,4 +1,4 @@
-"""The fit as the guided procedure runs it: select the model, judge on unseen rows, say what came of it."""
+"""Geometric fit of the guided procedure: model selection, verdict on unseen rows, and findings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +41,7 @@ HEEDS_ALL = ("none", "huber")  # losses that let a few gross rows draw a fit
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a fit came to.
+    """Outcome of a fit.
 
     Attributes:
         inputs: what it worked on.
@@ -68,28 +68,28 @@ class Outcome:
 
     @property
     def robot(self) -> CalibratedChain:
-        """The calibrated robot with covariance and corrections: what identification, excitation and export take."""
+        """Calibrated robot with covariance and corrections, for identification, excitation and export."""
         found = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
         return replace(found, source=str(self.inputs.source))
 
     @property
     def fit(self) -> Comparison:
-        """The two arms on the fit's rows."""
+        """Errors of both arms on the fitted rows."""
         return self.assessment.fit
 
     @property
     def validation(self) -> Mapping[str, Comparison]:
-        """The two arms on unseen rows, by file name."""
+        """Errors of both arms on unseen rows, by file name."""
         return self.assessment.validation
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a user should know."""
+        """Warnings for the user."""
         return self.assessment.warnings
 
     @property
     def verdict(self) -> Verdict:
-        """Pass, marginal or fail, with its reason."""
+        """Verdict (pass, marginal or fail) with its reason."""
         return self.assessment.verdict
 
 
@@ -103,7 +103,7 @@ def run(
     progress: Progress | None = None,
     selection: SelectionPrediction | None = None,
 ) -> Outcome:
-    """Fit, compare on all rows, and judge.
+    """Return the outcome of a fit: the model, errors on all rows, and the verdict.
 
     Args:
         inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
@@ -158,7 +158,7 @@ def run(
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
         notes.append(ratio)
     findings = _found_of(inputs, found, named, notes, torques, options.accept)
-    say("learning what errors to expect")
+    say("estimating the expected errors")
     expected = learn_errors(found, inputs.fit, torques, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
@@ -168,7 +168,7 @@ def run(
 
 
 def assessed(outcome: T, inputs: Inputs) -> T:
-    """Return an outcome judged anew on the unseen rows of `inputs`; nothing is fitted."""
+    """Return an outcome with a new verdict on the unseen rows of `inputs`; nothing is fitted."""
     wanted, options, fits = outcome.settings, outcome.options, outcome.selection
     settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
@@ -180,7 +180,7 @@ def _found_of(
     inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding],
     torques: Sequence[np.ndarray | None], accepted: Sequence[str],
 ) -> Findings:  # fmt: skip
-    """Return what a fit says of itself, whatever rows it has not seen; `notes` are findings on its residuals."""
+    """Return the findings of a fit that do not depend on unseen rows; `notes` are findings on its residuals."""
     long = inputs.chain.stretched_length()
     left = found.cross_validated
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
@@ -199,7 +199,7 @@ def _found_of(
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
-    """Return a finding where files share one station and one station per file explains them far better."""
+    """Return a finding if files share one station, but one station per file explains them far better."""
     own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []

@@ -1,4 +1,4 @@
-"""The folder of a fit, and that of its validation in a session: what is in them, written and read back.
+"""Folders of a fit and of its validation in a session: writing and reading their files.
 
 A fit's folder is written whole, beside its place, then moved there. Nothing else knows what its files are called.
 """
@@ -71,7 +71,7 @@ robot.toml holds the same geometry and terms, and `calib.robot.calibrated.read` 
 
 @dataclass(frozen=True)
 class FitFolder:
-    """The folder that a fit leaves: where its files are, and what they say."""
+    """Folder of a fit: paths of its files, and their content."""
 
     path: Path
 
@@ -82,7 +82,7 @@ class FitFolder:
 
     @property
     def urdf(self) -> Path:
-        """The best geometry without joint corrections."""
+        """Path of the URDF: the best geometry without joint corrections."""
         return self.path / URDF
 
     @property
@@ -92,7 +92,7 @@ class FitFolder:
 
     @property
     def residuals(self) -> Path:
-        """A row per measured one."""
+        """Path of the residuals, one row for each measured row."""
         return self.path / RESIDUALS
 
     @property
@@ -101,11 +101,11 @@ class FitFolder:
         return self.path / ESTIMATE, self.path / COVARIANCE
 
     def metrics(self) -> FitMetrics:
-        """Read numbers, verdict and findings."""
+        """Read the metrics: numbers, verdict and findings."""
         return _read(FitMetrics, self.path / METRICS)
 
     def findings(self) -> Findings:
-        """Read what the fit says of itself; schema 1 keeps it with the report, without the loss."""
+        """Read the findings of the fit; schema 1 stores them in the report, without the loss."""
         metrics = self.metrics()
         if metrics.findings is not None:
             return metrics.findings
@@ -113,7 +113,7 @@ class FitFolder:
         return read_record(Findings, _of_today(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
-        """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
+        """Read both arms; the frames of the nominal arm are fitted again to the fitted rows."""
         chosen = settings.combine(loss=self.findings().loss or settings.loss)
         cell = installation.read(self.path)
         rigid = calibrated.read(self.path).chain
@@ -127,7 +127,7 @@ class FitFolder:
         return ErrorModel(cell, free, covariance, np.concatenate([block.q for block in inputs.fit]), known)
 
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
-        """Read the joint values (m, n) [rad or m] of the fitted rows; None where the residuals are not there."""
+        """Read the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
         if not self.residuals.is_file():
             return None
         names = [shielded(f"{joint.name} [{joint.unit}]") for joint in joints]
@@ -138,7 +138,7 @@ class FitFolder:
 
 @dataclass(frozen=True)
 class ValidationFolder:
-    """The folder in a session that holds a fit against unseen rows: where its files are, and what they say."""
+    """Folder of a fit's validation on unseen rows in a session: paths of its files, and their content."""
 
     path: Path
 
@@ -149,12 +149,12 @@ class ValidationFolder:
 
     @property
     def errors(self) -> Path:
-        """A row per unseen one."""
+        """Path of the errors, one row for each unseen row."""
         return self.path / "errors.csv"
 
     @property
     def rows(self) -> Path:
-        """Errors of all rows, for figures."""
+        """Path of the errors of all rows, for figures."""
         return self.path / "rows.json"
 
     @property
@@ -163,14 +163,14 @@ class ValidationFolder:
         return self.path / REPORT
 
     def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
-        """Write errors, rows and, last, the metrics; return these."""
+        """Write errors, rows and, last, the metrics; return the metrics."""
         write_errors(self.errors, inputs.chain, found.validation)
         files.write_json(self.rows, rows)
         files.write_json(self.judged, found.record)
         return found.record
 
     def metrics(self) -> ValidationMetrics:
-        """Read numbers and verdict; of schema 1 the warnings are without the fit's."""
+        """Read numbers and verdict; in schema 1 the warnings do not include those of the fit."""
         return _read(ValidationMetrics, self.judged)
 
 
@@ -187,7 +187,7 @@ def _read(kind: type[T], path: Path) -> T:
 
 
 def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
-    """Return findings of schema 1 or 2, which kept sentences, as those of today."""
+    """Return findings of schema 1 or 2, which stored sentences, in the current form."""
     if "odd" not in findings and "notes" not in findings:
         return findings
     levels = {"fail": "earlier-fail", "marginal": "earlier-misfit"}
@@ -199,14 +199,14 @@ def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for a fit, or that holds one of its inputs."""
+    """Refuse, before any work is done, a folder that is not for a fit, or that contains one of its inputs."""
     check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
 def write_folder(
     outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None, *, owned: bool = False
 ) -> Path:
-    """Write all files of a fit, all or none; see `calib.folders`. An `owned` folder is ours, whatever is left in it."""
+    """Write all files of a fit, or none (see `calib.folders`); an `owned` folder is ours, whatever it contains."""
     if not owned:
         check_fit_target(out, [outcome.inputs.source])
 
@@ -256,7 +256,7 @@ def metrics(outcome: Outcome) -> FitMetrics:
 
 
 def _record(outcome: Outcome) -> dict[str, object]:
-    """Return what the provenance says of how the robot was calibrated, besides from what."""
+    """Return the provenance entries on how the robot was calibrated, without its source."""
     inputs = outcome.inputs
     again = inputs.earlier is not None and inputs.earlier.nominal is not None
     frames = {} if again else installation.frame_tables(outcome.selection.nominal.cell)
@@ -271,7 +271,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
 
 
 def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
-    """Write what a URDF cannot hold: the joint correction table and how to read it."""
+    """Write the table of joint corrections (a URDF cannot contain them), and how to apply it."""
     chain, deflection = corrections.chain, corrections.deflection
     units = dict(zip(chain.names, chain.units))
     owners = {element.name: element.joint for element in chain.elements}

@@ -1,4 +1,4 @@
-"""What a fit works on: the robot, the rows it may learn from, and the rows it must not see."""
+"""Inputs of a fit: the robot, the rows to fit, and the unseen rows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,13 +27,13 @@ from calib.robot.load import load, resolve
 
 @dataclass(frozen=True)
 class Unseen:
-    """Rows kept from the fit.
+    """Rows withheld from the fit.
 
     Attributes:
         block: the measurements; station and tool names are those of the fit unless ``own_frames``.
         own_frames: True where base and tool placement are to be fitted on these rows.
         held_out: True for a share of a fit file, False for a validation file.
-        seen: True where the same file was fitted on, so that its errors prove nothing.
+        seen: True if the same file was fitted, so that its errors are no evidence.
     """
 
     block: PoseMeasurements
@@ -44,14 +44,14 @@ class Unseen:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """A robot and its measurements, divided.
+    """Robot and measurements, divided into fitted and unseen rows.
 
     Attributes:
         chain: the nominal arm.
         source: the file it came from.
         fit: blocks to fit on.
         unseen: by the name of the file they come from.
-        notes: what a user should know about how the files were understood.
+        notes: remarks for the user on the interpretation of the files.
         earlier: the robot as its file has it, with what an earlier fit left there; None for a URDF.
     """
 
@@ -64,12 +64,12 @@ class Inputs:
 
     @property
     def known(self) -> Deflection:
-        """Joint corrections that came with the robot, from an earlier fit."""
+        """Joint corrections of the robot from an earlier fit."""
         return Deflection() if self.earlier is None else self.earlier.deflection
 
     @property
     def nominal(self) -> Chain:
-        """The arm before any calibration."""
+        """Nominal arm, before any calibration."""
         return self.chain if self.earlier is None or self.earlier.nominal is None else self.earlier.nominal
 
 
@@ -83,7 +83,7 @@ def gather(
     base: str | None = None,
     tip: str | None = None,
 ) -> Inputs:
-    """Read the robot and all files, name stations and tools, and set the unseen rows aside.
+    """Return the inputs of a fit from files: the robot, the named stations and tools, fitted and unseen rows.
 
     Args:
         robot: see `calib.robot.load`; or a robot in memory.
@@ -118,7 +118,7 @@ def gather(
         return given
     name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
     return replace(
-        given, notes=(*given.notes, f"{name} brings {count} deflection terms of an earlier fit; they stay as they are")
+        given, notes=(*given.notes, f"{name} brings {count} deflection terms of an earlier fit; they stay unchanged")
     )
 
 
@@ -139,7 +139,7 @@ def with_unseen(
         for block in read_file(each, given.chain, options, fit):
             again = _path(each).resolve() in files
             if again:
-                notes.append(f"{block.file} is a fit file too: its errors there say nothing of unseen poses")
+                notes.append(f"{block.file} is also a fit file: its errors are not those of unseen poses")
             shared = block if settings.refit_frames else _shared(block, fit, notes)
             unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=settings.refit_frames, seen=again)
     copied, remarks = repeated(fit, unseen)
@@ -154,7 +154,7 @@ def load_robot(
     base: str | None = None,
     tip: str | None = None,
 ) -> tuple[Chain, Path]:
-    """Return the chain `robot` names (or is) and its file; of a URDF, the chain of the joints that were measured."""
+    """Return the chain of `robot` (name or value) and its file; for a URDF, the chain of the measured joints."""
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
     source = resolve(robot)
@@ -191,7 +191,7 @@ def load_rigid(
 
 
 def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
-    """Refuse a table of joints that leaves out turning joints of the arm: they would stand wherever they are."""
+    """Refuse a table of joints in which revolute joints of the arm are missing: their positions would be unknown."""
     try:
         whole = load(source, base)
     except CalibError:  # the URDF does not say by itself where its arm ends
@@ -200,14 +200,14 @@ def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -
     if missing and set(chain.joint_names) < set(whole.joint_names):
         raise UsageError(
             f"{measured}: column '{missing[0]}' is missing: the arm of {source.name} has {whole.n} joints, {chain.n} "
-            f"are given; where it does end at {chain.tip}, say so: --tip {chain.tip}"
+            f"given; if it ends at {chain.tip}, give --tip {chain.tip}"
         )
 
 
 def read_file(
     each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
-    """Read one measurement file, or a folder of images, for a chain, held against its limits and what it can see.
+    """Read the measurements of a file (or folder of images) for a chain, and check them against its joint limits.
 
     Args:
         each, chain, options: what (or a block in memory, which is checked alike), for whom, and how.
@@ -234,7 +234,7 @@ def _path(each: Path | PoseMeasurements) -> Path:
 
 
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
-    """Divide a block into rows to fit and rows kept aside (None for a share of 0).
+    """Return the rows of a block to fit, and the rows held out (None for a share of 0).
 
     Poses are permuted, not rows: the reflectors of one pose stay together, and so do the two rows of a distance and the
     cycles of a repeated pose.
@@ -252,7 +252,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
 
 
 def _units(block: PoseMeasurements) -> np.ndarray:
-    """Return for each row the number (m,) of the pose (or measured pair) it belongs to, counted from 0.
+    """Return the index (m,) of the pose (or measured pair) of each row.
 
     Cycles of one repeated pose are one pose.
     """
@@ -266,14 +266,14 @@ def _units(block: PoseMeasurements) -> np.ndarray:
 
 
 def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
-    """Return how many robot poses the blocks hold (several reflectors seen at once are one pose)."""
+    """Return the number of robot poses in the blocks (several reflectors measured at once are one pose)."""
     return sum(len(np.unique(block.rows)) for block in blocks)
 
 
 def _named(
     read: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
-    """Name the stations and tools of the fit files as --stations and --tools say; no two things share a name.
+    """Return the fit files with stations and tools named by --stations and --tools; all names are distinct.
 
     Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
     """
@@ -296,19 +296,19 @@ def _named(
 
 
 def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return the name of what the arm holds, numbered from the second of its kind on."""
+    """Return the name of the tool of a file, numbered from the second tool of its kind."""
     number = [each for each in carried if each[0] == own[0]].index(own) + 1
     return f"{own[0]} {number}" if number > 1 else own[0]
 
 
 def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
-    """Return a file's name, or its path where a file of that name is there already."""
+    """Return a file's name, or its path if another file has the same name."""
     names = (Path(file).name, file, *(f"{file} ({number})" for number in range(2, len(taken) + 2)))
     return next(name for name in names if name not in taken)
 
 
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
-    """Return a validation block seen from a station of the fit, with the fit's tools."""
+    """Return a validation block with the fit's station and tools."""
     fit = [other for other in fit if other.carried == block.carried] or fit
     first = fit[0]
     if block.has_instrument:

@@ -1,4 +1,4 @@
-"""What ``metrics.json`` of a fit holds, as values: errors of both arms, the ladder, outliers, the verdict."""
+"""Content of a fit's ``metrics.json``: errors of both arms, the ladder of models, outliers, the verdict."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ SCHEMA = 3  # of metrics.json; 1 had no findings, 2 kept sentences in place of c
 
 @dataclass(frozen=True)
 class IntervalCoverage:
-    """Share of errors within the 95 % interval that the fit states, its width, and where the model extrapolates."""
+    """Share of errors within the fit's 95 % interval, the interval's width, and the rows that extrapolate."""
 
     coverage_percent: float
     median_mm: float
@@ -28,7 +28,7 @@ class IntervalCoverage:
 
 @dataclass(frozen=True)
 class ComparedRows:
-    """Both arms on one set of rows.
+    """Errors of both arms on one set of rows.
 
     Attributes:
         poses: how many robot poses.
@@ -56,13 +56,13 @@ class ComparedRows:
     reprojection_px: Mapping[str, float] = field(default_factory=dict)
 
     def judged(self, deliverable: str) -> ArmErrors:
-        """Return the errors of what is to be delivered."""
+        """Return the errors of the deliverable that the verdict is about."""
         return self.calibrated if deliverable != "urdf" or self.urdf_alone is None else self.urdf_alone
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row that does not fit: its residual in robust standard deviations of all rows, and in mm or deg."""
+    """Outlier: a row with its residual, in robust standard deviations of all rows and in mm or deg."""
 
     file: str
     row: int
@@ -73,18 +73,18 @@ class Outlier:
 
     @property
     def size(self) -> str:
-        """Its residual with the unit."""
+        """Residual with its unit, as text."""
         return f"{self.size_mm:.3g} mm" if self.size_deg is None else f"{self.size_deg:.3g} deg"
 
     @property
     def words(self) -> str:
-        """File, row and size."""
+        """File, row and residual, as text."""
         return f"{Path(self.file).name} row {self.row} ({self.size}, {self.sigmas:.1f} sigma)"
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What a verdict needs of a fit besides the errors on rows; kept in the fit's folder.
+    """Findings of a fit that its verdict needs besides the errors on rows; stored in the fit's folder.
 
     Attributes:
         model: the one chosen.
@@ -113,12 +113,12 @@ class Findings:
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationMetrics:
-    """What holding a fit against unseen rows came to: their errors, the verdict, what to know.
+    """Results of a fit on unseen rows: errors, verdict, warnings.
 
     Attributes:
-        deliverables: the verdict on each of `calib.procedure.kinematic_stage.settings.DELIVERABLES` that there is.
+        deliverables: the verdict on each existing one of `calib.procedure.kinematic_stage.settings.DELIVERABLES`.
         deliverable: which of them `verdict` and `reason` are about; empty in files of earlier versions.
-        noticed: the findings behind the warnings; what the reading of files noticed is text only.
+        noticed: the findings of the warnings; remarks from reading the files are text only.
         code, advice: of the finding that decided the verdict; empty for a pass.
     """
 
@@ -150,13 +150,13 @@ class FitMetrics(ValidationMetrics):
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:
-        """Sets of rows that the fit has not seen, by name."""
+        """Errors on the sets of unseen rows, by name."""
         return {name: rows for name, rows in self.validation.items() if rows.unseen}
 
 
 @dataclass(frozen=True)
 class ImageCoverage:
-    """Where in its images a camera saw corners, and how well they are predicted there.
+    """Number of corners in each cell of a camera's images, and their prediction errors.
 
     Attributes:
         file: the images' folder.

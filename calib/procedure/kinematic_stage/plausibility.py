@@ -1,4 +1,4 @@
-"""Findings on measurements that cannot be of this arm (catalogue, chapter 1): wrong columns, scale, large changes.
+"""Findings on measurements that contradict this arm (catalogue, chapter 1): wrong columns, scale, large changes.
 
 Rows that do not fit, and whether rigid geometry explains the measurements.
 """
@@ -25,7 +25,7 @@ TOO_GOOD = 2e-6  # rms [m]: less is left by no instrument (our choice)
 
 
 def named_outliers(found: GeometricFit) -> list[Outlier]:
-    """Return rows of the fit beyond four robust sigmas, worst first; several targets of one row count once."""
+    """Return the outliers of a fit (above four robust sigmas), worst first; several targets of one row count once."""
     result: dict[tuple[str, int, str], Outlier] = {}
     for file, row, label, sigmas, size in found.outliers():
         factor, unit = ERRORS[NATURE[label]]
@@ -35,7 +35,7 @@ def named_outliers(found: GeometricFit) -> list[Outlier]:
 
 
 def misfit(found: ModelSelection, reach: float) -> Finding | None:
-    """Return that no rigid geometry explains the measurements: the full one leaves more than `FLOOR` of the reach.
+    """Return a finding if no rigid geometry explains the measurements: the error exceeds `FLOOR` of the reach.
 
     Cross-validated, and on the fitted rows, degrees of freedom counted: few poses predict each other badly under any
     model, which says nothing against this one. Where the chosen model, joint corrections included, leaves less than
@@ -57,7 +57,7 @@ def misfit(found: ModelSelection, reach: float) -> Finding | None:
 
 
 def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
-    """Return that rows grossly off leave what `misfit` complains of; None where they do not.
+    """Return a finding if grossly wrong rows cause the error that `misfit` reports; else None.
 
     Args:
         found: the selection of models with a loss that heeds every row.
@@ -75,7 +75,7 @@ def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> F
 
 
 def _left(found: GeometricFit) -> float:
-    """Return the rms position error of a fit on its own rows [m], as if it had not used up degrees of freedom."""
+    """Return the rms position error of a fit on its own rows [m], corrected for degrees of freedom."""
     parts = [piece.part for piece in found.pieces]
     sizes = [part.sizes() for part in parts if NATURE[part.label] == "position"]
     rows, used = sum(part.height for part in parts), len(found.free) + sum(part.nuisances for part in parts)
@@ -96,7 +96,7 @@ def findings(
     left: float | None,
     reach: float,
 ) -> list[Finding]:
-    """Return what is odd with the rows of a fit, what explains most first.
+    """Return the findings on implausible rows of a fit, the one that explains most first.
 
     Args:
         nominal: the arm as it was, placed.
@@ -124,7 +124,7 @@ def findings(
 def _as_positions(
     blocks: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None]
 ) -> tuple[list[PoseMeasurements], list[np.ndarray | None]]:
-    """Return blocks and torques with some images as the poses they show: a board's square is the scale there."""
+    """Return blocks and torques with images replaced by the poses they show, scaled by the board's square."""
     shown = []
     for block, torque in zip(blocks, torques):
         if block.kind == IMAGES:
@@ -142,7 +142,7 @@ def _wrong_way(
     before: float,
     reach: float,
 ) -> list[Finding]:
-    """Return the change of columns that lets the nominal arm explain the rows."""
+    """Return the finding on the change of columns with which the nominal arm explains the rows."""
     if not before > FLOOR * reach:
         return []
     changed = wrong_columns(nominal, blocks, torques, mirrored=before > limit("unexplained", "share") * reach)
@@ -154,7 +154,7 @@ def _wrong_way(
 
 
 def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
-    """Return the elements of the arm, the largest change first, as a finding."""
+    """Return the finding on the fitted changes of the arm's elements, largest first."""
     changes = []
     for element, value, nominal in zip(fit.cell.chain.elements, fit.cell.chain.values, fit.start.chain.values):
         change = float(value - nominal)
@@ -168,7 +168,7 @@ def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
 
 
 def _scale(codes: tuple[str, str], one: Scale | None) -> list[Finding]:
-    """Return the first of two findings on a factor that has a level."""
+    """Return the first of two findings on a scale factor that reaches a level."""
     if one is None:
         return []
     off = abs(one.factor - 1.0)

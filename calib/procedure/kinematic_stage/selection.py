@@ -1,4 +1,4 @@
-"""Choosing the poses to measure: a robot's observation Jacobian handed to the package `poses`."""
+"""Selection of the poses to measure, from a robot's observation Jacobian and with the package `poses`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -41,13 +41,13 @@ TYPICAL = 300  # poses all over the workspace, seen or not, at which the tool's 
 
 @dataclass(frozen=True, eq=False)
 class PoseOutlook:
-    """What the chosen poses will determine, before anything is moved.
+    """Predicted accuracy of a calibration with the chosen poses, before measuring.
 
     Attributes:
         poses: of the fit on the chosen poses.
-        others: with other numbers of poses, chosen greedily.
-        blind: index and prediction if no pose had to be seen; None where nothing is asked of the sight.
-        comparable: the index of the chosen poses by the same choice as `blind`.
+        others: of other numbers of poses, chosen greedily.
+        blind: index and prediction without line-of-sight constraints; None if there are none.
+        comparable: index of poses chosen in the same way as `blind`, with line of sight.
     """
 
     poses: Prediction
@@ -58,15 +58,15 @@ class PoseOutlook:
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A selection with what it was made for.
+    """Selected poses with their robot, constraints and predicted accuracy.
 
     Attributes:
         chain: the nominal arm.
         selection: see `poses.select`.
         parameters: how many are identifiable from the measurements.
-        existing: index of the poses measured before alone; None without them, or where they are too few.
-        checked, unchecked: what the poses were held against, and what they could not be, in words.
-        notes: what else a user should know.
+        existing: index of the existing poses alone; None without them, or if they are too few.
+        checked, unchecked: constraints that were checked, and those that could not be, as text.
+        notes: other remarks for the user.
         outlook: predicted accuracy with these poses and with others.
         by_images: whether the poses are those at which a camera sees its board.
         run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
@@ -86,16 +86,16 @@ class Chosen:
 
     @property
     def prediction(self) -> SelectionPrediction | None:
-        """What is kept next to the poses; None where a parameter is not identifiable."""
+        """Prediction stored next to the poses; None if a parameter is not identifiable."""
         return self.outlook.poses if np.isfinite(self.outlook.poses.rms) else None
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """The names of figures that there are of it; none where a parameter is not identifiable."""
+        """Names of the available figures; none if a parameter is not identifiable."""
         return () if self.prediction is None else FIGURES if self.outlook.others else FIGURES[:1]
 
     def kept(self) -> list[str]:
-        """Return lines on what the poses were held against, on what they were not, and on the run."""
+        """Return lines on the constraints that were checked, on those that were not, and on the run."""
         lines = [f"kept: {', '.join(self.checked)}"] if self.checked else []
         lines += [f"NOT checked: {', '.join(self.unchecked)}"] if self.unchecked else []
         return [*lines, *ways(self.run, self.driven)]
@@ -113,7 +113,7 @@ def choose(
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Chosen:
-    """Choose m poses at which the robot's geometry shows best.
+    """Return the m poses that determine the robot's geometry best.
 
     Args:
         robot: see `calib.robot.load`.
@@ -125,7 +125,7 @@ def choose(
         map: where parallel work runs (`calib.workers`).
         progress: called with (done, total, what).
     """
-    require(m >= 1, f"-m {m}: at least one pose has to be chosen", UsageError)
+    require(m >= 1, f"-m {m}: give a number of at least one pose", UsageError)
     chain, source = load_robot(robot, existing if isinstance(existing, Path) else None, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
     limits = read_limits(constraints, cell, source, settings.without)
@@ -176,7 +176,7 @@ def choose(
 
 
 def _driven(found: Selection, driven: Drivable) -> Selection:
-    """Return a selection in the order of its run, with what the poses that were replaced cost."""
+    """Return a selection in driving order, its index and efficiency updated for replaced poses."""
     indices, value = found.indices, driven.value[1] if driven.replaced else found.value
     if indices is not None:
         indices = indices.copy()
@@ -190,7 +190,7 @@ def _driven(found: Selection, driven: Drivable) -> Selection:
 
 
 def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
-    """Return the candidates; where too few poses are feasible, say what excludes them."""
+    """Return the candidate poses; an error names the constraints if too few poses are feasible."""
     try:
         return draw_candidates(
             space.lower, space.upper, settings.candidates, partial(is_feasible, space), seed=settings.seed
@@ -213,7 +213,7 @@ def _outlook(
     before: np.ndarray | None,
     comparable: float,
 ) -> PoseOutlook:
-    """Return the predicted accuracy with chosen poses q (m, n), with others, and with line of sight ignored."""
+    """Return the predicted accuracy with chosen poses q (m, n), with other numbers, and without line of sight."""
     space, free = limits.space(seen), limits.space(seen, sight=False)
     stream = np.random.default_rng([search.seed, 2])
     typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
@@ -237,12 +237,12 @@ def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[s
 
 
 def targets(out: Path, plots: bool) -> files.Results:
-    """Return all files that a selection may write, with their suffixes."""
+    """Return the paths of all files that a selection may write."""
     return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside_poses(out, plots).values())]
 
 
 def write(chosen: Chosen, path: Path) -> Path:
-    """Write the chosen poses under the joints' names [rad or m], and next to them what they predict."""
+    """Write the chosen poses to a CSV with the joints' names [rad or m], and their predicted accuracy next to it."""
     if chosen.prediction is not None:
         write_prediction(chosen.prediction, path)
     else:
@@ -251,15 +251,15 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(found: Selection) -> str:
-    """Return what the bound behind an efficiency covers, and how sure that is."""
+    """Return the scope of the bound in an efficiency, and its uncertainty, as text."""
     climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
     if not climbs:
         return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
-    return f"of all feasible poses, as far as {climbs} searches for better ones can show; loose by at most {gap:.2g} %"
+    return f"of all feasible poses, as far as {climbs} searches for better poses show; not tight by at most {gap:.2g} %"
 
 
 def record(chosen: Chosen) -> dict[str, Any]:
-    """Return what the selection came to, numbers as numbers; `table` says it in words."""
+    """Return the results of the selection as numbers; `table` returns them as text."""
     found = chosen.selection
     return {
         "index": found.index,
@@ -281,7 +281,7 @@ def record(chosen: Chosen) -> dict[str, Any]:
 
 
 def table(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return what the selection came to, as pairs of words and numbers."""
+    """Return the results of the selection as pairs of label and value."""
     found = chosen.selection
     known = [] if chosen.existing is None else [("existing poses alone", f"{chosen.existing:.6g}")]
     return [
@@ -298,7 +298,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return the predicted accuracy, and what it costs that the instrument has to see them where that is asked."""
+    """Return table rows of the predicted accuracy, and of the loss by line-of-sight constraints if there are any."""
     rows = outlook_table(chosen.outlook.poses, chosen.outlook.others)
     if chosen.outlook.blind is None:
         return rows
@@ -307,4 +307,4 @@ def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
         f"index {chosen.outlook.comparable:.5g} instead of {index:.5g}, "
         f"σ of the tool {1e3 * one.rms:.3g} instead of {1e3 * blind.rms:.3g} mm"
     )
-    return [*rows, ("what the lines of sight cost", words)]
+    return [*rows, ("cost of line of sight", words)]

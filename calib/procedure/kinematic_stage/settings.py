@@ -1,4 +1,4 @@
-"""How poses are chosen and a geometry is fitted and judged: one value for command, guided run and scripts."""
+"""Settings of pose selection and geometric fit, shared by commands, guided run and scripts."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,18 +21,18 @@ Method = Annotated[str, OneOf("poses.select:Method")]
 @checked
 @dataclass(frozen=True)
 class FitSettings:
-    """How a geometry is fitted and judged.
+    """Settings of a geometric fit and its verdict.
 
     Attributes:
-        model: which rung of the ladder and all below it; auto climbs it. Default: as the options file says
-        loss: how residuals count. Default: as the options file says
-        folds: rows that the ladder sets aside: transfer (stations, files, regions), regions, random or poses
-        stations: base placement: each file its own, or one for all
-        tools: one tool (or set of reflectors) for all files, or each its own
-        holdout: share of each file's poses kept from the fit: the last of ``default_rng(seed).permutation(poses)``
-        refit_frames: validation files get a base and tool placement of their own
+        model: largest model of the ladder to fit; auto selects it. Default: from the options file
+        loss: loss function of the residuals. Default: from the options file
+        folds: cross-validation folds of the ladder: transfer (stations, files, regions), regions, random or poses
+        stations: one base placement for each file, or one for all
+        tools: one tool (or set of reflectors) for all files, or one for each
+        holdout: share of each file's poses held out of the fit: the last of ``default_rng(seed).permutation(poses)``
+        refit_frames: fit base and tool placement of the validation files separately
         tolerance: largest rms on unseen poses [m; on the command line mm]; above it the verdict is fail
-        deliverable: what the verdict is about: urdf (robot.urdf alone), or corrections (with joint_corrections.csv)
+        deliverable: subject of the verdict: urdf (robot.urdf alone), or corrections (with joint_corrections.csv)
         seed: reproduces everything random
 
     Raises:
@@ -54,25 +54,25 @@ class FitSettings:
 @checked
 @dataclass(frozen=True)
 class SelectionSettings:
-    """How poses to measure are chosen.
+    """Settings of the selection of poses to measure.
 
-    Polishing raises the index by 0.1 to 0.6 %, which knows nothing of deflections: virtual LWR4+ and UR5 with errors
-    that a model can hold, 40 poses, 6 seeds each, kept 0.09 mm rms with ``detmax`` and 0.12 mm with ``polish``.
+    Polishing raises the index by 0.1 to 0.6 %, but the index ignores deflections: virtual LWR4+ and UR5 with errors
+    that a model can explain (40 poses, 6 seeds each) kept 0.09 mm rms with ``detmax`` and 0.12 mm with ``polish``.
 
     Attributes:
-        kind: what will be measured
-        tools: x,y,z of a target in the tip's frame [m], several of them for several targets; default the tip itself
-        index: observability index that is maximised: O1 to O5, or cond, which is minimised
-        method: detmax, polish, local, multistart or tabu
-        candidates: poses to choose from
-        sigmas: of a position [m] and an orientation [rad], e.g. 1e-4,1e-4; default equal ones
+        kind: quantity that will be measured
+        tools: x,y,z of a target in the tip's frame [m], repeated for several targets; default the tip itself
+        index: observability index to maximise (O1 to O5), or cond to minimise
+        method: search method: detmax, polish, local, multistart or tabu
+        candidates: number of poses to choose from
+        sigmas: measurement σ of a position [m] and an orientation [rad], e.g. 1e-4,1e-4; default equal ones
         seed: reproduces everything random
-        starts: random sets that multistart begins at
-        evaluations: most evaluations of the index in one local search
-        seconds: processor time for the search [s]; without: to its end
-        climbs: searches for feasible poses beyond the bound; 0: it covers the candidates only
-        without: self-collision, floor, joint-margin, view: not kept; instrument, box, obstacles: not there
-        run: how fast the poses are driven, and how long each is measured
+        starts: number of random starting sets of multistart
+        evaluations: largest number of index evaluations in one local search
+        seconds: processor time for the search [s]; default unlimited
+        climbs: searches for feasible poses that exceed the bound; 0: the bound covers the candidates only
+        without: constraints to ignore (self-collision, floor, joint-margin, view), or objects (instrument, box, obstacles)
+        run: speed between poses, and measuring time at each
     """
 
     kind: Annotated[str, OneOf(("pose", "position"))] = "pose"

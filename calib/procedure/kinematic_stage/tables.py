@@ -1,4 +1,4 @@
-"""The fitted parameters as a person reads them: frames as placements, not as displacements from themselves.
+"""Tables of the fitted parameters and residuals: frames as placements, not as displacements from the nominal frame.
 
 The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In the table stand T's own position and
 rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
@@ -46,7 +46,7 @@ class EstimateTable:
 
 
 def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
-    """Return what a fit has moved: arm elements, placements, deflection coefficients.
+    """Return the table of fitted parameters: arm elements, placements, deflection coefficients.
 
     Args:
         found: the fit.
@@ -126,7 +126,7 @@ COMPONENTS = {
 
 
 def write_residuals(outcome: Outcome, path: Path) -> Path:
-    """Write measured minus predicted of every row, fitted (with its robust weight) and unseen.
+    """Write the residual (measured minus predicted) of every row, fitted (with its robust weight) and unseen.
 
     Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
     deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
@@ -148,7 +148,7 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
 
 
 def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
-    """Return the robust weight of each fitted residual by file, row and tool; the least of its natures."""
+    """Return the robust weight of each fitted residual by file, row and tool (position or orientation: the smaller)."""
     fit, result = outcome.selection.fit, {}
     for piece in fit.pieces:
         for i, w in zip(piece.part.index, piece.weight):
@@ -191,7 +191,7 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
 
 
 def _row_sizes(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the length of each row's position residual [mm], or its distance residual."""
+    """Return the length [mm] of each row's position residual, or its distance residual."""
     position, distance = columns["position"], columns["distance"]
     size = np.sqrt(np.nansum(position**2, axis=0))
     return np.where(np.isnan(position).all(axis=0), np.abs(distance[0]), size)

@@ -1,6 +1,6 @@
-"""Both arms on rows that were fitted and on rows that were not, and what that comes to: one assessment for all who ask.
+"""Errors of both arms on fitted and unseen rows, and the verdict from them.
 
-`assess` is called by a fit that was just made and by one read back from its folder; they get the same answer.
+`assess` returns the same result for a new fit and for one read from its folder.
 
 The rules of the verdict have their limits and sentences in the catalogue of findings, chapter 4.
 """
@@ -43,7 +43,7 @@ RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry ex
 
 @dataclass(frozen=True)
 class _Proof:
-    """What the arms are judged by: rms errors [m], and on which rows."""
+    """Errors that the verdict on the arms is based on: rms before and after [m], and their rows."""
 
     before: float
     after: float
@@ -52,7 +52,7 @@ class _Proof:
 
     @property
     def left(self) -> float:
-        """Share of the nominal arm's error that is left."""
+        """Ratio of the calibrated to the nominal arm's error."""
         return self.after / max(self.before, 1e-300)
 
 
@@ -66,7 +66,7 @@ def judge(
     cross_validated: float | None = None,
     arm: str = "",
 ) -> Verdict:
-    """Judge a calibration by the rows it has not seen; without unseen files, by cross-validation.
+    """Return the verdict on a calibration by its unseen rows; without unseen files, by cross-validation.
 
     Rules, the first group that says something; inside a group the worst finding decides:
 
@@ -127,7 +127,7 @@ def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
 def _far_off(
     found: Sequence[_Proof], sets: Mapping[str, Comparison], tolerance: float | None, reach: float
 ) -> Iterator[Finding]:
-    """Yield files on which both arms are far off (the instrument stood elsewhere, or it is another robot), or too far.
+    """Yield findings on files where both arms are far off (moved instrument or another robot), or above the tolerance.
 
     Orientations that are off, of all sets of rows, and errors above the tolerance.
     """
@@ -194,7 +194,7 @@ PLACES = tuple(
 
 @dataclass(frozen=True, eq=False)
 class Arms:
-    """The nominal and the calibrated installation, frames fitted to the fit's rows, and the best rigid geometry.
+    """Nominal and calibrated installation (frames fitted to the fitted rows), and the best rigid geometry.
 
     With the error model of the calibrated one, where there is one.
     """
@@ -207,7 +207,7 @@ class Arms:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """Both arms on the same rows, and what that comes to.
+    """Errors of both arms on the same rows, and the verdict.
 
     Attributes:
         fit: on the fit's rows.
@@ -229,12 +229,12 @@ class Assessment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a user should know, worst first."""
+        """Warnings for the user, worst first."""
         return tuple(dict.fromkeys((*lines_of(self.noticed), *self.notes)))
 
     @property
     def record(self) -> ValidationMetrics:
-        """The unseen rows, the verdict and the warnings as ``metrics.json`` holds them."""
+        """Unseen rows, verdict and warnings, in the form of ``metrics.json``."""
         return ValidationMetrics(
             validation={name: comparison.record() for name, comparison in self.validation.items()},
             verdict=self.verdict.level,
@@ -249,7 +249,7 @@ class Assessment:
 
 
 def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, wanted: FitSettings) -> Assessment:
-    """Compare both arms on fitted and on unseen rows, and judge.
+    """Return the errors of both arms on fitted and unseen rows, and the verdict.
 
     Args:
         arms: what is compared.
@@ -285,7 +285,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
 def judge_deliverables(
     fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, wanted: FitSettings
 ) -> dict[str, Verdict]:
-    """Return the verdict on each deliverable: on robot.urdf alone and, where there are any, with joint corrections."""
+    """Return the verdict on each deliverable: robot.urdf alone, and with joint corrections if there are any."""
     common = partial(judge, findings=findings, asked=wanted.model or "auto", tolerance=wanted.tolerance)
     if fit.alone is None:
         return {"urdf": common(fit, validation, cross_validated=findings.cross_validated)}
@@ -297,7 +297,7 @@ def judge_deliverables(
 
 
 def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
-    """Return the largest rms error of a deliverable on unseen rows; without any, that by cross-validation [m]."""
+    """Return the largest rms error [m] of a deliverable on unseen rows; without such rows, by cross-validation."""
     alone = deliverable == "urdf"
     sizes = [(each.of_urdf if alone else each).errors[1].rms for each in validation.values() if each.proves]
     by_folds = findings.rigid_cross_validated if alone else findings.cross_validated
@@ -305,7 +305,7 @@ def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable
 
 
 def _copies(inputs: Inputs) -> list[str]:
-    """Name files given as unseen that hold what was fitted."""
+    """Return the names of files given as unseen that contain fitted rows."""
     words = []
     for name, unseen in inputs.unseen.items():
         if unseen.seen:
@@ -317,7 +317,7 @@ def _copies(inputs: Inputs) -> list[str]:
 
 
 def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
-    """Return the nominal arm, corrections that came with it included, base and tool placement fitted for it."""
+    """Return the nominal arm (with earlier corrections), with base and tool placement fitted to it."""
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings, torques).cell
 
@@ -355,10 +355,10 @@ def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
 
 
 def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
-    """Write the errors of both arms at every unseen row; where positions were measured, with where and whither.
+    """Write the errors of both arms at every unseen row; for measured positions, with position and direction.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
-    puts it, all in the calibrated arm's base. Behind them `INTERVAL`, as in ``residuals.csv``.
+    puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.
     """
     rows: list[list[object]] = []
     for name, each in validation.items():
@@ -377,7 +377,7 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
 
 
 def _places(found: Comparison, number: int) -> np.ndarray:
-    """Return seen position [m] and the ways from there to both arms' [mm] of one block (m, 9); NaN without any."""
+    """Return measured position [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions."""
     block, torque = found.blocks[number], [found.torques[number]]
     if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)

@@ -159,7 +159,7 @@ def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
     from calib.robot.calibrated import CalibratedChain
 
     panda = load("panda")
-    with pytest.raises(Exception, match="not the axes of a UR arm"):
+    with pytest.raises(Exception, match="not have the axes of a UR arm"):
         ur_kinematics(CalibratedChain(panda, panda))
 
 

@@ -189,7 +189,7 @@ def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
     told = str(chosen)
     for words in (
         "predicted σ of the tool's position",
-        "what the lines of sight cost",
+        "cost of line of sight",
         "run: 14 poses in",
         "NOT checked: walls",
     ):

@@ -32,7 +32,7 @@ def test_a_second_reader_that_disagrees_refuses_and_one_that_cannot_read_is_said
     source, right = urdf_write.write_new(chain), readback.link_poses
     place = "calib.procedure.export.geometry.link_poses"
     monkeypatch.setattr(place, lambda *given: right(*given) + 1e-8)
-    with pytest.raises(RobotError, match="yourdfpy reads the calibrated URDF otherwise, by 1e-08"):
+    with pytest.raises(RobotError, match="poses differ by 1e-08 when yourdfpy reads the URDF"):
         check_readback(source, "robot.urdf", chain)
     monkeypatch.setattr(place, lambda text, *given: right("<robot", *given))
     assert "not read a second time: yourdfpy cannot read the URDF" in check_readback(source, "robot.urdf", chain)
