@@ -73,7 +73,7 @@ def find_gains(
         rest = [path for path in motions if path not in bare]
         raise UsageError(
             f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): one model cannot "
-            "use both A and N m;  state gains for all of them"
+            "use both A and N m; state gains for all of them"
         )
     if not isinstance(chain, Chain):
         raise UsageError(f"{bare[0]}: currents without drive gains; state gains = [...] (N m/A) in the options file")

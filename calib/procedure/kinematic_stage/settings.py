@@ -71,7 +71,7 @@ class SelectionSettings:
         evaluations: largest number of index evaluations in one local search
         seconds: processor time for the search [s]; default unlimited
         climbs: searches for feasible poses that exceed the bound; 0: the bound covers the candidates only
-        without: constraints to ignore (self-collision, floor, joint-margin, view), or objects (instrument, box, obstacles)
+        without: to ignore: self-collision, floor, joint-margin, view (limits); instrument, box, obstacles (objects)
         run: speed between poses, and measuring time at each
     """
 

@@ -71,7 +71,7 @@ def test_currents_and_torques_do_not_mix(robot, tmp_path, capsys):
     other = planted.write(tmp_path, "torques.npz", 1)
     bare = currents(tmp_path, "bare.npz", 0)
     assert run("identify", robot, bare, "--validate", other, "--friction", "standard", "--out", tmp_path / "x") == 2
-    assert "do not go into one model" in " ".join(capsys.readouterr().err.split())
+    assert "one model cannot use both" in " ".join(capsys.readouterr().err.split())
 
 
 def test_identified_gains_are_kept(robot, tmp_path):
