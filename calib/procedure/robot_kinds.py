@@ -100,7 +100,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     if verb not in stages:
         instead = found.instead.get(verb, f"{', '.join(stages)} take it")
         named = robot if isinstance(robot, (str, Path)) else found.source
-        raise UsageError(f"{named} is a {found.kind}, {verb} supports only serial arms; {instead}")
+        raise UsageError(f"{named} is a {found.kind}, and {verb} is for serial arms only; {instead}")
     for key, value in (("base", base), ("tip", tip)):
         if value:
             raise UsageError(f"{key} '{value}' is a link of a URDF; a {found.kind} has no such links")
@@ -122,4 +122,4 @@ def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: objec
         value = getattr(settings, each.name)
         if each.name not in read and value is not False and value != getattr(plain, each.name):
             place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
-            raise UsageError(f"{place}{each.name}{shown} is supported only for serial arms, not for this kind of robot")
+            raise UsageError(f"{place}{each.name}{shown} is for serial arms only, not for this kind of robot")

@@ -123,7 +123,7 @@ def test_geometry_that_is_exact_adds_nothing():
     assert without.geometry is None and "assumed exact" in geometry_tables.summary(without)
     np.testing.assert_array_equal(without.covariance, found.fitted.estimate.covariance)
     tiny = geometry_uncertainty.propagate(found, CalibratedChain(arm, covariance=1e-16 * np.eye(6)), [case])
-    assert not tiny.changed.any() and "no matter" in geometry_tables.summary(tiny)
+    assert not tiny.changed.any() and "no propagation" in geometry_tables.summary(tiny)
     assert np.linalg.eigvalsh(tiny.covariance - tiny.torque).min() > -1e-12
 
 

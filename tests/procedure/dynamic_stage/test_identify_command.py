@@ -127,7 +127,7 @@ def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
         ("[filter]\ncutoff = 120.0", "Nyquist"),
         ("[[coupling]]\njoints = [1]", "coupling"),
         ("[[term]]\nname = 'K'\nshape = 'sine'\njoint = 2", "needs (order, speed)"),
-        ('[files."other.npz"]\npayload = []', "is none of the recordings"),
+        ('[files."other.npz"]\npayload = []', "names none of the recordings"),
         ("drives = ['Ia', 'Fv']", "drives: 2 values for 3 joints"),
         ("drives = 'Ia Fx'", "drive term 'Fx'"),
         ("prior = 'cad'\nmethod = 'iv'", "controller"),
@@ -150,7 +150,7 @@ def test_a_payload_of_unknown_centre_on_unseen_motion_alone_is_refused(robot, tm
     identify_options = tmp_path / "options.toml"
     identify_options.write_text('[payload.tool]\nmass = 2.0\n[files."other.npz"]\npayload = ["tool"]')
     code = run(robot, train, "--validate", unseen, "--options", identify_options, "--out", tmp_path / "out")
-    assert code == 2 and "other.npz carries 'tool'" in capsys.readouterr().err
+    assert code == 2 and "payload 'tool' of other.npz" in capsys.readouterr().err
 
 
 def test_other_folders_are_not_overwritten(robot, tmp_path, capsys):
