@@ -1,18 +1,18 @@
-"""The errors of trajectory design: each says what was found, why it may be so, and what to try."""
+"""The errors of trajectory design: each states the finding, its likely cause, and advice."""
 
 
 class BadInput(ValueError):
-    """An array or an option that cannot be what it should be (shape, NaN, limits that cross, an unknown name)."""
+    """An invalid array or option (shape, NaN, crossed limits, unknown name)."""
 
 
 def require(holds: object, message: str, kind: type[Exception] = BadInput) -> None:
-    """Raise `kind(message)` unless `holds`; for messages that can be formed whether it holds or not."""
+    """Raise `kind(message)` unless `holds`; for messages that can be formatted in both cases."""
     if not holds:
         raise kind(message)
 
 
 class NotExciting(ValueError):
-    """No motion of the family tells all columns of the regressor apart."""
+    """Raised if no motion of the family excites all columns of the regressor."""
 
 
 class NothingFeasible(ValueError):

@@ -122,7 +122,7 @@ def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
 
 
 def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return d^r q / dt^r (N, n) straight from eq. 23, independent of tables and null spaces."""
+    """Return d^r q / dt^r (N, n) directly from eq. 23, independent of tables and null spaces."""
     most = max(len(c) // 2 for c in coefficients)
     rates = 2 * np.pi / period * np.arange(1, most + 1)
     angle = np.outer(times, rates) + order * np.pi / 2  # each derivative turns sine and cosine by π/2
@@ -154,6 +154,6 @@ def _check_frequencies(counts: Sequence[int], period: float, resonance: float | 
         least = 2 * np.pi * max(counts) / resonance
         raise BadInput(
             f"the highest frequency, {max(counts)} · 2π/{period:g} s = {top:.4g} rad/s, is not below the resonance at "
-            f"{resonance:.4g} rad/s: it would excite what the model does not hold; take fewer harmonics or a period "
+            f"{resonance:.4g} rad/s: it would excite unmodelled dynamics; take fewer harmonics or a period "
             f"above {least:.4g} s"
         )

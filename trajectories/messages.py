@@ -1,4 +1,4 @@
-"""A track as a ROS 2 message trajectory_msgs/msg/JointTrajectory, in JSON or in YAML (``ros2 topic pub`` reads it)."""
+"""Motions as ROS 2 messages trajectory_msgs/msg/JointTrajectory, in JSON or YAML (for ``ros2 topic pub``)."""
 
 import json
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 
 
 def joint_trajectory(track: Setpoints, joint_names: Sequence[str], every: int = 1, frame: str = "") -> dict[str, Any]:
-    """Return the message as plain dictionaries; joints in rad or m, effort in N m or N where torques are known.
+    """Return the message as plain dictionaries; joints in rad or m, effort in N m or N if torques are known.
 
     Args:
         every: take one sample out of so many (and the last), for controllers that interpolate.
         frame: header.frame_id.
     """
     if len(joint_names) != track.n or len(set(joint_names)) != track.n:
-        raise BadInput(f"the motion has {track.n} joints, the message would name {', '.join(joint_names) or 'none'}")
+        raise BadInput(f"the motion has {track.n} joints, the given names are {', '.join(joint_names) or 'none'}")
     require(every >= 1, f"every {every}: expected 1 or more")
     rows = np.unique(np.append(np.arange(0, len(track), every), len(track) - 1))
     points = [_point(track, int(k)) for k in rows]
@@ -32,14 +32,14 @@ def joint_trajectory(track: Setpoints, joint_names: Sequence[str], every: int = 
 
 
 def to_json(message: dict[str, Any]) -> str:
-    """Return the message as JSON, a point per line."""
+    """Return the message as JSON, one point per line."""
     points = ",\n".join("    " + json.dumps(point, allow_nan=False) for point in message["points"])
     head = json.dumps({key: message[key] for key in ("header", "joint_names")}, indent=2)[:-2]
     return f'{head},\n  "points": [\n{points}\n  ]\n}}\n'
 
 
 def to_yaml(message: dict[str, Any]) -> str:
-    """Return the message as YAML; numbers always with a point, since YAML 1.1 takes 1e-05 for text."""
+    """Return the message as YAML; numbers always with a decimal point, since YAML 1.1 reads 1e-05 as text."""
     stamp = message["header"]["stamp"]
     lines = [
         "header:",

@@ -1,4 +1,4 @@
-"""Constraints on where the arm is: places of the tool and of named points, and distances between bodies.
+"""Constraints on the arm's place: positions of the tool and of named points, and distances between bodies.
 
 Places and distances come from callables with derivative products; see `trajectories.constraints` for what a constraint
 has.
@@ -14,7 +14,7 @@ from trajectories.basis import SampledMotion
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Distance of points from the base's z axis and their height: d_xy ≥ least_radius, lowest ≤ z ≤ highest.
+    """Limits on points' distance from the base's z axis and height: d_xy ≥ least_radius, lowest ≤ z ≤ highest.
 
     Written least² - x² - y² ≤ 0 over 2 · least, which is smooth on the axis too and a length near the limit.
 
@@ -74,7 +74,7 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """Distances between bodies of at least `least` [m].
+    """Minimum distance `least` [m] between bodies.
 
     Attributes:
         distances: q (N, n) -> (N, k) [m], negative inside.

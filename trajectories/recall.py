@@ -1,4 +1,4 @@
-"""A motion found again in a recording, cut to whole periods, and averaged with its variance.
+"""Search for a motion in a recording, cut to whole periods, averaged with variance.
 
 The place is where the sum of squared differences between recording and reference is least,
 
@@ -42,7 +42,7 @@ class Recalled:
 
 @dataclass(frozen=True, eq=False)
 class Averaged:
-    """Mean over periods.
+    """Mean of signals over periods, with variance.
 
     Attributes:
         mean: (period, k).
@@ -56,7 +56,7 @@ class Averaged:
 
     @property
     def pooled(self) -> np.ndarray:
-        """(k,) variance of a single sample over the whole period: what weights are made of."""
+        """Variance (k,) of a single sample, averaged over the period: used for weights."""
         return self.variance.mean(axis=0)
 
 
@@ -74,33 +74,33 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     """
     q, r = np.asarray(recorded, dtype=float), np.asarray(reference, dtype=float)
     if q.ndim != 2 or r.ndim != 2 or q.shape[1] != r.shape[1]:
-        raise BadInput(f"recording {q.shape} and reference {r.shape} need one column per joint, the same ones")
+        raise BadInput(f"recording {q.shape} and reference {r.shape} need the same number of columns, one per joint")
     if not (np.isfinite(q).all() and np.isfinite(r).all()):
-        raise BadInput("recording or reference hold values that are no numbers: cut them out first")
+        raise BadInput("recording or reference contain values that are not numbers: cut them out first")
     if len(q) < len(r):
-        raise BadInput(f"the recording has {len(q)} samples, one period of the motion {len(r)}: it is not all there")
+        raise BadInput(f"the recording has {len(q)} samples, less than one period of the motion ({len(r)})")
     similarity = _likeness(q, r)
     best = int(similarity.argmax())
     if similarity[best] < likeness:
         raise BadInput(
             f"the motion is not in the recording: the nearest {len(r)} samples begin at {best} and explain "
-            f"{max(similarity[best], 0.0):.0%} of its variance; check the rate, the order of the joints and their units"
+            f"{max(similarity[best], 0.0):.0%} of its variance; check the rate, the joint order and the units"
         )
     chain = [k for k in range(best % len(r), len(similarity), len(r)) if similarity[k] >= likeness]
     run = _run_with(chain, best, len(r))[skip:]
-    require(run, f"fewer than {skip + 1} whole periods of the motion are in the recording")
+    require(run, f"the recording contains fewer than {skip + 1} whole periods of the motion")
     return Recalled(run[0], len(r), len(run), tuple(float(similarity[k]) for k in run), _lag(similarity, best))
 
 
 def average(values: np.ndarray, found: Recalled) -> Averaged:
-    """Average signals (N, k) of the recording over the whole periods found; two or more."""
+    """Average signals (N, k) of the recording over the whole periods found (at least two)."""
     require(found.periods >= 2, "one period has no variance: record two or more")
     parts = np.asarray(values, dtype=float)[found.rows].reshape(found.periods, found.period, -1)
     return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), found.periods)
 
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return 1 - D(k) / Σ |r - mean|² for every place (N - P + 1,)."""
+    """Return 1 - D(k) / Σ |r - mean|² at every offset (N - P + 1,)."""
     centre = r.mean(axis=0)
     q, r = q - centre, r - centre
     energy = np.concatenate([[0.0], np.cumsum((q**2).sum(axis=1))])
@@ -110,13 +110,13 @@ def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return Σ_i x[k + i] r[i] for every place k (N - P + 1,) of r (P,) in x (N,), by FFT."""
+    """Return Σ_i x[k + i] r[i] for every offset k (N - P + 1,) of r (P,) in x (N,), by FFT."""
     size = next_fast_len(len(x) + len(r) - 1, real=True)
     return np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(r[::-1], size), size)[len(r) - 1 : len(x)]
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:
-    """Return the unbroken run of places, one period apart, that holds the best one."""
+    """Return the unbroken sequence of offsets, one period apart, that includes the best one."""
     k = places.index(best)
     first = last = k
     while first and places[first - 1] == places[first] - period:
@@ -127,7 +127,7 @@ def _run_with(places: list[int], best: int, period: int) -> list[int]:
 
 
 def _lag(similarity: np.ndarray, best: int) -> float:
-    """Return where the parabola through the best match and its neighbours peaks, relative to it."""
+    """Return the peak of the parabola through the best match and its neighbours, relative to the match."""
     if not 0 < best < len(similarity) - 1:
         return 0.0
     before, here, after = similarity[best - 1 : best + 2]

@@ -1,4 +1,4 @@
-"""Motions as a controller takes them: samples at its rate, joined, repeated, slowed down."""
+"""Motions as setpoints for a controller: samples at its rate, joined, repeated, slowed down."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ class Setpoints:
         return (len(self) - 1) / self.rate
 
     def repeated(self, times: int) -> Setpoints:
-        """Return a closed motion `times` times over: periodic, both ends included, so N - 1 samples a period."""
-        require(times >= 1, f"a motion can be repeated once or more often, not {times} times")
+        """Return a closed motion repeated `times` times; both ends are included, so N - 1 samples a period."""
+        require(times >= 1, f"times = {times}: expected 1 or more")
         return joined([self] * times)
 
 
 def joined(tracks: Sequence[Setpoints]) -> Setpoints:
-    """Return tracks one after the other; each begins where the one before ends, at that very sample.
+    """Return tracks joined one after the other; each begins at the last sample of the previous one.
 
     Raises:
         BadInput: for other rates, or a jump of position or speed at a seam, with its joint and size.
@@ -58,16 +58,14 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
     max_jump = 1e-6  # of a joint [rad or m] at a seam between two tracks
     for k, (one, two) in enumerate(pairwise(tracks)):
         if two.rate != rate:
-            raise BadInput(
-                f"motions {k + 1} and {k + 2} are at {one.rate:g} and {two.rate:g} Hz: make them at one rate"
-            )
+            raise BadInput(f"motions {k + 1} and {k + 2} are at {one.rate:g} and {two.rate:g} Hz: use one rate for all")
         for what, end, start in (("position", one.q[-1], two.q[0]), ("speed", one.v[-1], two.v[0])):
             jump = np.abs(start - end)
             if jump.max() > max_jump * (1 if what == "position" else rate):
                 j = int(jump.argmax())
                 raise BadInput(
                     f"motion {k + 2} begins {jump[j]:.3g} away from motion {k + 1}'s end ({what} of joint {j + 1}): "
-                    "put an approach between them"
+                    "insert an approach between them"
                 )
     rows = [slice(None)] + [slice(1, None)] * (len(tracks) - 1)
     parts = {key: np.vstack([getattr(t, key)[r] for t, r in zip(tracks, rows)]) for key in ("q", "v", "a")}
@@ -77,14 +75,14 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
 
 
 def slowed(track: Setpoints, factor: float) -> Setpoints:
-    """Return the same path `factor` times slower, for a rehearsal: v / factor, a / factor²; torques are not known.
+    """Return the same path `factor` times slower, for a rehearsal: v / factor, a / factor²; torques unknown.
 
     Positions between the samples come from cubic Hermite pieces, which meet q and v at every sample.
 
     Args:
         factor: 1 or more; rounded to a whole number of samples at the end.
     """
-    require(np.isfinite(factor) and factor >= 1, f"a rehearsal runs a factor of 1 or more slower, not {factor:g}")
+    require(np.isfinite(factor) and factor >= 1, f"rehearsal factor {factor:g}: expected 1 or more")
     if factor == 1:
         return track
     count = round((len(track) - 1) * factor)

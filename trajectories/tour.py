@@ -1,4 +1,4 @@
-"""The order in which to visit places in least time: an open tour, and how long moves between joint values last."""
+"""Order of places for the shortest total time: an open tour, and durations of joint moves."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from trajectories.errors import BadInput
 
 
 def move_times(one: np.ndarray, two: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
-    """Return how long straight joint moves from rest to rest last (...) [s]: trapezoids, all joints in proportion.
+    """Return the durations (...) [s] of straight joint moves from rest to rest: trapezoids, all joints in proportion.
 
     A joint that goes by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2 √(d/a); the slowest one rules.
 
@@ -21,7 +21,7 @@ def move_times(one: np.ndarray, two: np.ndarray, velocity: np.ndarray, accelerat
 
 
 def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
-    """Return the order (m,) in which to visit m places, near the least total time; it ends anywhere.
+    """Return an order (m,) of m places with nearly the shortest total time; the last place is free.
 
     Nearest neighbours from several starts, each improved by reversing parts (2-opt, Croes 1958) and by moving up to
     three places elsewhere (Or 1976) until neither helps; the best is returned.
@@ -62,14 +62,14 @@ def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
 
 
 def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Return a closed tour that neither a reversal nor a relocation shortens; each time the move that saves most."""
+    """Return a closed tour that no reversal or relocation shortens, by repeating the move that saves most."""
     while (shorter := _reversed(order, cost)) is not None or (shorter := _relocated(order, cost)) is not None:
         order = shorter
     return order
 
 
 def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
-    """Return the tour with the part reversed that saves most: edges a-b and c-d become a-c and b-d."""
+    """Return the tour after the reversal that saves most: edges a-b and c-d become a-c and b-d."""
     after = np.roll(order, -1)
     edge = cost[order, after]
     gains = np.triu(edge[:, None] + edge - cost[order[:, None], order] - cost[after[:, None], after], 2)
@@ -80,7 +80,7 @@ def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
 
 
 def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
-    """Return the tour with the part of up to three places moved elsewhere, turned or not, that saves most."""
+    """Return the tour after moving up to three successive places, reversed or not, for the largest saving."""
     count, best = len(order), (1e-9, 0, 0, 0, False)
     after = np.roll(order, -1)
     edge = cost[order, after]

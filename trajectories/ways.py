@@ -1,4 +1,4 @@
-"""A way between two places in joint space that keeps clear: the straight move, else one with via-points.
+"""Search for a collision-free way between two places in joint space: straight, else with via-points.
 
 RRT-Connect (Kuffner & LaValle 2000): two trees, from either end, grow towards random places and towards each other;
 then detours are cut short wherever a straight move is clear. What is clear is asked of the caller, in batches.
@@ -12,12 +12,12 @@ import numpy as np
 Clear = Callable[[np.ndarray], np.ndarray]
 
 """Largest step of a tree in one joint, as a share of its unit (see `Room`). Our choice."""
-"""Share of draws that are the middle between the ends and near it rather than anywhere. Our choice."""
+"""Share of random places near the middle between the ends. Our choice."""
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Where a way may go.
+    """Search space of collision-free ways.
 
     Attributes:
         lower, upper: (n,) [rad or m].
@@ -34,7 +34,7 @@ class Room:
 
 
 def straight_is_clear(room: Room, one: np.ndarray, two: np.ndarray) -> bool:
-    """Tell whether the straight move between two places (n,) is clear; eight places on it are looked at first."""
+    """Return whether the straight move between two places (n,) is clear; eight places on it are checked first."""
     count = max(int(np.ceil((np.abs(two - one) / room.spacing).sum())), 1)
     share = np.arange(1, count) / count
     if not len(share):
@@ -46,7 +46,7 @@ def straight_is_clear(room: Room, one: np.ndarray, two: np.ndarray) -> bool:
 
 
 def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: int = 4000) -> np.ndarray | None:
-    """Return a clear way (k, n) from start to goal, both included: two places where the straight move is clear.
+    """Return a clear way (k, n) from start to goal, both included: two places if the straight move is clear.
 
     Args:
         room: limits and what is clear.
@@ -78,7 +78,7 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
 
 
 def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray, max_step: float = 0.5) -> int | None:
-    """Let a tree grow by one step towards a place; return the number of the new node, None where that is not clear."""
+    """Extend a tree by one step towards a place; return the new node's number, None if the step is not clear."""
     nodes, parents = tree
     away = (aim - np.array(nodes)) / room.unit
     near = int(np.linalg.norm(away, axis=1).argmin())
@@ -101,7 +101,7 @@ def _branch(nodes: list[np.ndarray], parents: list[int], leaf: int) -> list[np.n
 
 
 def _shortened(room: Room, places: np.ndarray, generator: np.random.Generator, tries: int = 60) -> np.ndarray:
-    """Return a way with detours cut short: between places of it, and between points of its lines."""
+    """Return a way with detours removed by straight moves between its places and points on its lines."""
     for _ in range(tries):
         if len(places) < 3:
             break

@@ -1,4 +1,4 @@
-"""The dynamics that give a timed path its torques, and the largest velocities, accelerations and torques."""
+"""Dynamics and limits (velocity, acceleration, torque) for the timing of a path."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -9,7 +9,7 @@ from trajectories.errors import BadInput
 
 
 class Law(Protocol):
-    """The dynamics of a robot, as `calib.dynamics.path_dynamics.PathDynamics` has it; arrays (N, n)."""
+    """Interface of a robot's dynamics, see `calib.dynamics.path_dynamics.PathDynamics`; arrays (N, n)."""
 
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
@@ -20,7 +20,7 @@ class Law(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TimingLimits:
-    """Largest moduli (n,), each above zero, infinite where there is no limit.
+    """Limits on absolute values (n,), each above zero; infinite for no limit.
 
     Attributes:
         velocity, acceleration: [rad/s or m/s, and per s].

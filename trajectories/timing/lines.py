@@ -27,7 +27,7 @@ Forward = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A tool line as a joint path.
+    """Straight tool line as a joint path.
 
     Attributes:
         path: the joints' path.
@@ -53,7 +53,7 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
     start = np.asarray(start, dtype=float)
     first = forward(start[None])[0]
     if np.linalg.norm(_error(first[None], np.asarray(goal)[None])) <= SAME:
-        raise BadInput("the tool line has no length: both ends have the same tool pose; take one of them away")
+        raise BadInput("the tool line has no length: both ends have the same tool pose; remove one of them")
     count = SAMPLES
     while True:
         share = np.linspace(0, 1, count)
@@ -69,7 +69,7 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
 
 
 def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return joint values (m, n) at the targets (m, 4, 4), one after the other."""
+    """Return joint values (m, n) at the targets (m, 4, 4), solved one after the other."""
     q, found = start.copy(), [start]
     for k, target in enumerate(targets[1:], 1):
         q, error = _reach(forward, jacobian, q, start, target)
@@ -77,7 +77,7 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
             short, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
             raise NothingFeasible(
                 f"no tool line: at {k / (len(targets) - 1):.0%} of it the arm stays {1e3 * short:.3g} mm and "
-                f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow has to flip); take waypoints nearer "
+                f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow must flip); take waypoints closer "
                 "to each other, another posture at the start, or joint motion",
                 "reach", short, "m",
             )  # fmt: skip
@@ -86,7 +86,7 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
 
 
 def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, rest: np.ndarray, target: np.ndarray):
-    """Return joint values (n,) at a target pose and what is left of the error (6,)."""
+    """Return joint values (n,) at a target pose and the remaining error (6,)."""
     error = np.full(6, np.inf)
     max_step = 0.2  # [rad or m] of a step of any joint
     for _ in range(STEPS):

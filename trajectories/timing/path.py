@@ -1,4 +1,4 @@
-"""Paths q = Φ(s): where a motion goes, before anything says when. At least twice continuously differentiable.
+"""Paths q = Φ(s): geometry of a motion without timing. At least twice continuously differentiable.
 
 Splines through joint waypoints are parametrised by chord length (knots s_k apart by |q_k - q_{k-1}|), so that Φ' has a
 norm near one and the spline does not swing out where waypoints lie unevenly (de Boor 1978; Lee 1989 compares).
@@ -17,7 +17,7 @@ SAME = 1e-9  # waypoints nearer than this [rad or m] are one
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A path of n joints.
+    """A path of n joints as a spline.
 
     Attributes:
         derivative: (s (N,), order) to (N, n), d^order Φ / ds^order [rad or m per s^order], order 0 to 2.
@@ -49,7 +49,7 @@ class Path:
 
 
 def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.ndarray | None = None) -> Path:
-    """Return the natural cubic spline (C²) through waypoints; through two, the straight line.
+    """Return the natural cubic spline (C²) through waypoints; the straight line for two.
 
     Args:
         waypoints: (m, n) joint values [rad or m], two or more.
@@ -84,16 +84,16 @@ def checked(waypoints: np.ndarray) -> np.ndarray:
         row, joint = (int(k) for k in np.argwhere(~np.isfinite(points))[0])
         raise BadInput(f"waypoint {row + 1}, joint {joint + 1} is not a number ({points[row, joint]})")
     if len(points) < 2:
-        raise BadInput(f"{len(points)} waypoint: a path needs two or more (the first is where the motion starts)")
+        raise BadInput(f"{len(points)} waypoint: a path needs two or more (the first is the start)")
     steps = np.abs(np.diff(points, axis=0)).max(axis=1)
     if (steps <= SAME).any():
         k = int(np.argmax(steps <= SAME))
-        raise BadInput(f"waypoints {k + 1} and {k + 2} are the same; take one away (a stop is the end of a motion)")
+        raise BadInput(f"waypoints {k + 1} and {k + 2} are the same; remove one (a motion stops only at its end)")
     return points
 
 
 def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np.ndarray | None = None) -> np.ndarray:
-    """Return the margin (n,) that a path keeps to the nearer joint limit [rad or m].
+    """Return the path's margin (n,) to the nearer joint limit [rad or m]; refuse a path beyond a limit.
 
     Raises:
         BadInput: naming the waypoint or the place of the path beyond a limit, the joint, and by how much.
@@ -120,7 +120,7 @@ def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np
 
 
 def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each joint is lowest and highest, and its values there, two arrays (2, n)."""
+    """Return the path parameters of each joint's minimum and maximum, and the values there, two arrays (2, n)."""
     spans = len(path.knots) - 1
     samples = 40  # samples per knot interval where extremes are looked for
     s = np.interp(np.linspace(0, spans, samples * spans + 1), np.arange(spans + 1), path.knots)
@@ -131,7 +131,7 @@ def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reversals(path: Path, s: np.ndarray) -> np.ndarray:
-    """Return where joints turn between samples s (N,): zeros of Φ'_j, by bisection."""
+    """Return the path parameters where joints reverse between samples s (N,): zeros of Φ'_j, by bisection."""
     slope = path(s, 1)
     k, j = np.nonzero(slope[:-1] * slope[1:] < 0)
     low, high, rising = s[k], s[k + 1], slope[k + 1, j] > 0

@@ -16,7 +16,7 @@ TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A speed profile.
+    """A speed profile along a path.
 
     Attributes:
         s: (K + 1,) grid on the path, rising from 0.
@@ -28,12 +28,12 @@ class Profile:
 
     @property
     def u(self) -> np.ndarray:
-        """(K,) s̈ between grid points: Δx / (2 Δs)."""
+        """Path acceleration s̈ (K,) between grid points: Δx / (2 Δs)."""
         return np.diff(self.x) / (2 * np.diff(self.s))
 
     @property
     def times(self) -> np.ndarray:
-        """(K + 1,) when the grid points are passed [s]: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
+        """Times (K + 1,) of the grid points [s]: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
         speed = np.sqrt(self.x)
         return np.append(0.0, np.cumsum(2 * np.diff(self.s) / (speed[:-1] + speed[1:])))
 
@@ -56,7 +56,7 @@ class Profile:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """A motion along a path at places dense on it.
+    """A motion along a path, sampled densely.
 
     Attributes:
         s: (N,) the places.
@@ -73,7 +73,7 @@ class Sampled:
 
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
-    """Sample every interval of a profile with both of its ends: s̈, and friction's direction, jump to the next one.
+    """Return a profile sampled on each interval with both ends: s̈ and the friction's sign jump between intervals.
 
     At rest friction takes the direction of the motion that begins or ends there: the larger torque.
     """
@@ -96,7 +96,7 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
-    """Return the motion at a controller's rate [Hz]; its duration has to be a whole number of samples.
+    """Return the motion at a controller's rate [Hz]; its duration must be a whole number of samples.
 
     Torques at rest are those just after the start and just before the end.
     """

@@ -36,7 +36,7 @@ class _Bounded:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintRows:
-    """What does not change from round to round.
+    """Constraint rows that stay the same in all iterations.
 
     Attributes:
         s: (K + 1,) the grid.
@@ -66,7 +66,7 @@ class ConstraintRows:
         return cls(s, q, slope, curvature, A, B, G, limits)
 
     def speed(self, fastest_joint: float) -> float:
-        """Return the x at which no joint moves faster than this anywhere [rad/s or m/s]."""
+        """Return the x = ṡ² up to which no joint exceeds a speed [rad/s or m/s] anywhere."""
         return (fastest_joint / np.abs(self.slope).max()) ** 2
 
     def top(self, tight: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ class ConstraintRows:
     def friction(
         self, law: Law | None, x: np.ndarray | None, before: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return slope and value at x = 0 of friction as a line in x, each (2, K, n).
+        """Return friction linearised in x: slope and value at x = 0, each (2, K, n).
 
         Args:
             x: (K + 1,) the profile of the last round; None: friction at a creeping speed.
@@ -129,7 +129,7 @@ class ConstraintRows:
 
 
 def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
-    """Return the fastest profile from rest to rest.
+    """Return the fastest speed profile from rest to rest.
 
     Raises:
         NothingFeasible: where no speed can be kept from some grid point on.
@@ -138,7 +138,7 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     if not np.isfinite(most).all():
         k = int(np.flatnonzero(~np.isfinite(most)).max())
         raise NothingFeasible(
-            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path lets the robot stop at its end within the limits",
+            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits",
             "torque", float("nan"), "N m",
         )  # fmt: skip
     x = np.zeros(len(s))
@@ -148,7 +148,7 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     if (x[1:-1] <= 0).any():
         k = int(np.argmax(x[1:-1] <= 0)) + 1
         raise NothingFeasible(
-            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within the limits it has",
+            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within these limits",
             "torque", float("nan"), "N m",
         )  # fmt: skip
     return Profile(s, x)
@@ -164,7 +164,7 @@ def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
 
 
 def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
-    """Return the largest x (K + 1,) at each grid point from which the end is reached at rest; NaN where there is none.
+    """Return the largest x (K + 1,) at each grid point from which the path's end can be reached at rest; NaN if none.
 
     u and x are handed over in units of a typical x, without which the linear programs fail where speeds are large.
     """
@@ -189,7 +189,7 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
 
 
 class _Interval:
-    """What toppra asks of a path whose constraints are given."""
+    """Path interface for toppra, with given constraints."""
 
     dof = 1
 

@@ -1,4 +1,4 @@
-"""The outer loop: a path's own parameters φ chosen for a shorter time, its waypoints kept.
+"""Outer optimisation: path parameters φ for a shorter time, with fixed waypoints.
 
 A spline through m waypoints has freedom left: the spacing of its knots (m - 2 ratios), and a via point in the middle of
 each interval that may leave the first spline by `stray` (n each). The duration is continuous in φ but not smooth, since
@@ -22,7 +22,7 @@ Timer = Callable[[Path], float]
 
 @dataclass(frozen=True, eq=False)
 class Shaped:
-    """What the search found.
+    """Result of the search for a shorter path.
 
     Attributes:
         path: the fastest path.
@@ -40,7 +40,7 @@ class Shaped:
 
 
 def count(waypoints: np.ndarray, stray: float) -> int:
-    """Return how many parameters φ the path has."""
+    """Return the number of path parameters φ."""
     m, n = np.shape(waypoints)
     return m - 2 + ((m - 1) * n if stray > 0 else 0)
 
@@ -66,7 +66,7 @@ def shorten(
     stray: float = 0.0,
     progress: Callable[[int, float], None] | None = None,
 ) -> Shaped:
-    """Return the path through the waypoints with the shortest time that so many evaluations find.
+    """Return the path through the waypoints with the shortest time found within the given evaluations.
 
     Args:
         timer: duration [s] of a path; raises `NothingFeasible` or `BadInput` where it has none.
@@ -76,7 +76,7 @@ def shorten(
     import nlopt
 
     if not (np.isfinite(stray) and stray >= 0) or evaluations < 1:
-        raise BadInput(f"stray {stray:g}, {evaluations} evaluations: expected zero or more, and one or more")
+        raise BadInput(f"stray {stray:g}, {evaluations} evaluations: expected stray >= 0 and evaluations >= 1")
     p = count(waypoints, stray)
     first = build(waypoints, np.zeros(p), stray)
     before = timer(first)

@@ -29,7 +29,7 @@ ACTIVE = 0.01  # of a limit: nearer than that it is active
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """A timed path.
+    """A timed path with its torques and limits.
 
     Attributes:
         path, profile, limits: what moves, how fast, within what.
@@ -58,12 +58,12 @@ class Timing:
 
     @property
     def margins(self) -> dict[str, np.ndarray]:
-        """What is left of each limit, (n,) as a share of it; 1 where there is no limit."""
+        """Margin (n,) to each limit, as a share of it; 1 for no limit."""
         return {name: 1.0 - values.max(axis=0) for name, values in self.used.items()}
 
     @property
     def active_share(self) -> float:
-        """Share of the time in which some limit is within `ACTIVE` of being reached."""
+        """Share of the time in which at least one limit is reached within `ACTIVE`."""
         near = np.max([values.max(axis=1) for values in self.used.values()], axis=0) >= 1 - ACTIVE
         return float(self.sampled.weights @ near / self.sampled.weights.sum())
 
@@ -119,7 +119,7 @@ def time_optimal(
 
 
 def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing | None:
-    """Return the timing a little slower, up to 1 %, so that it keeps the limits; None where that does not help."""
+    """Return the timing slowed down by up to 1 % to keep the limits; None if that does not suffice."""
     for factor in 1 + 1e-5 * 2.0 ** np.arange(11):
         profile = timing.profile.slower(factor)
         profile = profile if rate is None else profile.slower(_whole(profile.duration, rate))
@@ -132,14 +132,14 @@ def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing 
 
 
 def _per_interval(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the largest of each interval (count, n) of what `dense` sampled (N, n)."""
+    """Return the maxima (count, n) per interval of values (N, n) sampled by `dense`."""
     return values.reshape(count, -1, values.shape[1]).max(axis=1)
 
 
 def _round(
     rows: ConstraintRows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict
 ) -> Profile:
-    """Return the fastest profile with friction as a line; by secants alone where tangents leave nothing feasible."""
+    """Return the fastest profile with linearised friction; by secants only if tangents make it infeasible."""
     try:
         return fastest(rows.bounded(rows.friction(law, x, before), tight), rows.s)
     except NothingFeasible:
@@ -147,7 +147,7 @@ def _round(
 
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
-    """Return the shares of the limits in use, (N, n) each; kinds of limit that no joint has are left out."""
+    """Return the shares of the limits in use, (N, n) each, without kinds of limit that no joint has."""
     found = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
     sizes = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}
     return {
@@ -158,7 +158,7 @@ def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
 
 
 def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
-    """Refuse a path on which the torque limits do not hold the robot still, or do not move it slowly.
+    """Refuse a path on which the torque limits do not suffice to hold the robot or to move it slowly.
 
     A motion that swings through such a place can exist; it could not be stopped there, nor rehearsed (our choice).
     """
@@ -171,14 +171,14 @@ def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) ->
             k, j = (int(i) for i in np.unravel_index(np.argmax(excess), excess.shape))
             raise NothingFeasible(
                 f"no motion: to {doing} at {s[k] / path.length:.0%} of the path, joint {j + 1} needs "
-                f"{abs(torque[k, j]):.4g} N m and its limit is {limits.torque[j]:.4g} ({excess[k, j]:.3g} too little); "
+                f"{abs(torque[k, j]):.4g} N m, its limit is {limits.torque[j]:.4g} ({excess[k, j]:.3g} short); "
                 "take another path, a smaller payload, or check the limits",
                 f"torque of joint {j + 1}", float(excess[k, j]), "N m",
             )  # fmt: skip
 
 
 def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
-    """Return a grid on the path: even in time where it starts and stops, and with its knots and turning points.
+    """Return a grid on the path: even in time near start and end, including its knots and reversal points.
 
     Args:
         count: intervals; None: `GRID`, or `PER_SPAN` between knots where these are many.
