@@ -1,4 +1,4 @@
-"""Frozen arrays and the one shape check."""
+"""Read-only arrays, and the check of shapes."""
 
 from dataclasses import fields
 

@@ -52,7 +52,7 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
     except RecursionError:
         raise error(f"{path}: is nested too deeply: more than {MAX_LEVELS} levels") from None
     except ValueError as wrong:  # of tomllib, of the decoder, of a number with thousands of digits, of a name with NUL
-        words = "a whole number of thousands of digits" if "digits" in str(wrong) else wrong
+        words = "a whole number with thousands of digits" if "digits" in str(wrong) else wrong
         raise error(f"{path}: is not a TOML file: {words}") from wrong
     _check_size(found, str(path), error)
     return found
@@ -72,7 +72,7 @@ def _check_size(found: Any, place: str, error: type[CalibError]) -> None:
 
 
 def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = UsageError) -> T:
-    """Return a parsed table as a `kind`.
+    """Return a parsed table as a checked instance of the dataclass `kind`.
 
     Args:
         kind: a dataclass under `strict`.
@@ -127,7 +127,7 @@ def _adapter(kind: Any) -> Any:
 
 
 def schema(kind: type, title: str) -> dict[str, Any]:
-    """Return the JSON schema (draft 2020-12) of the files that `parse` reads as a `kind`."""
+    """Return the JSON schema (draft 2020-12) of files for the dataclass `kind`."""
     from pydantic.json_schema import GenerateJsonSchema
 
     found = _adapter(kind).json_schema()

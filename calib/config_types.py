@@ -44,7 +44,7 @@ def shown(value: Any) -> str:
     try:
         return _SHORT.repr(value)
     except ValueError:
-        return "a whole number of thousands of digits"
+        return "a whole number with thousands of digits"
 
 
 def number(value: Any, place: str, quantity: str = "", error: type[CalibError] = UsageError) -> float:
@@ -100,7 +100,7 @@ def _expression(text: str, quantity: str, max_letters: int = 200) -> float:
 
 
 def _evaluated(node: ast.expr) -> float:
-    """Evaluate numbers, pi, signs and the four operations; anything else is a ValueError."""
+    """Return the value of an expression of numbers, pi, signs and + - * /; refuse anything else."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
@@ -239,7 +239,7 @@ class OneOf(_Read):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The texts."""
+        """The accepted texts."""
         if not isinstance(self.allowed, str):
             return self.allowed
         module, _, name = self.allowed.partition(":")
@@ -281,7 +281,7 @@ class Expect:
 
 
 def _unconverted(one: Any) -> Any:
-    """Return pydantic's schema of a number, text, flag or list of them without conversions, nan and infinity."""
+    """Return pydantic's strict schema of a number, text, flag or list of them; nan and infinity are refused."""
     if one["type"] in ("int", "float", "str", "bool"):
         one["strict"] = True
     if one["type"] == "float":
@@ -296,8 +296,8 @@ class Checked:
     """A function applied to a value before the annotations to its left check it.
 
     Attributes:
-        read: raises `ValueError` with the complaint's words.
-        json: what the JSON schema says in place of what stands to its left.
+        read: raises `ValueError` with the error message.
+        json: JSON schema that replaces that of the annotations to its left.
     """
 
     read: Callable[[Any], Any]
@@ -341,7 +341,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Filled:
-    """A list of tables that is not empty."""
+    """A non-empty list of tables."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         return {**handler(source), "min_length": 1}

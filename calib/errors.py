@@ -40,7 +40,7 @@ class Finding:
 
 
 def finding(code: str, **values: Any) -> Finding:
-    """Return a finding with plain values: numpy's numbers as Python's, sequences as tuples."""
+    """Return a finding with plain values: numpy numbers converted to Python's, sequences to tuples."""
     return Finding(code, {name: _plain(value) for name, value in values.items()})
 
 
@@ -97,7 +97,7 @@ class MeasurementError(CalibError):
 
 
 class Unidentifiable(CalibError):
-    """Parameters that the data do not identify.
+    """Error: the data do not identify all parameters.
 
     Attributes:
         names: the parameters concerned.
@@ -110,7 +110,7 @@ class Unidentifiable(CalibError):
 
 
 class NotConverged(CalibError):
-    """An iteration that stopped before its tolerance; ``last`` is its last estimate."""
+    """Error: an iteration stopped before reaching its tolerance; ``last`` is its last estimate."""
 
     def __init__(self, message: str, last: object = None):
         self.last = last
@@ -122,7 +122,7 @@ class CannotSimulate(NotConverged):
 
 
 class Diverged(NotConverged):
-    """An iteration whose estimates diverged."""
+    """Error: the estimates of an iteration diverged."""
 
 
 class TaskLost(CalibError):
@@ -139,7 +139,7 @@ class TaskLost(CalibError):
 
 
 class SessionError(CalibError):
-    """A session folder that is busy, damaged, or not in the state a command needs."""
+    """A session folder that is busy, damaged, or in the wrong state for a command."""
 
 
 def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: Any) -> None:
@@ -164,9 +164,9 @@ def refuse_option(place: object, words: str) -> NoReturn:
 
 
 def one_of(word: Any, words: Collection[str], what: str, kind: type[Exception] = CalibError, *details: Any) -> Any:
-    """Return `word`; one that is none of `words` raises ``what 'word' is none of ... (did you mean ...?)``."""
+    """Return `word` if it is among `words`, else raise ``what 'word' is not one of ... (did you mean ...?)``."""
     if word not in words:
-        raise kind(f"{what} '{word}' is none of {', '.join(words)}{suggestion(str(word), words)}", *details)
+        raise kind(f"{what} '{word}' is not one of {', '.join(words)}{suggestion(str(word), words)}", *details)
     return word
 
 

@@ -21,7 +21,7 @@ AGAIN = "fit, or identify, again"
 
 @dataclass(frozen=True, eq=False)
 class StoredEstimate:
-    """Rows of ``estimate.csv``.
+    """Stored estimate, the rows of ``estimate.csv``.
 
     Attributes:
         names, units: p texts each.
@@ -82,6 +82,6 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
         matrix = np.array([row[1:] for row in rows], dtype=float)
     names = tuple(map(plain_text, header[1:]))
     if tuple(plain_text(row[0]) for row in rows if row) != names or matrix.shape != (len(names), len(names)):
-        refuse_robot(path, f"rows and columns do not name the same parameters; {AGAIN}")
+        refuse_robot(path, f"parameter names of rows and columns differ; {AGAIN}")
     require(np.isfinite(matrix).all(), f"{path}: not a table of finite numbers; {AGAIN}", RobotError)
     return names, matrix

@@ -225,7 +225,7 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
     known = [path for path in map(Path, read) if os.path.exists(path)]  # False for names that no file can have
     for target in targets:
         if any(same_file(target, path) for path in known):
-            raise UsageError(f"{target} is read, and would be written over; write it elsewhere (--out)")
+            raise UsageError(f"{target} is an input and would be overwritten; write elsewhere (--out)")
 
 
 def same_file(one: Path, other: Path) -> bool:
@@ -267,7 +267,7 @@ def _digest(path: Path, *_: int) -> str:
 
 
 def write_json(path: str | Path, value: Any) -> Path:
-    """Write a record (`calib.records`), or anything made of records, mappings and lists, as indented JSON.
+    """Write a record (`calib.records`), or any nesting of records, mappings and lists, as indented JSON.
 
     Raises:
         CalibError: for a number that is not finite, since JSON has none, with its place; nothing is written.
@@ -278,8 +278,8 @@ def write_json(path: str | Path, value: Any) -> Path:
     except ValueError as error:
         place = next(_not_finite(value, ""), "") or "somewhere"
         raise CalibError(
-            f"{path} was not written: {place} is not a finite number, so that nothing can be said of this robot; the "
-            "measurements are too few or too much alike, or far from what the robot can do. Measure more poses, or ask "
+            f"{path} was not written: {place} is not a finite number. The "
+            "measurements are too few, too similar, or do not belong to this robot. Measure more poses, or ask "
             "for a simpler model"
         ) from error
     return write(path, content + "\n")

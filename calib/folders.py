@@ -38,10 +38,10 @@ def check_target(
     files.check_writable(out)
     files.check_not_input([out, *(out / name for name in ours)], inputs)
     if other := files_of(out, {METRICS, SESSION} - set(ours)):
-        raise UsageError(f"{out} holds {other[0]}: it is another result's or session's folder; choose another (--out)")
+        raise UsageError(f"{out} contains {other[0]} of another result or session; choose another folder (--out)")
     present = files_of(out, ours)
     if present and not all((out / name).exists() for name in marks):
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another (--out)")
+        raise UsageError(f"{out} contains {', '.join(present)}, not from an earlier {what}; choose another (--out)")
 
 
 def files_of(folder: Path, ours: Collection[str]) -> list[str]:
@@ -69,7 +69,7 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
         staging = Path(tempfile.mkdtemp(suffix, prefix, out.parent))
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise UsageError(f"cannot write beside {out}: {reason}; nothing was changed there") from error
+        raise UsageError(f"cannot write next to {out}: {reason}; nothing was changed there") from error
     try:
         write(staging)
         os.chmod(staging, 0o777 & ~files.umask())

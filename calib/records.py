@@ -47,7 +47,7 @@ def plain_text(cell: str) -> str:
 
 
 def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
-    """Return the rows of a CSV file of ours as values of the named tuple `kind`, whose fields are its columns.
+    """Return the rows of a CSV file as named tuples `kind`, whose fields are the columns.
 
     Raises:
         ValueError: where a column is missing or a cell is no number where one belongs.
@@ -58,7 +58,7 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
 
 
 def typed_rows(kind: type[T], rows: Iterable[Mapping[str, str]], place: str) -> tuple[T, ...]:
-    """Return rows of text by column as values of the named tuple `kind`; `place` is for messages, see `read_rows`."""
+    """Return text rows (by column) as named tuples `kind`; `place` names their source in messages."""
     hints = get_type_hints(kind)
     return tuple(kind(**{name: _cell(hint, row, name, place) for name, hint in hints.items()}) for row in rows)
 
@@ -165,7 +165,7 @@ def _nullable(hint: Any) -> bool:
 
 
 def read_record(kind: type[T], content: Any, place: str = "") -> T:
-    """Return plain JSON `content` as a value of `kind`, a record or a type made of records.
+    """Return plain JSON `content` as a value of the record type `kind`.
 
     Keys that a record does not name are left out, so that a newer version may write more; a field with a default may be
     missing.

@@ -26,7 +26,7 @@ def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJac
 
 
 def axis_distance(tool: Tool, least: float, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Keep d_xy = √(x² + y²) ≥ least [m], written least² − x² − y² ≤ 0, which is smooth on the axis too."""
+    """Keep d_xy = √(x² + y²) ≥ least [m], in the smooth form least² − x² − y² ≤ 0."""
     slope = None if jacobian is None else partial(_axis_gradient, tool, jacobian)
     return PoseConstraint("distance from the axis", partial(_axis, tool, least), slope)
 

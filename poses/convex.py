@@ -78,7 +78,7 @@ def bound(
 
 
 def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
-    """Solve the relaxation over prepared candidates; see `bound`."""
+    """Return the solved relaxation over prepared candidates; see `bound`."""
     z, known = candidates.z, candidates.known
     count, _, p = z.shape
     cap = 1.0 if capped else float(m)
@@ -114,7 +114,7 @@ def information_of(z: np.ndarray, known: np.ndarray, x: np.ndarray) -> np.ndarra
 
 
 def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Return d_i = tr(z_i M⁻¹ z_iᵀ) (N,)."""
+    """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates."""
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = z.reshape(-1, z.shape[2]) @ root.T
     return np.einsum("ij,ij->i", *(2 * (spread.reshape(len(z), -1),)))

@@ -27,7 +27,7 @@ class Pool:
 
 @dataclass(frozen=True)
 class Design:
-    """Chosen candidates.
+    """Chosen candidates with their information and log det.
 
     Attributes:
         members: their indices, in the order of choosing.
@@ -98,7 +98,7 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
 
 
 def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
-    """Return the member whose removal costs least of log det, and the (negative) gain."""
+    """Return the member whose removal reduces log det least, and the (negative) gain."""
     members = np.array(design.members)
     gains = gains_of(pool, design, members, -1.0)
     return int(members[gains.argmax()]), float(gains.max())

@@ -43,8 +43,8 @@ def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
     if not finite.all():
         first = int(np.argmin(finite))
         raise BadInput(
-            f"{name}: {int((~finite).sum())} of {len(array)} poses hold values that are not finite, the first is pose "
-            f"{first}; check the model there, or leave such poses out by the predicate"
+            f"{name}: {int((~finite).sum())} of {len(array)} poses have values that are not finite, the first is pose "
+            f"{first}; check the model there, or exclude such poses by the predicate"
         )
     return array
 

@@ -148,7 +148,7 @@ def select_poses(
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Selection:
-    """Select m poses that make the parameters as observable as possible.
+    """Return m poses that make the parameters as observable as possible.
 
     * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
       kicks (`poses.exchange`); other indices than O1 go on from there by `poses.by_index`.
@@ -241,7 +241,7 @@ def _candidates(
 
 
 def _exchange(task: _Request) -> _Chosen:
-    """Choose among the candidates; after Ctrl-C return the best so far."""
+    """Choose poses among the candidates; after Ctrl-C return the best so far."""
     candidates, m, p = task.candidates, task.m, task.jacobians.shape[2]
     whole = Pool(candidates.z, candidates.known)
     # Candidates of small score at the relaxed optimum are hardly ever chosen: search the promising ones (1000 at least,

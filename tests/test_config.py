@@ -105,7 +105,7 @@ def test_a_topic_without_schema_says_which_have_one(capsys: pytest.CaptureFixtur
     ("content", "words"),
     [
         (b"a = 1" + b"0" * 400, "a: a whole number of more than 64 bits"),
-        (b"a = 1" + b"0" * 5000, "a whole number of thousands of digits"),
+        (b"a = 1" + b"0" * 5000, "a whole number with thousands of digits"),
         (b"a = " + b"[" * 5000 + b"]" * 5000, "is nested too deeply"),
         (b"a = " + b"{b=" * 5000 + b"1" + b"}" * 5000, "is nested too deeply"),
         (b"a." * 5000 + b"a = 1", "is nested too deeply"),

@@ -18,7 +18,7 @@ def test_nothing_is_written_over_what_is_read_or_not_ours(tmp_path: Path) -> Non
     check_target(out, (METRICS, "a.csv"), (METRICS,), "fit", [tmp_path / "log.npz"])
     out.mkdir()
     (out / "a.csv").write_text("mine")
-    with pytest.raises(UsageError, match="no earlier fit"):
+    with pytest.raises(UsageError, match="not from an earlier fit"):
         check_target(out, (METRICS, "a.csv"), (METRICS,), "fit")
     (out / METRICS).write_text("{}")
     check_target(out, (METRICS, "a.csv"), (METRICS,), "fit")
@@ -76,7 +76,7 @@ def test_a_covariance_comes_back_by_names_of_any_kind(tmp_path: Path) -> None:
     found = estimate_files.read_covariance(tmp_path)
     assert found[0] == names and np.array_equal(found[1], matrix)
     path.write_text(path.read_text().replace("ü,", "u,", 1))
-    with pytest.raises(RobotError, match="do not name the same parameters"):
+    with pytest.raises(RobotError, match="parameter names of rows and columns differ"):
         estimate_files.read_covariance(tmp_path)
 
 

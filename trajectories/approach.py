@@ -69,5 +69,5 @@ def _check(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarray], r
             raise BadInput(f"approach: joint {int(np.argmin(np.isfinite(values))) + 1} of the {name} is not a number")
     for kind, values in bounds.items():
         if values.shape != start.shape or not (np.isfinite(values) & (values > 0)).all():
-            raise BadInput(f"approach: {kind} limits have to be finite and above zero, one per joint; found {values}")
+            raise BadInput(f"approach: {kind} limits must be finite and above zero, one per joint; found {values}")
     require(np.isfinite(rate) and rate > 0, f"rate {rate:g} Hz: expected a number above zero")

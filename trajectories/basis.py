@@ -22,7 +22,7 @@ ORDERS = ("position", "velocity", "acceleration", "jerk")
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """Samples of a motion.
+    """Samples of a motion with position, velocity, acceleration and jerk.
 
     Attributes:
         times: (N,) [s].
@@ -185,7 +185,7 @@ def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:
 
 
 def aligned_period(period: float, rate: float) -> int:
-    """Return how many samples of a controller's rate [Hz] one period [s] holds.
+    """Return the number of samples at a controller's rate [Hz] in one period [s]; refuse fractions.
 
     Raises:
         BadInput: where it holds no whole number, so that averaging over periods would mix instants.
@@ -194,7 +194,7 @@ def aligned_period(period: float, rate: float) -> int:
     if not np.isfinite(count) or count < 1 or abs(count - round(count)) > 1e-6:
         near = max(1, round(count)) / rate if np.isfinite(count) else float("nan")
         raise BadInput(
-            f"a period of {period:g} s is {count:g} samples at {rate:g} Hz, which is not whole: periods could not be "
+            f"a period of {period:g} s is {count:g} samples at {rate:g} Hz, not a whole number: periods could not be "
             f"averaged sample by sample; take {near:.12g} s"
         )
     return round(count)

@@ -95,7 +95,7 @@ def bspline_family(
     counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
         raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
-    require(degree >= 5, f"degree {degree}: 5 at least, or the jerk has kinks and nothing bounds it between samples")
+    require(degree >= 5, f"degree {degree}: expected 5 or more (below, the jerk is not bounded between samples)")
     require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     if rate is not None:
         aligned_period(period, rate)

@@ -143,7 +143,7 @@ class TorqueLimit:
         if not np.isfinite(self.parameters).all():
             k = int(np.argmin(np.isfinite(self.parameters)))
             raise BadInput(f"torque model: parameter {k + 1} is not finite ({self.parameters[k]})")
-        require((self.limits > 0).all(), f"torque limits have to be above zero, found {self.limits}")
+        require((self.limits > 0).all(), f"torque limits must be above zero, found {self.limits}")
         require(0 <= self.margin < 1, f"torque margin {self.margin}: expected a share of the limits from 0 to below 1")
         object.__setattr__(self, "joints", np.flatnonzero(np.isfinite(self.limits)))
 
@@ -203,7 +203,7 @@ def box_limits(
         if not (sizes > 0).all():
             j = int(np.argmin(np.where(np.isnan(sizes), -1.0, sizes)))
             raise BadInput(
-                f"{ORDERS[order]} limit of joint {j + 1} is {sizes[j]:g}: it has to be above zero; a joint that may "
+                f"{ORDERS[order]} limit of joint {j + 1} is {sizes[j]:g}: it must be above zero; a joint that may "
                 "not move is locked with 0 harmonics"
             )
         found.append(BoxLimit(order, -sizes, sizes, units[order]))
@@ -211,7 +211,7 @@ def box_limits(
 
 
 class Smoothed(NamedTuple):
-    """A constraint at a motion, smoothed.
+    """Smoothed values of a constraint along a motion.
 
     Attributes:
         constraint: which.

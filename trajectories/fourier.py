@@ -96,7 +96,7 @@ def fourier_family(
     if not counts or min(counts) < 0 or max(counts) < 1:
         raise BadInput(f"harmonics {harmonics} for {joints} joints: expected whole numbers, one of them above 0")
     if rest and 1 in counts:
-        raise BadInput("one harmonic cannot start at rest in velocity and acceleration: take 2 or more, or 0 to lock")
+        raise BadInput("one harmonic cannot start at rest: take 2 or more, or 0 to lock the joint")
     _check_frequencies(counts, period, resonance)
     if rate is not None:
         aligned_period(period, rate)

@@ -67,7 +67,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that `calib identify --out` writes."""
+        """Write the result folder, as `calib identify --out` does."""
         from calib.procedure.report import dynamics_figures
 
         return folder.write_folder(self, Path(out), dynamics_figures.write if plots else None)
@@ -80,7 +80,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
         return charts.figures(dynamics_figures.figures(self))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the metrics as ``metrics.json`` holds them."""
+        """Return the metrics as in ``metrics.json``."""
         return plain(metrics.metrics(self))
 
     def to_dataframe(self) -> Any:

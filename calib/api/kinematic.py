@@ -167,7 +167,7 @@ class GeometryFit(Judged, fit.Outcome):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""
+        """Write the result folder, as `calib fit --out` does: robot.toml, URDF, estimate, residuals, certificate."""
         from calib.procedure.report import certificate
 
         return folder.write_folder(self, Path(out), partial(certificate.write_fit, plots=plots))
@@ -182,7 +182,7 @@ class GeometryFit(Judged, fit.Outcome):
         return {name: charts.figure(chart) for name, (chart, _) in captioned.items()}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the metrics as ``metrics.json`` holds them."""
+        """Return the metrics as in ``metrics.json``."""
         return plain(folder.metrics(self))
 
     def to_dataframe(self) -> Any:
@@ -209,7 +209,7 @@ class GeometryFit(Judged, fit.Outcome):
 
 
 class JointCommands(compensation.Commands):
-    """Joint commands that put the real tool on nominal targets. ``print`` says what is reached and how well."""
+    """Joint commands that move the real tool to nominal targets. ``print`` says what is reached and how well."""
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
@@ -346,7 +346,7 @@ def compensate(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> JointCommands:
-    """Turn nominal targets into the joint commands that put the real tool there.
+    """Compute the joint commands that move the real tool to nominal targets.
 
     Args:
         fitted: a fit, the folder of one, or what was read of it.

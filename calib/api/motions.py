@@ -49,7 +49,7 @@ class ExcitationDesign(design.Designed):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that `calib excite --out` writes: trajectory.csv, ROS 2 messages, metrics, figures."""
+        """Write the result folder, as `calib excite --out` does: trajectory.csv, ROS 2 messages, metrics, figures."""
         from calib.procedure.report import motion_figures
 
         return folder.write_design(self, Path(out), motion_figures.write_design if plots else None)
@@ -86,7 +86,7 @@ class MotionPlan(planning.Planned):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the folder that `calib plan --out` writes."""
+        """Write the result folder, as `calib plan --out` does."""
         from calib.procedure.report import motion_figures
 
         return folder.write_plan(self, Path(out), motion_figures.write_plan if plots else None)

@@ -71,7 +71,7 @@ class Judged(ABC):
 
     @abstractmethod
     def section(self) -> Section:
-        """Return the section: verdict, figures, tables, sentences."""
+        """Return the report section: verdict, figures, tables, sentences."""
 
     @property
     def outcome(self) -> Self:

@@ -35,7 +35,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # a unit in brackets is a unit, not a style
-    help="Calibrate a robot's geometry, then its dynamics on it: choose poses and motions, fit, validate, export.",
+    help="Calibrate a robot's geometry, then its dynamics: choose poses and motions, fit, validate, export.",
     epilog=EXIT_CODES,
 )
 

@@ -1,4 +1,4 @@
-"""The dynamics: excite, recall, identify; and motions planned with them: plan."""
+"""Commands for dynamics: excite, recall, identify, and plan (motions)."""
 
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,4 +1,4 @@
-"""The geometry: fit, select, export."""
+"""Commands for geometry: fit, select, export, compensate."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -192,7 +192,7 @@ def compensate(
     overwrite: bool = False,
     seed: Seed = 0,
 ) -> None:
-    """Turn targets into joint commands that put the real tool there.
+    """Compute joint commands that move the real tool to targets.
 
     Targets of a workpiece that the instrument has measured: --frame STATION (the file's name, see the fit's report).
 

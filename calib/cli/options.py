@@ -1,4 +1,4 @@
-"""Commands made of functions: parameters and settings fields become options, docstrings their help."""
+"""Commands from function signatures: parameters and settings fields become options, docstrings their help."""
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
@@ -82,7 +82,7 @@ def _with_help(hint: Any, words: str, names: Sequence[str], positional: bool) ->
 
 
 def _options(kind: Any) -> Iterator[Parameter]:
-    """Yield the options of a settings dataclass, those of settings inside it included."""
+    """Yield the options of a settings dataclass, including nested settings."""
     hints, about = get_type_hints(kind, include_extras=True), described(kind)
     for field in fields(kind):
         if is_dataclass(hints[field.name]):

@@ -1,4 +1,4 @@
-"""The guided session: new, next, status, redo, demo; and formats."""
+"""Commands of the guided session: new, next, status, redo, run; formats and explain."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -64,7 +64,7 @@ def _asked(given: Answers) -> Answers:
 
     if not sys.stdin.isatty():
         missing = "--robot" if given.robot is None else "--instrument"
-        raise UsageError(f"{missing} is missing (at a terminal, calib new asks)")
+        raise UsageError(f"{missing} is missing (calib new asks for it at a terminal)")
     for question in QUESTIONS:
         while question.open(given):
             answer = typer.prompt(question.words, default=question.default, show_default=bool(question.default))

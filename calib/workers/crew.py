@@ -103,8 +103,8 @@ def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Calla
 def _lost(number: int, task: _Task, error: Died) -> TaskLost:
     given = task.arguments[0] if len(task.arguments) == 1 else task.arguments
     return TaskLost(
-        f"task {number + 1} ({shortened(given)}) is lost: {error}. Usually memory ran out; give each task less, or run "
-        "fewer at once",
+        f"task {number + 1} ({shortened(given)}) is lost: {error}. The usual cause is too little memory: run "
+        "fewer tasks at once",
         number, given,
     )  # fmt: skip
 

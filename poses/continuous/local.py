@@ -83,7 +83,7 @@ def improved(
     sharpness: Sequence[float] = SHARPNESS,
     report: Callable[[float], None] | None = None,
 ) -> Improved:
-    """Improve a set of poses under limits and constraints, all joint values at once.
+    """Improve a set of poses within limits and constraints, moving all joint values at once.
 
     A predicate without gradient cannot steer the search: poses that end where it says no go back to their start, and
     the others are searched again around them (our choice).

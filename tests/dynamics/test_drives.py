@@ -164,11 +164,11 @@ def test_stacking_copies_nothing():
     [
         (lambda: drives.standard(["Ia Fx"]), "joint 1: drive term 'Fx' is none of Ia"),
         (lambda: drives.term("F", "sign", 0), r"needs \(v0\)"),
-        (lambda: drives.term("F", "curly", 0), "shape 'curly' is none of"),
+        (lambda: drives.term("F", "curly", 0), "shape 'curly' is not one of"),
         (lambda: drives.DriveTerm("F", "one", (), side="left"), "side 'left', expected 'link' or 'motor'"),
         (lambda: IdentificationModel(bodies_of(TX40), drives.standard(["Ia"]) * 2), "'Ia1' occurs twice"),
         (lambda: IdentificationModel(bodies_of(TX40), drives.standard(["Ia"] * 7)), "'Ia7' refers to a missing joint"),
-        (lambda: torque_rows("torque"), "kind 'torque' is none of"),
+        (lambda: torque_rows("torque"), "kind 'torque' is not one of"),
     ],
 )
 def test_bad_terms_are_named(make, message):

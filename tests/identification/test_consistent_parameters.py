@@ -140,7 +140,7 @@ def test_the_euclidean_prior_is_another_robot_as_near_to_the_data():
 
 def test_an_unknown_prior_is_refused():
     _, _, _, data = planted(3)
-    with pytest.raises(UsageError, match="prior 'euclid' is none of entropic, euclidean"):
+    with pytest.raises(UsageError, match="prior 'euclid' is not one of entropic, euclidean"):
         solve.find_possible(data, prior="euclid")
 
 

@@ -210,5 +210,5 @@ def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
     arm = set(found.estimate.names) & set(found.cell.chain.names)
     assert np.count_nonzero(np.diag(read)) == len(arm) > 20
     files.write_table(tmp_path / calibrated.COVARIANCE, ("name", "alpha2"), [("d2", 1.0)])
-    with pytest.raises(RobotError, match="do not name the same parameters"):
+    with pytest.raises(RobotError, match="parameter names of rows and columns differ"):
         calibrated.read(tmp_path)

@@ -80,7 +80,7 @@ def test_friction_that_fades_near_standstill_shows_where_slow_rows_are_left_out(
 def test_a_named_rung_is_taken_at_all_joints_whatever_it_brings():
     found = identify(planted.arm(), [planted.case("a", 0)], IdentificationSettings(friction="asymmetric"))
     assert [one.name for one in found.friction.terms] == ["Fva1", "Fva2", "Fva3"]
-    with pytest.raises(UsageError, match="friction 'stribek' is none of"):
+    with pytest.raises(UsageError, match="friction 'stribek' is not one of"):
         select_friction(FrictionCandidates([], [], [], None, *[np.zeros(0)] * 4), "stribek")  # type: ignore[arg-type]
 
 

@@ -156,7 +156,7 @@ def row(**entry) -> dict:
         (row(aplha=1), r"number 2 \('joint2'\): there is no key 'aplha' .did you mean 'alpha'"),
         (row(a=1), r"there is no key 'a'"),
         (row(alpha="90 mm"), r"joint2'\), alpha: cannot read '90 mm' as a number \(here .*: rad, deg, mrad, degrees\)"),
-        (row(kind="spherical"), r"kind 'spherical' is none of revolute, prismatic, fixed"),
+        (row(kind="spherical"), r"kind 'spherical' is not one of revolute, prismatic, fixed"),
         (row(kind="fixed", lower=1), r"a fixed row has no 'lower'"),
         (row(index=1.5), r"index 1.5 is not a whole number"),
         (row(index=1), r"joint name 'joint1' occurs twice"),

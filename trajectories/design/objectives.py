@@ -29,7 +29,7 @@ Scaling = Literal["raw", "normalised"]
 
 
 class Value(NamedTuple):
-    """An objective and its slopes: by the regressor (N, n, b), by q, v, a, jerk (4, N, n), by the duration [1/s].
+    """An objective's value and slopes: by the regressor (N, n, b), by q, v, a, jerk (4, N, n), by the duration [1/s].
 
     ``exact`` is the objective without smoothing, ``by_information`` ∂F/∂M (b, b) of the information's own.
     """
@@ -65,7 +65,7 @@ def observed(regressor: np.ndarray, sigmas: np.ndarray | None, existing: np.ndar
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """An index of the information matrix.
+    """An index of the information matrix, as an objective.
 
     Attributes:
         index: "cond", "logdet" or "smallest".
@@ -86,9 +86,9 @@ class Excitation:
 
     def __post_init__(self) -> None:
         if self.index not in get_args(Index):
-            raise BadInput(f"index '{self.index}' is none of {', '.join(get_args(Index))}")
+            raise BadInput(f"index '{self.index}' is not one of {', '.join(get_args(Index))}")
         if isinstance(self.scaling, str) and self.scaling not in get_args(Scaling):
-            raise BadInput(f"scaling '{self.scaling}' is none of {', '.join(get_args(Scaling))}")
+            raise BadInput(f"scaling '{self.scaling}' is not one of {', '.join(get_args(Scaling))}")
 
     @property
     def name(self) -> str:

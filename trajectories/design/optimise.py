@@ -47,7 +47,7 @@ def design(
         NothingFeasible: naming the constraint that stood in the way where the excess was least.
     """
     if method not in get_args(Method):
-        raise BadInput(f"method '{method}' is none of {', '.join(get_args(Method))}")
+        raise BadInput(f"method '{method}' is not one of {', '.join(get_args(Method))}")
     began = time.perf_counter()
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     require(tasks, "no starts: ask for at least one, or give an initial guess")

@@ -75,7 +75,7 @@ def sweep(
             runs.append(run)
             values.append(run.values)
         if report:
-            report(number, len(levels), f"{len(runs)} motions on the front")
+            report(number, len(levels), f"{len(runs)} motions on the Pareto front")
     table = np.array(values).reshape(len(runs), 2)
     return Front((first.name, second.name), table, tuple(runs), non_dominated(table))
 

@@ -78,7 +78,7 @@ class ExcitationProblem:
             raise BadInput(f"stretch {self.stretch}: expected two positive factors, the smaller first")
         require(self.samples >= 8, f"{self.samples} samples: expected 8 or more over a period")
         if self.coarse is not None and (self.coarse.n, self.coarse.period) != (self.family.n, self.family.period):
-            raise BadInput("the coarse family has other joints or another period than the family")
+            raise BadInput("the coarse family must have the same joints and period as the family")
         require(self.objectives or self.goals, "nothing to design for: give objectives or goals")
 
     @property

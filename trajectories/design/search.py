@@ -242,7 +242,7 @@ class StartSearch:
         )  # fmt: skip
 
     def at(self, y: np.ndarray) -> Evaluation:
-        """Evaluate once per point, and keep the best feasible one."""
+        """Return the evaluation of a point, computed once; remember the best feasible one."""
         key = (y.tobytes(), self.sharpness)
         if self._evaluation is None or key != self._at:
             self._evaluation, self._at = evaluate(self.problem, self.basis, y, self.sharpness), key
@@ -324,7 +324,7 @@ class StartSearch:
         return self._optimised(solver, start)[: len(y)]
 
     def _count(self, y: np.ndarray) -> int:
-        """Return the number of inequalities, those of goals included."""
+        """Return the number of inequalities, including those of goals."""
         return len(self.at(np.ascontiguousarray(y)).constraints) + len(self.problem.goals)
 
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:

@@ -44,7 +44,7 @@ class Margin:
 
 @dataclass(frozen=True)
 class Verification:
-    """Margins of all columns of all constraints.
+    """Margins to all constraints, column by column.
 
     Attributes:
         instants: how many were looked at over the period.

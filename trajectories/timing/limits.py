@@ -38,5 +38,5 @@ class TimingLimits:
                 raise BadInput(f"{name} limits: expected one per joint, found shape {values.shape}")
             if not (values > 0).all():
                 j = int(np.argmin(np.where(np.isnan(values), -np.inf, values)))
-                raise BadInput(f"{name} limit of joint {j + 1} is {values[j]:g}: it has to be above zero")
+                raise BadInput(f"{name} limit of joint {j + 1} is {values[j]:g}: it must be above zero")
             object.__setattr__(self, name, values)

@@ -39,7 +39,7 @@ class _Line:
 
 
 def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarray) -> _Line:
-    """Return the joint path on which the tool runs straight from its pose at `start` to the pose `goal`.
+    """Return the joint path of a straight tool line from the tool pose at `start` to the pose `goal`.
 
     Args:
         forward: q (m, n) to tool poses (m, 4, 4).

@@ -113,8 +113,8 @@ def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np
         before = max(int(np.searchsorted(path.knots, places[k, j])), 1)
         hint = f" between waypoints {before} and {before + 1}" if waypoints is not None else ""
         raise BadInput(
-            f"the path swings{hint} to {values[k, j]:.4g} at joint {j + 1}, {excess[k, j]:.3g} beyond its limits "
-            f"{lower[j]:.4g} to {upper[j]:.4g}: put a waypoint there, or move the waypoints away from the limit"
+            f"the path overshoots{hint} to {values[k, j]:.4g} at joint {j + 1}, {excess[k, j]:.3g} beyond its limits "
+            f"{lower[j]:.4g} to {upper[j]:.4g}: add a waypoint there, or move the waypoints away from the limit"
         )
     return -excess.max(axis=0)
 

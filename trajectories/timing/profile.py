@@ -90,7 +90,7 @@ def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: 
 
 
 def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
+    """Return the motion q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
     slope = path(s, 1)
     return path(s), slope * speed[:, None], slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
 

@@ -201,7 +201,7 @@ def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
     name = max(excess, key=lambda key: float(excess[key].max()))
     worst, j = float(excess[name].max()), int(excess[name].max(axis=0).argmax())
     return NothingFeasible(
-        f"the timing did not settle: the {name} of joint {j + 1} stays {worst:.2g} of its limit beyond it between grid "
-        "points; a path with gentler bends, or more grid points, may help",
+        f"the timing did not converge: the {name} of joint {j + 1} exceeds its limit by {worst:.2g} of it between grid "
+        "points; try a path with gentler bends, or more grid points",
         f"{name} of joint {j + 1}", worst, "of the limit",
     )  # fmt: skip

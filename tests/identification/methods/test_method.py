@@ -54,5 +54,5 @@ def test_every_way_to_fail_has_its_name(problem, error, status):
 def test_bad_input_is_no_status(problem):
     with pytest.raises(UsageError, match="loop"):
         METHODS["iv"].estimate(problem)
-    with pytest.raises(UsageError, match="'lms' is none of"):
+    with pytest.raises(UsageError, match="'lms' is not one of"):
         method_named("lms")

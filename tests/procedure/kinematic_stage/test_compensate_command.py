@@ -261,7 +261,7 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
         code, _, err = calib("compensate", *arguments, "--out", "commands.csv")
         assert code == 2 and said in err, (arguments, err)
     code, _, err = calib("compensate", fitted, "t.csv", "--out", "t.csv")
-    assert code == 2 and "t.csv is read, and would be written over" in err
+    assert code == 2 and "t.csv is an input and would be overwritten" in err
 
 
 def test_one_target_and_the_same_one_twice_are_targets(fitted, here, calib):
