@@ -22,7 +22,7 @@ def test_nothing_is_written_over_what_is_read_or_not_ours(tmp_path: Path) -> Non
         check_target(out, (METRICS, "a.csv"), (METRICS,), "fit")
     (out / METRICS).write_text("{}")
     check_target(out, (METRICS, "a.csv"), (METRICS,), "fit")
-    with pytest.raises(UsageError, match=r"a\.csv is read"):
+    with pytest.raises(UsageError, match=r"a\.csv is an input"):
         check_target(out, (METRICS, "a.csv"), (METRICS,), "fit", [f"{out / 'a.csv'}@0:9"])
 
 
@@ -55,7 +55,7 @@ def test_figures_of_others_stay_and_stale_ones_of_ours_go(tmp_path: Path) -> Non
     assert sorted(path.name for path in tmp_path.iterdir()) == [METRICS, "plot_mine.png", "plot_torque_mine.png"]
     (tmp_path / "plot_map.png").touch()
     (tmp_path / METRICS).unlink()
-    with pytest.raises(UsageError, match=r"holds plot_map\.png"):
+    with pytest.raises(UsageError, match=r"contains plot_map\.png"):
         check_target(tmp_path, ours, (METRICS,), "fit")
 
 
@@ -96,7 +96,7 @@ def test_files_written_together_appear_together(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mark", [METRICS, "session.toml"])
 def test_the_folder_of_another_result_or_a_session_is_refused(mark, tmp_path: Path) -> None:
     (tmp_path / mark).touch()
-    with pytest.raises(UsageError, match=f"holds {mark}"):
+    with pytest.raises(UsageError, match=f"contains {mark}"):
         check_target(tmp_path, ("robot.urdf",), (), "export")
 
 

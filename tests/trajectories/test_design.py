@@ -253,7 +253,7 @@ def test_a_wall_thinner_than_a_step_is_not_jumped_over():
     ("make", "words"),
     [
         (lambda: box_limits(CHAIN.lower, CHAIN.upper, 0 * VELOCITY), "velocity limit of joint 1 is 0"),
-        (lambda: design(problem(), method="newton"), "none of slsqp"),  # type: ignore[arg-type]
+        (lambda: design(problem(), method="newton"), "not one of slsqp"),  # type: ignore[arg-type]
         (lambda: design(problem(), starts=0), "no starts"),
         (lambda: problem(samples=3), "8 or more"),
         (lambda: problem(objectives=()), "nothing to design"),

@@ -172,10 +172,10 @@ def test_coverage_is_zero_where_every_range_is_visited_enough():
     ("make", "error", "words"),
     [
         (lambda: BoxLimit(0, np.array([1.0]), np.array([0.0])), BadInput, "lower 1 is not below upper 0"),
-        (lambda: BoxLimit(1, np.array([0.1]), np.array([0.5])), BadInput, "hold zero"),
+        (lambda: BoxLimit(1, np.array([0.1]), np.array([0.5])), BadInput, "include zero"),
         (lambda: TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI * np.nan, LIMITS), BadInput, "not finite"),
         (lambda: TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, 0 * LIMITS), BadInput, "above zero"),
-        (lambda: Excitation("det"), BadInput, "none of cond"),  # type: ignore[arg-type]
+        (lambda: Excitation("det"), BadInput, "not one of cond"),  # type: ignore[arg-type]
         (lambda: Excitation().of_information(np.diag([1.0, 0.0])), NotExciting, "column 1"),
     ],
 )

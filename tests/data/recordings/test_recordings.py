@@ -234,7 +234,7 @@ def test_what_is_odd_is_noted(archive, series):
 def test_recordings_and_options_are_held_to_their_shapes(recording):
     with pytest.raises(MeasurementError, match="expected"):
         Recording(recording.t, recording.q[:, :2], recording.effort, "torque", ("a", "b", "c"))
-    with pytest.raises(MeasurementError, match="none of torque, current"):
+    with pytest.raises(MeasurementError, match="not one of torque, current"):
         Recording(recording.t, recording.q, recording.effort, "force", ("a", "b", "c"))
     with pytest.raises(UsageError, match="did you mean 'torque'"):
         RecordingOptions(names={"torqe": "x"})

@@ -35,7 +35,7 @@ def test_an_approach_keeps_its_limits_and_reaches_one_of_them():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"velocity": np.array([1.0, 0.0, 1.0])}, "velocity limits have to be"),
+        ({"velocity": np.array([1.0, 0.0, 1.0])}, "velocity limits must be"),
         ({"jerk": np.full(3, np.inf)}, "jerk limits must be finite"),
         ({"start": np.array([0.0, np.nan, 0.0])}, "joint 2 of the start"),
         ({"goal": np.zeros(2)}, "one value per joint"),

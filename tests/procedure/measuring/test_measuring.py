@@ -134,7 +134,7 @@ def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path,
     assert run([*given, str(tmp_path / "b.csv"), "--no-plots"]) == 0 and not (tmp_path / "b_predicted.png").exists()
     (tmp_path / "a.csv").rename(tmp_path / "c_outlook.png")
     assert run([*given, str(tmp_path / "c.csv"), "--existing", str(tmp_path / "c_outlook.png")]) == 2
-    assert "c_outlook.png is read" in capsys.readouterr().err
+    assert "c_outlook.png is an input" in capsys.readouterr().err
     assert run([*given, str(tmp_path / "d.csv"), "--run", str(tmp_path / "d.csv")]) == 2
     assert "written twice" in capsys.readouterr().err and not (tmp_path / "d.csv").exists()
 

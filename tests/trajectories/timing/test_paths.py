@@ -62,7 +62,7 @@ def test_waypoints_and_swings_beyond_the_limits_are_named():
     swinging = np.zeros((4, 7))
     swinging[:, 0] = [0.0, 2.96, 2.96, 0.0]
     swinging[:, 1] = [0.0, 0.0, 0.5, 0.5]
-    with pytest.raises(BadInput, match=r"swings between waypoints 2 and 3 to .* joint 1"):
+    with pytest.raises(BadInput, match=r"overshoots between waypoints 2 and 3 to .* joint 1"):
         check_within(spline(swinging), lower, upper, swinging)
     margin = check_within(spline(WAYPOINTS), lower, upper, WAYPOINTS)
     assert (margin > 0).all()
