@@ -210,7 +210,7 @@ def test_the_controller_is_read_from_its_log():
 
 def test_what_cannot_be_done_is_said():
     case = log(1e-4, 1)
-    with pytest.raises(UsageError, match="none of iv, didim"):
+    with pytest.raises(UsageError, match="not one of iv, didim"):
         found(case, method="2sls")
     with pytest.raises(UsageError, match="'ZZ9'"):
         found(case, positive=("ZZ9",))
