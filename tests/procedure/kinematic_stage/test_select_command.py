@@ -148,7 +148,9 @@ def test_what_is_sent_to_other_processes_pickles(cell):
     assert np.array_equal(copy.collision.distances(q), limits.collision.distances(q))
 
 
-@pytest.mark.parametrize(("out", "words"), [("before.csv", "is an input"), ("rules.toml", "is an input"), (".", "is a folder")])
+@pytest.mark.parametrize(
+    ("out", "words"), [("before.csv", "is an input"), ("rules.toml", "is an input"), (".", "is a folder")]
+)
 def test_nothing_is_written_onto_what_is_read(cell, calib, out, words):
     Path("rules.toml").write_text("[target]\nreach = 0.9\n")
     write_poses("before.csv", 8, 0)
