@@ -1,4 +1,4 @@
-"""CSV tables: a header with units, columns in SI, and complaints that name the row and the column.
+"""CSV tables: headers with units, columns converted to SI, errors with row and column.
 
 Separator tab, semicolon, comma or bar (the first of these that the header has), or blanks, where the first row of
 numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``
@@ -36,7 +36,7 @@ LONGEST = 1 << 20  # letters of a line (our choice)
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table as the file has it.
+    """Header, units and cells of a CSV file, before conversion to SI.
 
     Attributes:
         file: its path, for messages.
@@ -59,11 +59,11 @@ class Table:
         return name in self.header
 
     def fail(self, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
-        """Refuse the table, a column of it, or the cell in a row (from 0)."""
+        """Refuse the table, one of its columns, or one cell of a column (row from 0)."""
         refuse_data(self.file, message, column, None if row is None else int(self.rows[row]))
 
     def index(self, name: str) -> int:
-        """Return the place of column `name`; one that is not there is refused with the nearest one that is."""
+        """Return the index of column `name`; refuse a missing column and suggest the nearest name."""
         if name not in self.header:
             found = ", ".join(self.header)
             self.fail(f"column '{name}' is missing{suggestion(name, self.header)}; found: {found}")
@@ -105,10 +105,10 @@ class Table:
         return cells * self.factor(column, known, unit)
 
     def factor(self, column: int, known: Mapping[str, float], unit: str) -> float:
-        """Return the factor to SI of a column's unit, one of those known, which its header or `unit` states."""
+        """Return the factor to SI of a column; the unit is in its header or in `unit`, and one of `known`."""
         name, own = self.header[column], self.units[column]
         if own and unit and own != unit:
-            self.fail(f"its header says [{own}], the options say {unit}: take one of them away", name)
+            self.fail(f"the header states [{own}], the options state {unit}: remove one of them", name)
         unit = own or unit
         if unit and unit.lower() not in known:
             expected = ", ".join(name for name in known if name.isascii())
@@ -116,12 +116,12 @@ class Table:
         return known[unit.lower()] if unit else 1.0
 
     def where(self, keep: np.ndarray) -> Table:
-        """Return the rows at which `keep` (m,) holds."""
+        """Return the table of the rows selected by the mask `keep` (m,)."""
         return Table(self.file, self.header, self.units, tuple(cells[keep] for cells in self.cells), self.rows[keep])
 
 
 def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: bool = False) -> Table:
-    """Read the CSV file at `path`; a 100 MB file of numbers takes some 3 s and its own size of memory.
+    """Return the table of the CSV file at `path`; 100 MB of numbers take about 3 s and 100 MB of memory.
 
     Args:
         header: names for a file that has no header.
@@ -136,7 +136,7 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
         if not doubles and len(set(names)) < len(names):
             name = next(name for i, name in enumerate(names) if name in names[:i])
             places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
-            refuse_data(path, f"stands in the header more than once (columns {places})", name)
+            refuse_data(path, f"occurs more than once in the header (columns {places})", name)
         cells = _read_columns(lines, separator, names, path)
     require(len(cells[0]), "has a header but no data rows", MeasurementError, path)
     rows = frozen(np.arange(1, len(cells[0]) + 1), int)
@@ -159,7 +159,7 @@ def row_width(path: str | Path) -> int:
 
 @contextmanager
 def _opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[str]]]:
-    """Open a file behind its header line, with the separator and the header's cells."""
+    """Yield a file positioned after its header line, its separator, and the header's cells."""
     try:
         check_regular(path)
         opened = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
@@ -170,12 +170,12 @@ def _opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list
 
 
 def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, list[str]]:
-    """Return the separator and the header's cells, and leave a file behind its header line."""
+    """Return the separator and the header's cells; the file is then positioned after its header line."""
     try:
         comment, place = "", 0
         for line in iter(partial(file.readline, LONGEST), ""):
             if len(line) == LONGEST:
-                refuse_data(path, f"has a line of more than {LONGEST} letters: this is no table")
+                refuse_data(path, f"has a line of more than {LONGEST} characters: not a table")
             text = line.strip()
             if text.startswith("#"):
                 comment = text
@@ -200,14 +200,14 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
 
 
 def _headless(cells: Sequence[str], path: str | Path) -> bool:
-    """Return whether a first line is one of numbers."""
+    """Return whether a first line contains numbers only."""
     if sum(bool(_DECIMAL_COMMA.match(cell)) for cell in cells) > len(cells) / 2:
         refuse_data(path, _not_a_number(cells[0]), row=1)
     return sum(_is_number(cell) for cell in cells) > len(cells) / 2
 
 
 def _separator(line: str, ahead: Callable[[], str]) -> str:
-    """Return the separator of a first line; `ahead` returns the line behind it."""
+    """Return the separator of a first line; `ahead` returns the line after it."""
     line = re.sub(r'"[^"]*"', "", line)
     if mark := next((mark for mark in "\t;,|" if mark in line), ""):
         return mark
@@ -218,7 +218,7 @@ def _separator(line: str, ahead: Callable[[], str]) -> str:
 
 
 def _ahead(file: IO[str]) -> str:
-    """Return the next line that is neither empty nor a comment; the file stays where it is."""
+    """Return the next line that is neither empty nor a comment; the file position is unchanged."""
     place = file.tell()
     lines = iter(partial(file.readline, LONGEST), "")
     found = next((line for line in lines if line.strip() and not line.startswith("#")), "")
@@ -231,8 +231,8 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
     if len(names) == width and not any(_is_number(name) for name in names if name):
         return names
     message = (
-        f"has no header: its first line is numbers, {width} cells. Add a first line that names the columns "
-        "(q1,q2,...,x,y,z), or give `format` in the options where the file is of a known headerless form"
+        f"has no header: its first line contains only numbers ({width} cells). Add a line with the column names "
+        "(q1,q2,...,x,y,z), or state `format` in the options for a known headerless format"
     )
     refuse_data(path, message)
 
@@ -247,7 +247,7 @@ def _split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]
 
 
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
-    """Return the columns behind the header. Blocks of nothing but numbers, one in each cell, are read by numpy, some
+    """Return the columns below the header. Blocks of nothing but numbers, one in each cell, are read by numpy, some
     five times as fast; from the first block on that is anything else, cell by cell."""
     body = (line for line in lines if (text := line.lstrip()) and text[0] != "#")
     blocks: list[np.ndarray] = []
@@ -269,7 +269,7 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
 
 
 def _numbers(block: list[str], separator: str, width: int) -> np.ndarray | None:
-    """Return the lines as an array (m, width); None where a cell is empty or no number, or a row has other cells."""
+    """Return the lines as an array (m, width); None if a cell is not a number or the widths of rows differ."""
     delimiter = None if separator == " " else separator
     try:
         found = np.loadtxt(block, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
@@ -279,7 +279,7 @@ def _numbers(block: list[str], separator: str, width: int) -> np.ndarray | None:
 
 
 def _transposed(blocks: list[np.ndarray], width: int) -> np.ndarray:
-    """Return blocks (m_i, width) as one array (width, m), each column in one piece; the blocks are used up."""
+    """Return blocks (m_i, width) as one array (width, m) of contiguous columns; empties `blocks`."""
     table, place = np.empty((width, sum(len(block) for block in blocks))), 0
     blocks.reverse()
     while blocks:  # an hour's log is held once, not twice
@@ -293,7 +293,7 @@ def _transposed(blocks: list[np.ndarray], width: int) -> np.ndarray:
 def _read_cells(
     body: Iterator[str], separator: str, names: tuple[str, ...], path: str | Path, done: int
 ) -> list[list[np.ndarray]]:
-    """Return the columns in parts, each of floats or of texts; `done` rows stand before."""
+    """Return the columns in parts, each of floats or of texts; `done` rows precede them."""
     parts: list[list[np.ndarray]] = [[] for _ in names]
     rows = (row for row in csv.reader(body, delimiter=separator, skipinitialspace=True) if any(row))
     try:
@@ -310,7 +310,7 @@ def _read_cells(
 
 
 def _convert(column: Sequence[str]) -> np.ndarray:
-    """Return the cells as floats where all of them are numbers or empty, else as texts."""
+    """Return the cells as floats if all of them are numbers or empty, else as texts."""
     joined = "".join(column)
     try:
         if "_" in joined or not joined.isascii():
@@ -354,7 +354,7 @@ def _not_a_number(cell: str) -> str:
 
 
 def _ragged(row: Sequence[str], names: Sequence[str], separator: str) -> str:
-    message = f"has {len(row)} cells where the header has {len(names)} columns"
+    message = f"has {len(row)} cells, the header has {len(names)} columns"
     if separator == "," and len(row) > 1.5 * len(names):
         message += "; if these are decimal commas, save the table with decimal points and commas between columns"
     return message
@@ -363,7 +363,7 @@ def _ragged(row: Sequence[str], names: Sequence[str], separator: str) -> str:
 def _not_utf8(error: UnicodeDecodeError, path: str | Path) -> MeasurementError:
     byte = error.object[error.start]
     if _begins_as_archive(path):
-        return MeasurementError("is an archive (NumPy's .npz, a spreadsheet), where a CSV table is expected", path)
+        return MeasurementError("is an archive (.npz or spreadsheet), not a CSV table", path)
     return MeasurementError(f"is not UTF-8 text (byte 0x{byte:02x}): save it as 'CSV UTF-8'", path)
 
 

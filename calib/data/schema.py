@@ -1,6 +1,6 @@
-"""Columns of tables, declared once: their names, dimension and bounds; and the one complaint about a cell.
+"""Declarations of table columns (names, dimension, bounds), and the error about a cell beyond them.
 
-Poses, targets, waypoints and recordings read their tables by these declarations. A value that cannot be is refused by
+Poses, targets, waypoints and recordings read their tables by these declarations. An impossible value is refused by
 `refuse`: the value first, what to do last, then how many more rows are like it; the error carries file, row and column.
 """
 
@@ -17,14 +17,14 @@ from calib.units import DEG
 
 @dataclass(frozen=True)
 class Bounds:
-    """What measured values stay within; all of them our choice.
+    """Bounds on measured values; all of them our choice.
 
     Attributes:
         max_turn: of a turning joint without limits [rad].
         max_length: of a tool from its instrument, and of a sliding joint's travel [m].
         min_sigma: of an instrument [m or rad].
         min_travel: a joint that moves less has not moved [rad or m].
-        limit_slack: by which encoders stand beyond a limit [rad or m].
+        limit_slack: allowed encoder error beyond a joint limit [rad or m].
         max_norm_error: of a quaternion or a matrix, rounding that is corrected.
     """
 
@@ -40,7 +40,7 @@ BOUNDS = Bounds()
 
 
 class Rows(Protocol):
-    """What a complaint is about: a table, a recording or a block of measurements.
+    """Source of rows named in an error: a table, a recording or a block of measurements.
 
     Attributes:
         file: where it came from.
@@ -55,11 +55,11 @@ class Rows(Protocol):
 
 
 def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable[[int, int], str]) -> None:
-    """Refuse the rows at which `bad` (m,) or (m, k) holds; nothing happens where it never does.
+    """Refuse the rows marked in `bad`, (m,) or (m, k), if any.
 
     Args:
         columns: the file's names of the k columns.
-        says: the sentence for the first bad cell, of its row and column (from 0).
+        says: returns the message for the first bad cell from its row and column (from 0).
 
     Raises:
         MeasurementError: with file, row and column of the first bad cell, and the number of further rows.
@@ -75,7 +75,7 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table, or several that go together.
+    """One column of a table, or a family of columns (x, y, z).
 
     Attributes:
         names: ours, in their order.
@@ -83,7 +83,7 @@ class Column:
         family: name under which options state a unit for all of them.
         most: largest absolute value [SI].
         likely: the unit that larger values are likely in.
-        positive: advice where a value is not above zero; "" where it may be anything.
+        positive: advice if a value is not above zero; "" if it may have any sign.
     """
 
     names: tuple[str, ...]
@@ -94,7 +94,7 @@ class Column:
     positive: str = ""
 
     def check(self, values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-        """Return values (m, k) [SI], NaN where a cell may be empty; those beyond the column's bounds are refused."""
+        """Return the given values (m, k) [SI] (NaN: empty cell); refuse values beyond the column's bounds."""
         unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
 
         def other_unit(row: int, k: int) -> str:
@@ -113,12 +113,12 @@ class Column:
 
 
 def joint_unit(kind: str) -> tuple[str, str, float]:
-    """Return the SI unit of a joint of URDF's type `kind`, the unit that is mistaken for it, and its size in SI."""
+    """Return the SI unit for a joint of URDF type `kind`, the unit mistaken for it, and that unit's factor to SI."""
     return ("m", "mm", 1e-3) if kind == "prismatic" else ("rad", "deg", DEG)
 
 
 def max_travel(kinds: Sequence[str]) -> np.ndarray:
-    """Return the largest values (n,) [rad or m] that joints of these types reach where no limits are known."""
+    """Return the largest plausible values (n,) [rad or m] of joints of these types without known limits."""
     most = {"prismatic": BOUNDS.max_length, "continuous": math.inf}
     return np.array([most.get(kind, BOUNDS.max_turn) for kind in kinds])
 
@@ -132,10 +132,10 @@ def check_travel(
     kinds: Sequence[str],
     advice: Callable[[int, str], str],
 ) -> None:
-    """Refuse joint values (m, n) [rad or m] beyond `most` (n,).
+    """Refuse joint values (m, n) [rad or m] larger than `most` (n,).
 
     Args:
-        advice: what to do about joint j, whose values look like another unit.
+        advice: returns the advice for joint j from the unit its values look like.
     """
 
     def says(row: int, j: int) -> str:

@@ -91,9 +91,9 @@ def test_a_column_that_turns_to_text_late_is_text(write):
         ("", "is empty", None, None),
         ("# only a comment\n", "is empty", None, None),
         ("a,b\n", "no data rows", None, None),
-        ("a,b,a\n1,2,3\n", r"more than once \(columns 1 and 3\)", None, "a"),
-        ("a,b\n1,2\n1,2,3\n", "3 cells where the header has 2", 2, None),
-        ("a,b\n1,2\n1\n", "1 cells where the header has 2", 2, None),
+        ("a,b,a\n1,2,3\n", r"more than once in the header \(columns 1 and 3\)", None, "a"),
+        ("a,b\n1,2\n1,2,3\n", "3 cells, the header has 2", 2, None),
+        ("a,b\n1,2\n1\n", "1 cells, the header has 2", 2, None),
         ("a,b\n1,5,2,5\n", "decimal commas", 1, None),
         ("1,2\n3,4\n", "has no header.*format", None, None),
         ("left,1,2\nright,3,4\n", "has no header", None, None),
@@ -140,7 +140,7 @@ def test_files_that_cannot_be_decoded_or_found(tmp_path):
         ("x [furlong]", "length", "", "is none of"),
         ("x [deg]", "length", "", "is none of"),
         ("x [m]", "angle", "", "is none of"),
-        ("x [mm]", "length", "m", r"header says \[mm\], the options say m"),
+        ("x [mm]", "length", "m", r"header states \[mm\], the options state m"),
         ("xx", "length", "", r"'x' is missing"),
     ],
 )
@@ -159,7 +159,7 @@ def test_the_header_alone(write):
 
 
 def test_a_ragged_row_far_down_keeps_its_number(write):
-    with pytest.raises(MeasurementError, match="1 cells where the header has 2") as error:
+    with pytest.raises(MeasurementError, match="1 cells, the header has 2") as error:
         read_table(write("a,b", "1,2\n" * 40_002 + "3\n"))
     assert error.value.row == 40_003
 

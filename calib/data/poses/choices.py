@@ -1,4 +1,4 @@
-"""What a fit of the geometry may be asked for, by name; loads nothing, so that the command line starts at once."""
+"""Names of models, losses and files of a geometric fit; imports little, so that the command line starts at once."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,5 +17,5 @@ Loss = Annotated[str, OneOf(LOSSES)]
 
 
 def is_image_folder(path: Path) -> bool:
-    """Return whether a path is a folder of images (or of the corners found in them) with joint values."""
+    """Return whether a path is a folder of board images (or of detected corners) with joint values."""
     return path.is_dir() and ((path / JOINTS).exists() or (path / BOARD).exists())

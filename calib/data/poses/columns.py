@@ -1,4 +1,4 @@
-"""Which column of a measurement file holds what: our names, the robot's, and those of the options file."""
+"""Meaning of the columns of a measurement file, by our names, the robot's joint names, and the options."""
 
 import re
 from collections.abc import Sequence
@@ -45,12 +45,12 @@ _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table, and how the options say that it is read.
+    """A table and the options to read it with.
 
-    Attributes:
-        table: as the file has it.
-        options: names and units that the header does not state.
-        suffixes: that may stand behind our names of columns that go together.
+        Attributes:
+            table: as the file has it.
+            options: names and units that the header does not state.
+    suffixes: allowed endings of our names in a family of columns.
     """
 
     table: Table
@@ -62,12 +62,12 @@ class Sheet:
         self.table.fail(message, column)
 
     def find(self, name: str) -> str:
-        """Return the file's name of the column that we call `name`; "" where it has none."""
+        """Return the file's name for our column `name`; "" if the file has no such column."""
         theirs = self.options.columns.get(name, name)
         return theirs if theirs in self.table else ""
 
     def unit(self, column: str, family: str) -> str:
-        """Return the unit that header or options state for a column; "" for none."""
+        """Return the unit of a column as stated in the header or the options; "" if neither states it."""
         return self.table.units[self.table.index(column)] or self._stated(column, family)
 
     def _stated(self, column: str, family: str) -> str:
@@ -76,7 +76,7 @@ class Sheet:
         return units.get(ours, units.get(column, units.get(family, "")))
 
     def numbers(self, names: Sequence[str], column: Column, gaps: bool = False) -> np.ndarray:
-        """Return columns (m, k) in SI, within the bounds of what they are; a gap is NaN."""
+        """Return columns (m, k) in SI, checked against the bounds of `column`; a gap is NaN."""
         family, dimension = column.family, column.dimension
         values = [self.table.numbers(name, dimension, self._stated(name, family), gaps) for name in names]
         return column.check(np.stack(values, axis=1), self.table, names)
@@ -87,18 +87,18 @@ class Sheet:
         return self.numbers(names, Column(tuple(joints), "joint", "joints")), names
 
     def check_names(self, joints: Sequence[str]) -> None:
-        """Refuse options that name a column which neither we nor the file have."""
+        """Refuse options that name a column unknown to both the toolkit and the file."""
         ours = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
         for name, theirs in self.options.columns.items():
             if name not in ours and not _TARGET.fullmatch(name):
-                message = f"the options map a column '{name}', which is none of ours{suggestion(name, ours)}"
-                self.fail(f"{message}; ours are {', '.join(ours)}", theirs)
+                message = f"the options map a column '{name}', which this toolkit does not know{suggestion(name, ours)}"
+                self.fail(f"{message}; known are {', '.join(ours)}", theirs)
             self.table.index(theirs)
         for name in (*self.options.groups, *self.options.where):
             self.table.index(name)
         for name, unit in self.options.units.items():
             if name not in (*ours, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
-                message = f"the options give a unit {unit} for '{name}', which is no column"
+                message = f"the options state unit {unit} for '{name}', which is not a column"
                 self.fail(message + suggestion(name, (*ours, *UNIT_GROUPS)), name)
 
     def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
@@ -126,12 +126,10 @@ class Sheet:
         if all(re.fullmatch(r"q\d+", name) for name in found):
             extra = [name for name in self.table.header if re.fullmatch(r"q\d+", name) and name not in found]
             if extra:
-                self.fail(
-                    f"the robot has {len(found)} joints, and this is one more: is it the right robot (chain)?", extra[0]
-                )
+                self.fail(f"the robot has only {len(found)} joints: is this the right robot (chain)?", extra[0])
 
     def family(self, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
-        """Return the file's names of columns that go together (plain, or with a suffix); () if none is there.
+        """Return the file's names of a family of columns (plain, or with a suffix); () if all are absent.
 
         Where the options map some of them, the others are those that the file has under one of these names.
 
@@ -152,28 +150,28 @@ class Sheet:
         return ()
 
     def one_of(self, families: Sequence[tuple[str, ...]], ours: Sequence[str]) -> tuple[str, ...]:
-        """Return the one of several families of columns that the file has, () where there is none; two are refused."""
+        """Return the only family of columns found in the file, () if none was found; refuse two."""
         if len(families) > 1:
             first, second = (", ".join(family) for family in families[:2])
             one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, families[-1]))
-            message = f"the header has {first} and {second}: which of them are to be read? Map them in the options"
+            message = f"the header has {first} and {second}; map the columns to be read in the options"
             self.fail(f"{message}: [columns] {one}", families[0][0])
         return families[0] if families else ()
 
     def _mapped(self, name: str, together: Sequence[str]) -> str:
-        """Return the file's name of one of the columns `together`, of which the options map some."""
+        """Return the file's name of column `name` of the family `together`, mapped only in part by the options."""
         if name in self.options.columns:
             return self.options.columns[name]
         found = [name + suffix for suffix in self.suffixes if name + suffix in self.table]
         if len(found) == 1:
             return found[0]
         what = " and ".join(found) + " could be it" if found else f"missing{suggestion(name, self.table.header)}"
-        self.fail(f"{what}: {', '.join(together)} go together, and [columns] maps some of them only; map it, too", name)
+        self.fail(f"{what}: {', '.join(together)} belong together; map this one in [columns], too", name)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The file's names of the columns to read.
+    """File's names of the columns to read.
 
     Attributes:
         kind: one of `KINDS`.
@@ -209,7 +207,7 @@ class Layout:
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
-    """Return which columns of a table are to be read for a robot with these joints.
+    """Return the columns of a table to be read for a robot with these joints.
 
     Raises:
         MeasurementError: where a column is missing or mapped in vain, or the header allows several kinds, or several
@@ -219,15 +217,15 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     found = _layout(sheet, joints)
     numbers = (*found.joints, *(name for names in found.positions for name in names), *found.orientation)
     if twice := sorted({name for name in numbers if numbers.count(name) > 1}):
-        message = "is read twice, as two different columns: is one of them mapped to it by mistake? See [columns]"
+        message = "is read as two different columns: is one of them mapped by mistake? See [columns]"
         sheet.fail(message, twice[0])
     if found.kind == "pose":
         _check_one_source(sheet, found.positions[0], found.orientation)
     for name, theirs in sheet.options.columns.items():
         if theirs not in found.used:
             sheet.fail(
-                f"is mapped to '{name}' by the options, yet nothing reads it in a file of kind '{found.kind}': take it "
-                "out of [columns], or state another kind",
+                f"is mapped to '{name}' by the options, but not read in a file of kind '{found.kind}': remove it "
+                "from [columns], or state another kind",
                 theirs,
             )
     return found
@@ -248,7 +246,7 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not orientation:
         sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
     if len(positions) > 1:
-        sheet.fail("kind 'pose' allows one target per row, found numbered positions", positions[1][0])
+        sheet.fail("kind 'pose' allows one target per row, but positions are numbered", positions[1][0])
     if orientation[0] not in ("qx", "r11"):
         meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
@@ -257,7 +255,7 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
 
 
 def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
-    """Refuse a plain position beside a measured orientation, or the reverse: the plain columns may be the command.
+    """Refuse a plain position with a measured orientation, or the reverse: the plain columns may be commands.
 
     Measured is what is named so, or what the options map though the file has the plain names, too.
     """
@@ -271,8 +269,8 @@ def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequen
             mapped = ", ".join(f'{name} = "{name}"' for name in names)
             alone = "" if names == POSITION.names else ', or read the positions alone (kind = "position")'
             sheet.fail(
-                f"the header has {', '.join(names)} beside {', '.join(measured)}: were the former measured, too, or "
-                f"are they what was commanded? If measured, map them in the options ([columns] {mapped}){alone}",
+                f"the header has {', '.join(names)} next to {', '.join(measured)}: were the former measured or "
+                f"commanded? If measured, map them in the options ([columns] {mapped}){alone}",
                 names[0],
             )
 
@@ -290,7 +288,7 @@ def _grouped_layout(sheet: Sheet, kind: str, joints: tuple[str, ...]) -> Layout:
 
 
 def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a quaternion's four columns, a matrix's nine, three angles', or none.
+    """Return the names of the orientation's columns: four (quaternion), nine (matrix), three (angles), or ().
 
     Raises:
         MeasurementError: for three angles whose meaning the options do not state.
@@ -298,16 +296,16 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     found = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
     if len(found) == 3 and not sheet.options.euler:
         sheet.fail(
-            f"{', '.join(found)} look like an orientation. State in the options what they mean: euler = 'vector' "
-            "(rotation vector, as Universal Robots have it), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
-            "B, C) ...; or kind = 'position' to leave them out",
+            f"{', '.join(found)} look like an orientation. State their meaning in the options: euler = 'vector' "
+            "(rotation vector, as in Universal Robots), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
+            "B, C) ...; or ignore them by kind = 'position'",
             found[0],
         )
     return found
 
 
 def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of three angles, capital letters or not, that are no joints; () if there are none.
+    """Return the names of three angle columns (in any case) that are not joints; () if absent.
 
     Columns named by one small letter (a, b, c) are anything, unless the options state what angles mean.
     """
@@ -331,10 +329,10 @@ def _find_kind(sheet: Sheet, joints: Sequence[str]) -> str:
         kinds.append("pose" if _find_orientation(sheet, joints) else "position")
     if len(kinds) > 1:
         several = ", ".join(kinds)
-        sheet.fail(f"the header allows the kinds {several}: say which one in the options (kind = '{kinds[0]}')")
+        sheet.fail(f"the header allows the kinds {several}; state one in the options (kind = '{kinds[0]}')")
     if not kinds:
         needed = "x y z (position), with qx qy qz qw (pose), distance with pair or bar, socket, or plane"
-        message = f"nothing measured found: expected columns {needed}; the header has {', '.join(sheet.table.header)}"
+        message = f"no measurements found: expected columns {needed}; the header has {', '.join(sheet.table.header)}"
         sheet.fail(f"{message}. Map other names in the options' [columns]")
     return kinds[0]
 
@@ -352,5 +350,5 @@ def _find_targets(sheet: Sheet) -> tuple[tuple, tuple, tuple[str, ...]]:
     if plain and plain[0] != "x":
         notes = (f"the position is read from {', '.join(plain)}",)
     if plain and marks:
-        notes = (*notes, f"the numbered positions x{marks[0]}... are not read beside {', '.join(plain)}")
+        notes = (*notes, f"the numbered positions x{marks[0]}... are not read, since {', '.join(plain)} are")
     return positions, sigmas if all(sigmas) else (), notes

@@ -1,6 +1,6 @@
-"""The fit options file: what the headers of the measurement files do not state, and how to fit.
+"""Options file of a fit: reading of measurement files (where their headers are silent), model and loss.
 
-TOML; every key is optional, and a key that is none of these is refused. Lengths in m, angles in rad::
+TOML; every key is optional, and an unknown key is refused. Lengths in m, angles in rad::
 
     kind = "position"                # pose, position, distance, bar, sockets, plane; where the header does not state it
     format = "csv"                   # csv, robodk, three_smr; where the header does not state it
@@ -78,7 +78,7 @@ class Sigma:
     Attributes:
         position, orientation: per axis [m], [rad].
         distance: [m].
-        floor: what sigmas in the file's columns are raised to [m].
+        floor: lower bound to which sigmas of the file's columns are raised [m].
     """
 
     position: Annotated[tuple[Metres, Metres, Metres], Each] | None = None
@@ -90,7 +90,7 @@ class Sigma:
 @strict
 @dataclass(frozen=True)
 class CameraOptions:
-    """[camera]: how images are understood."""
+    """Options of image folders ([camera])."""
 
     mounting: Annotated[str, OneOf(("auto", IN_HAND, TO_HAND))] = "auto"
     intrinsics: Annotated[str, OneOf(("auto", "given", "fit"))] = "auto"
@@ -101,12 +101,12 @@ class CameraOptions:
 @strict
 @dataclass(frozen=True)
 class FileOptions:
-    """How one measurement file is to be read; the defaults leave everything to its header. Keys as in the file.
+    """Options for reading one measurement file; by default its header determines everything. Keys as in the file.
 
     Attributes:
         columns: our column name → the file's.
         units: our column name or a family of columns → unit.
-        where: column → the texts whose rows are kept.
+        where: column → texts; only rows with one of them are kept.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -130,10 +130,10 @@ class FileOptions:
 @strict
 @dataclass(frozen=True)
 class FitOptions(FileOptions):
-    """The options of one fit: how files are read that have no table of their own, and how to fit.
+    """Options of one fit: default options for reading files, options per file, model, loss and priors.
 
     Attributes:
-        files: file name → how that file is read.
+        files: file name → options for reading that file.
         model, loss, loss_scale, beta, fix, free, accept, prior: as in the options file.
         source: the options file, for messages.
     """
@@ -150,12 +150,12 @@ class FitOptions(FileOptions):
     source: Annotated[str, Hidden()] = ""
 
     def for_file(self, path: str | Path) -> FileOptions:
-        """Return the options for the file at `path`: its own where there is a [files] table of that name."""
+        """Return the options for the file at `path`: its [files] table if present, else the common options."""
         return own_table(self.files, path) or self
 
 
 def read_options(path: str | Path | None = None) -> FitOptions:
-    """Read the options file at `path`; the defaults without one.
+    """Return the options of the file at `path`; without a file the defaults.
 
     Raises:
         UsageError: for a file that is missing or no TOML, an unknown key, or a value that a key cannot have.
@@ -164,21 +164,21 @@ def read_options(path: str | Path | None = None) -> FitOptions:
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptions:
-    """Return the options that a parsed TOML table holds; `source` is for messages."""
+    """Return the options in a parsed TOML table; `source` names the file in messages."""
     found = replace(parse(FitOptions, inherited(table, FileOptions), source), source=source)
     if "free" in table and not found.free:
-        refuse_option(source, "free: names no parameter; leave the key out to free all")
+        refuse_option(source, "free: the list is empty; remove the key to free all parameters")
     both = set(found.fix) & set(found.free)
     if both:
-        refuse_option(source, f"'{min(both)}' stands in fix and in free; take it out of one")
+        refuse_option(source, f"'{min(both)}' is in fix and in free; remove it from one")
     return found
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
-    """Refuse a [files] table that names none of the files at `paths`."""
+    """Refuse a [files] table for a file that is not among `paths`."""
     names = [Path(path).name for path in paths]
     for name in options.files:
         wanted = Path(name).parts
         if not any(Path(path).parts[-len(wanted) :] == wanted for path in paths):
             near = suggestion(name, names)
-            refuse_option(options.source, f'files."{name}" is none of the files given{near}: {", ".join(names)}')
+            refuse_option(options.source, f'files."{name}" is not among the files given{near}: {", ".join(names)}')

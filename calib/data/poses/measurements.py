@@ -1,4 +1,4 @@
-"""What was measured at poses: one frozen type per kind of measurement over common rows; knows no robot.
+"""Measurements at poses: one frozen type per kind of measurement, independent of the robot.
 
 A kind says something of the tool point p (and frame R) that the robot carries. What it says of the geometry is a
 residual function registered for the type in `calib.geometry.residuals`.
@@ -19,7 +19,7 @@ from calib.errors import MeasurementError, require
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurements:
-    """m measured rows of one kind from one file: what all kinds have in common.
+    """m measured rows of one kind from one file, with the fields common to all kinds.
 
     Attributes:
         q: (m, n) joint values [rad or m], columns as in ``joint_names``.
@@ -28,7 +28,7 @@ class PoseMeasurements:
         station: name of the instrument placement that these rows share (unused by kinds without an instrument).
         file, rows: where they came from; rows (m,) count data rows from 1.
         ignored: header names that were not used, for the message.
-        notes: what is odd but was accepted, for the message.
+        notes: findings on odd values that were accepted, for the message.
 
     Of a kind:
         kind: its name in files.
@@ -59,7 +59,7 @@ class PoseMeasurements:
         for name in self.per_row:
             if (value := getattr(self, name)) is None:
                 continue
-            require(len(value) == m, f"{name} has {len(value)} rows where q has {m}", MeasurementError, self.file)
+            require(len(value) == m, f"{name} has {len(value)} rows, q has {m}", MeasurementError, self.file)
             object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
 
     @staticmethod
@@ -67,7 +67,7 @@ class PoseMeasurements:
         q: ArrayLike, position: ArrayLike, quaternion: ArrayLike | None = None, *,
         joint_names: Sequence[str] = (), **more: Any,
     ) -> Positions:  # fmt: skip
-        """Return arrays as measured positions, or, with `quaternion`, as measured poses.
+        """Return measurements from arrays: positions, or poses if `quaternion` is given.
 
         Args:
             q: (m, n) joint values [rad or m].
@@ -90,27 +90,27 @@ class PoseMeasurements:
 
     @property
     def per_row(self) -> list[str]:
-        """The fields with one entry per row (None where not stated): all arrays; of whole numbers in `_COUNTS`."""
+        """Names of the array fields with one entry per row; those in `_COUNTS` hold integers."""
         return [field.name for field in fields(self) if "ndarray" in str(field.type)]
 
     @property
     def together(self) -> np.ndarray:
-        """(m,) number of the robot pose, or of the pair of poses, without whose other rows a row says nothing."""
+        """(m,) number of the robot pose (or pair of poses) of each row; rows of one number are kept together."""
         return self.rows
 
     @property
     def measured(self) -> np.ndarray:
-        """(m, k) the numbers that distinguish one measurement from another at the same joints."""
+        """(m, k) numbers by which measurements at the same joint values differ."""
         return np.zeros((len(self), 0))
 
     @property
     def carried(self) -> tuple[str, object]:
-        """What the arm carries: ``tool``, or an instrument or its target with what distinguishes it from others."""
+        """Object on the flange: ``tool``, or the instrument or its target with a key that distinguishes it."""
         return "tool", None
 
     @property
     def states_sigma(self) -> bool:
-        """Whether the file says how well it was measured."""
+        """Whether the file states sigmas."""
         return getattr(self, "sigma", None) is not None
 
 
@@ -163,7 +163,7 @@ class Poses(Positions):
 
 @dataclass(frozen=True, eq=False)
 class GroupedMeasurements(PoseMeasurements):
-    """Rows that say something of each other, without an instrument.
+    """Rows with relative measurements within groups, without an instrument.
 
     Attributes:
         group: (m,) index of the socket, plane, pair or bar centre.
@@ -244,7 +244,7 @@ class Planes(GroupedMeasurements):
 KINDS: dict[str, type[PoseMeasurements]] = {
     each.kind: each for each in (Poses, Positions, Distances, Bars, Sockets, Planes)
 }
-"""The types by the names that files and options give them."""
+"""Measurement types by their names in files and options."""
 
 Measured = TypeVar("Measured", bound=PoseMeasurements)
 

@@ -1,4 +1,4 @@
-"""Can these numbers be what their header says? Each complaint names the row, the column and the likely cause."""
+"""Plausibility checks of pose measurements: each error names the row, the column and the likely cause."""
 
 import math
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def check_joints(
     stated = [sheet.unit(column, "joints") for column in columns]
     _check_joint_units(sheet, columns, kinds, stated)
     if len(q) > 1 and np.ptp(q, axis=0).max() < BOUNDS.min_travel:
-        message = f"all {len(q)} rows have the same joint values: one pose determines nothing of the robot"
+        message = f"all {len(q)} rows have the same joint values: one pose determines no parameter"
         refuse_data(table.file, message, columns[0], int(table.rows[-1]))
     lower, upper = np.asarray(limits if limits is not None else [np.full(len(joints), np.nan)] * 2, dtype=float)
     bounded = np.isfinite(lower) & np.isfinite(upper)
@@ -46,7 +46,7 @@ def check_joints(
     def advice(j: int, other: str) -> str:
         if stated[j] in ("", "rad", "m"):
             return f"looks like {other}; if so, name the column '{columns[j]} [{other}]'"
-        return f"the column is read as [{stated[j]}]: does it hold another unit (counts, grad), or another joint?"
+        return f"the column is read as [{stated[j]}]: is it in another unit (counts, grad), or of another joint?"
 
     def says(row: int, j: int) -> str:
         unit, other, factor = joint_unit(kinds[j])
@@ -55,7 +55,7 @@ def check_joints(
         if stated[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and inside.all():
             return f"{found}: {advice(j, other)}"
         return (
-            f"{found}: are joint columns swapped? If the robot does go there, correct its limits or set "
+            f"{found}: are joint columns swapped? If the robot reached it, correct its limits or set "
             "check_limits = false in the options"
         )
 
@@ -74,12 +74,12 @@ def check_joints(
     turning = [j for j in range(len(joints)) if not sliding[j]]
     in_degrees = turning and all(stated[j] in ("deg", "°", "degrees") for j in turning)
     if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
-        notes.append("no joint goes beyond 6.6 deg: are these values really degrees, not radians?")
+        notes.append("all joint values are below 6.6 deg: are they radians instead of degrees?")
     return tuple(notes)
 
 
 def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return which joint values (m, n) are beyond their limits (n,), by more than encoders are."""
+    """Return which joint values (m, n) exceed their limits (n,) by more than encoder errors."""
     return (q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)
 
 
@@ -87,19 +87,19 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
     """Refuse a stated unit that does not suit the joint: mm for a revolute one, deg for a prismatic one."""
     for name, kind, unit in zip(columns, kinds, stated):
         if unit and (unit.lower() in ANGLES) == (kind == "prismatic"):
-            advice = "is the column in its place?"
+            advice = "is it the right column?"
             if not sheet.table.units[sheet.table.index(name)]:
-                advice = "the options state it; if it holds for some joints only, state it by their columns' names"
+                advice = "the unit is from the options; if only some joints have it, state it by their column names"
             sheet.fail(f"the unit [{unit}] does not suit a {kind} joint: {advice}", name)
 
 
 def check_block(
     block: PoseMeasurements, options: FileOptions, kinds: Sequence[str] | None = None, limits: Limits | None = None
 ) -> PoseMeasurements:
-    """Return a block in memory with the notes that a file of its rows would get, or refuse it as that file."""
+    """Return a block in memory with the notes of the checks that files undergo; refuse what they refuse."""
     q, joints = np.asarray(block.q), tuple(block.joint_names)
     place = block.file or "measurements in memory"
-    message = f"q has shape {q.shape} where there are {len(joints)} joints: expected (rows, joints)"
+    message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"
     require(len(block) and q.ndim == 2 and q.shape[1] == len(joints), message, MeasurementError, place)
     table = Table(place, joints, ("",) * len(joints), tuple(q.T), block.rows)
     _check_finite(q, table, joints)
@@ -120,9 +120,9 @@ def _check_finite(values: np.ndarray, source: Rows, columns: Sequence[str]) -> N
 
 
 def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-    """Return quaternions (m, 4) with norm 1; one that is off by more than rounding is refused."""
+    """Return normalised quaternions (m, 4); refuse norms that differ from 1 by more than rounding."""
     norm = np.linalg.norm(values, axis=1)
-    rest = "not 1; are these four columns a quaternion, and has none of them been rounded or swapped?"
+    rest = "not 1: were columns rounded or swapped, or are they not a quaternion?"
     refuse(
         source, np.abs(norm - 1) > BOUNDS.max_norm_error, columns,
         lambda row, _: f"the quaternion {', '.join(columns)} has norm {norm[row]:.4g}, {rest}",
@@ -131,7 +131,7 @@ def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -
 
 
 def rotation_matrices(values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-    """Return matrices (m, 3, 3), given row by row (m, 9), that are rotations but for rounding; others are refused."""
+    """Return rotation matrices (m, 3, 3) from their elements row by row (m, 9); refuse what is not a rotation."""
     matrices = values.reshape(-1, 3, 3)
     defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
     skewed = defect > 2 * BOUNDS.max_norm_error
@@ -146,7 +146,7 @@ def rotation_matrices(values: np.ndarray, source: Rows, columns: Sequence[str]) 
 
 
 def turns(values: np.ndarray, source: Rows, columns: Sequence[str], euler: str) -> np.ndarray:
-    """Return quaternions (m, 4) x y z w of three angles each (m, 3) [rad], whose meaning `euler` is (`fit_options`)."""
+    """Return quaternions (m, 4) x y z w of three angles (m, 3) [rad] in the convention `euler` (`fit_options`)."""
     if euler == "vector":
         return Rotation.from_rotvec(values).as_quat(canonical=True)
     TURNS.check(values, source, columns)
@@ -155,7 +155,7 @@ def turns(values: np.ndarray, source: Rows, columns: Sequence[str], euler: str) 
 
 
 def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
-    """Return unit quaternions (m, 4) x y z w of columns: of a quaternion, of a matrix, or of three angles."""
+    """Return unit quaternions (m, 4) x y z w from the columns of a quaternion, a matrix or three angles."""
     values = sheet.numbers(names, replace(TURNS, most=math.inf) if len(names) == 3 else Column(tuple(names)))
     if len(names) == 3:
         return turns(values, sheet.table, names, sheet.options.euler)

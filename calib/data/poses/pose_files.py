@@ -65,7 +65,7 @@ from calib.data.schema import refuse
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
-    """Return the rows of a table, with joint values q (m, n), as groups."""
+    """Return grouped measurements from the rows of a table, with joint values q (m, n)."""
     table, options = sheet.table, sheet.options
     names, group = labels(table, layout.group)
     tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), np.zeros(len(q), dtype=int))
@@ -115,7 +115,7 @@ def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequenc
         members = np.flatnonzero(group == number)
         first, last = members[0], members[-1]
         if len(members) != 2:
-            message = f"pair '{name}' has {len(members)} rows; a distance joins two"
+            message = f"pair '{name}' has {len(members)} rows; a distance needs two"
             table.fail(message, layout.group[-1], last)
         if abs(distance[first] - distance[last]) > 1e-9:
             message = (
@@ -125,7 +125,7 @@ def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequenc
 
 
 def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:
-    """Return the pairs of groups that share all labels but the socket's, with the known distance [m]."""
+    """Return the pairs of groups that differ only in the socket's label, with their known distance [m]."""
     table, options = sheet.table, sheet.options
     if options.socket_distance is None:
         return ()
@@ -137,7 +137,7 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
     for place, sockets in fixtures.items():
         if len(sockets) > 2 and not options.socket_pairs:
             sheet.fail(
-                f"{'/'.join(place) or 'the fixture'} has {len(sockets)} sockets ({', '.join(sockets)}): say which of "
+                f"{'/'.join(place) or 'the fixture'} has {len(sockets)} sockets ({', '.join(sockets)}): state which of "
                 "them are socket_distance apart (socket_pairs = [['0', '1']] in the options)",
                 layout.group[-1],
             )
@@ -147,13 +147,13 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
     if not links:
         wanted = ", ".join(f"{a} and {b}" for a, b in options.socket_pairs) or "two sockets"
         found = ", ".join(dict.fromkeys(texts[-1]))
-        message = f"no fixture position has {wanted}, so that socket_distance joins nothing; found {found}"
+        message = f"no fixture position has {wanted}, needed for socket_distance; found {found}"
         sheet.fail(message, layout.group[-1])
     return tuple(links)
 
 
 def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndarray) -> Positions:
-    """Return the block as seen from the base frame that was measured with every row.
+    """Return the block with its measurements relative to the base frame that was measured with every row.
 
         p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
         Σ_p = R_bᵀ (Σ_t + Σ_b + [l]× Σ_rb [l]×ᵀ) R_b,  l = p_t - p_b;   Σ_r = R_bᵀ (Σ_rt + Σ_rb) R_b
@@ -180,9 +180,7 @@ def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndar
             cross = np.swapaxes(np.cross(lever[:, None], np.eye(3)), 1, 2)  # [l]×, its columns l × e
             covariance = covariance + cross @ _diagonal(stated) @ np.swapaxes(cross, 1, 2)
         changes["sigma"] = _turned(turn, covariance)
-    note = (
-        "positions are relative to the base frame measured with each row; its noise is counted as large as the target's"
-    )
+    note = "positions are relative to the base frame measured with each row; its noise is assumed equal to the target's"
     return replace(block, notes=(*block.notes, note), **changes)
 
 
@@ -191,7 +189,7 @@ def _diagonal(sigma: np.ndarray) -> np.ndarray:
 
 
 def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (m, 3) of covariances (m, 3, 3) in turned axes."""
+    """Return the standard deviations (m, 3) of covariances (m, 3, 3) along rotated axes."""
     return np.sqrt(np.einsum("mij,mjk,mik->mi", turn, covariance, turn))
 
 
@@ -203,7 +201,7 @@ def read_measurements(
     kinds: Sequence[str] | None = None,
     limits: Limits | None = None,
 ) -> list[PoseMeasurements]:
-    """Read the measurements in `path` for a robot with these joints.
+    """Return the measurements in the file at `path` for a robot with these joints.
 
     Args:
         joints: the robot's n joint names.
@@ -233,9 +231,9 @@ def read_measurements(
 
 
 def joint_columns(path: str | Path) -> tuple[str, ...]:
-    """Return the names in the header of `path` that may be joints (without ``q_``): all that we know as nothing else.
+    """Return the header names of `path` that may be joints (without ``q_``): all names unknown to the toolkit.
 
-    A caller holds them against the chains of a URDF, to see which of them was measured.
+    A caller compares them with the chains of a URDF, to find the chain that was measured.
     """
     known = {name + suffix for name in OURS for suffix in SUFFIXES}
     names, units = read_header(path)
@@ -247,19 +245,19 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
 
 
 def _select_rows(sheet: Sheet) -> Sheet:
-    """Return the rows whose cells have the values that ``where`` allows."""
+    """Return the sheet with the rows selected by the option ``where``."""
     table, keep = sheet.table, np.ones(len(sheet.table), dtype=bool)
     for name, values in sheet.options.where.items():
         texts = table.texts(name)
         keep &= np.isin(texts, list(values))
         if not keep.any():
             found = ", ".join(list(dict.fromkeys(texts))[:10])
-            sheet.fail(f"no row is left by where = {', '.join(values)}; found {found}", name)
+            sheet.fail(f"no row is selected by where = {', '.join(values)}; found {found}", name)
     return sheet if keep.all() else replace(sheet, table=table.where(keep))
 
 
 def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
-    """Read positions and poses; each target that was seen makes a row, in the file's order."""
+    """Return positions or poses, one row per target seen, in the file's order."""
     table, several = sheet.table, len(layout.positions) > 1
     position = np.stack([_position(sheet, names, several) for names in layout.positions], axis=1)
     seen = np.asarray(~np.isnan(position).any(axis=2))
@@ -296,13 +294,13 @@ def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
     position = sheet.numbers(names, POSITION, gaps)
     empty = np.isnan(position)
     partial = empty & ~empty.all(axis=1, keepdims=True)
-    message = f"is empty while others of {', '.join(names)} are not; a target not seen has none of them"
+    message = f"is empty, others of {', '.join(names)} are not; leave all of them empty for a target not seen"
     refuse(sheet.table, partial, names, lambda row, k: message)
     return position
 
 
 def _sigma(sheet: Sheet, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
-    """Return sigmas (m, targets, 3) [m] from columns, else from the options, else None."""
+    """Return sigmas (m, targets, 3) [m] from the columns, else from the options, else None."""
     stated = sheet.options.sigma
     if not layout.sigmas:
         return None if stated.position is None else np.tile(stated.position, (*seen.shape, 1))

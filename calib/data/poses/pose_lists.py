@@ -1,4 +1,4 @@
-"""Targets for `calib compensate`: where the real tool is to stand, one row each, as a CSV table.
+"""Targets for `calib compensate`: desired poses of the real tool, one per row of a CSV table.
 
 ==================  ===================================================================================================
 joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``: the pose that the *nominal*
@@ -66,7 +66,7 @@ MAX_JOINT_DIFFERENCE = 0.02  # read-back and commanded joints of one pose differ
 def write_poses(
     path: str | Path, q: ArrayLike, joint_names: Sequence[str], *, unit: str = "rad", kinds: Sequence[str] | None = None
 ) -> Path:
-    """Write joint values (m, n) [rad or m] as a CSV with the joint names as header.
+    """Write joint values (m, n) [rad or m] to a CSV file with the joint names as header.
 
     Args:
         unit: ``rad`` or ``deg`` (headers then say ``[deg]``); prismatic joints stay in m.
@@ -82,7 +82,7 @@ def write_poses(
 
 
 def filled_in(path: Path, joints: int) -> bool:
-    """Return whether a list of planned poses has more than joint values: measurements added by hand."""
+    """Return whether a list of planned poses also has measurements, added by the user."""
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:]
     return any(cell.strip() for line in lines for cell in re.split("[,;\t]", line)[joints:])
 
@@ -95,7 +95,7 @@ def read_poses(
     kinds: Sequence[str] | None = None,
     limits: Limits | None = None,
 ) -> np.ndarray:
-    """Return joint values (m, n) [rad or m] in the order of `joints`: of a CSV file, of measurements, or an array.
+    """Return joint values (m, n) [rad or m] in the order of `joints`, from a CSV file, measurements or an array.
 
     Columns and checks of a file are those of measurements.
     """
@@ -114,15 +114,15 @@ def check_planned(
     q: np.ndarray, sheet: Sheet, columns: Sequence[str], joints: Sequence[str], kinds: Sequence[str] | None,
     limits: Limits | None,
 ) -> tuple[str, ...]:  # fmt: skip
-    """Return the notes of `calib.data.poses.plausible.check_joints`; one pose several times is no fault of a plan."""
+    """Return the notes of `calib.data.poses.plausible.check_joints`; a plan may repeat one pose."""
     moves = np.ptp(q, axis=0).max() > BOUNDS.min_travel
     return plausible.check_joints(q if moves else q[:1], sheet, columns, joints, kinds, limits)
 
 
 def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX_JOINT_DIFFERENCE) -> tuple[str, ...]:
-    """Compare the joints of a measurement with the poses (m, n) [rad or m] that were to be measured.
+    """Return notes on differences between measured joint values and planned poses (m, n) [rad or m].
 
-    A planned and a measured pose are the same where no joint differs by more than `near`.
+    A planned and a measured pose are the same if no joint differs by more than `near`.
 
     Returns:
         Notes: planned poses that were not measured, rows that nobody planned.
@@ -145,13 +145,13 @@ def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX
 
 
 def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
-    """Return one row per row of the file, where several targets made several."""
+    """Return joint values and file row numbers, one per row of the file (several targets share a row)."""
     rows, first = np.unique(measured.rows if measured.rows is not None else [], return_index=True)
     return measured.q[first], rows
 
 
 def _matched(these: np.ndarray, those: np.ndarray, near: float) -> np.ndarray:
-    """Return which of `those` has one of `these` within `near` (largest joint difference)."""
+    """Return which rows of `those` are within `near` (largest joint difference) of a row of `these`."""
     distance, _ = KDTree(these).query(those, p=math.inf)
     return distance <= near
 
@@ -167,25 +167,25 @@ def _explain(
         causes = [f"the values are {what}"] if what else []
         moved = [j for j in range(len(names)) if order[j] != j]
         if moved:
-            pairs = ", ".join(f"{names[order[j]]} holds joint {j + 1}" for j in moved)
+            pairs = ", ".join(f"{names[order[j]]} contains joint {j + 1}" for j in moved)
             causes.append(f"columns are swapped ({pairs})")
         if (sign < 0).any():
             turned = ", ".join(names[order[j]] for j in np.flatnonzero(sign < 0))
             causes.append(f"the sign is reversed ({turned})")
-        message = f"the measured joints fit the plan if {' and '.join(causes)}"
+        message = f"the measured joints agree with the plan if {' and '.join(causes)}"
         column = names[order[moved[0]]] if moved else names[0]
         return MeasurementError(f"{message}; correct the header or the options", measured.file, None, column)
     distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(q, p=math.inf))
     worst = int(np.argmax(distance))
     joint = int(np.argmax(np.abs(q[worst] - plan[index[worst]])))
     count = int((distance <= near).sum())
-    message = f"only {count} of {len(q)} rows are planned poses; the nearest differs here by {distance[worst]:.3g}"
-    advice = "is it the right plan? Where other poses were measured on purpose, set plan = false under [poses]"
+    message = f"only {count} of {len(q)} rows are planned poses; the nearest one differs by {distance[worst]:.3g}"
+    advice = "is it the right plan? If other poses were measured on purpose, set plan = false under [poses]"
     return MeasurementError(f"{message}: {advice} in session.toml", measured.file, int(rows[worst]), names[joint])
 
 
 def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which measured column (n,) best holds each planned joint, and with which sign (n,).
+    """Return the measured column (n,) that best fits each planned joint, and its sign (n,).
 
     Each pair of columns is compared as two sets of numbers (mean distance to the nearest one, at most 1), so that order
     and completeness of the rows do not matter; the assignment minimises the sum.
@@ -207,7 +207,7 @@ SUFFIXES = ("", "_target")
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """m targets from one file.
+    """Targets from one file, m rows.
 
     Attributes:
         q: (m, n) nominal joint values [rad or m]; None where the file has none.
@@ -250,7 +250,7 @@ class Targets:
 def read_targets(
     path: str | Path, joints: Sequence[str], *, kinds: Sequence[str] | None = None, limits: Limits | None = None
 ) -> Targets:
-    """Read the targets in `path` for a robot with these joints.
+    """Return the targets in the file at `path` for a robot with these joints.
 
     Args:
         joints: the robot's n joint names.
@@ -275,7 +275,7 @@ def read_targets(
         needed = f"joints ({', '.join(joints)}, or q1 to q{len(joints)}), or x y z with or without qx qy qz qw"
         sheet.fail(f"no targets found: expected {needed}; found {', '.join(table.header)}")
     if turned and not position:
-        sheet.fail(f"has {turned[0]} but no x y z: an orientation alone is no target")
+        sheet.fail(f"has {turned[0]} but no x y z: a target needs a position")
     used = {*columns, *position, *turned}
     units = [table.units[table.index(name)] for name in columns]
     return Targets(

@@ -1,4 +1,4 @@
-"""Forms that other programs write: RoboDK's point and pose CSV, and the headerless CSV of three reflectors.
+"""CSV formats of other programs: RoboDK's points and poses, and the headerless format of three reflectors.
 
 RoboDK (six joints). The header has J1 to J6 (``J1``, ``J1 (deg)``, ``Joint 1``), and what follows is read by its place,
 as RoboDK's own macros do (RoboDK-API, CalculateErrorsDistances.py, CalculateErrorsPoses.py):
@@ -37,7 +37,7 @@ Read = tuple[Table, FileOptions, tuple[str, ...]]
 
 
 def recognises(header: Sequence[str]) -> bool:
-    """Return whether a header is RoboDK's: J1 to J6 (or ``Joint 1`` to ``Joint 6``) first.
+    """Return whether a header begins with RoboDK's J1 to J6 (or ``Joint 1`` to ``Joint 6``).
 
     ``joint1`` in one word is a name that robots have: such a file is read by its names.
     """
@@ -47,11 +47,11 @@ def recognises(header: Sequence[str]) -> bool:
 
 
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
-    """Read RoboDK's CSV into a table that the plain reader understands, with the options to read it and notes."""
+    """Return RoboDK's CSV as a table for the standard reader, with the options to read it and notes."""
     found = read_header(path)[0]
     if not recognises(found):
-        refuse_data(path, f"is no RoboDK file: its header begins {', '.join(found[:7])}, not J1 to J6")
-    require(joints == 6, f"RoboDK's form has 6 joints, the robot has {joints}", MeasurementError, path)
+        refuse_data(path, f"is not a RoboDK file: its header begins with {', '.join(found[:7])}, not J1 to J6")
+    require(joints == 6, f"RoboDK's format has 6 joints, the robot has {joints}", MeasurementError, path)
     pose = len(found) == 18 or (len(found) == 12 and _plain(found[9]) in _POSE_MARKS)
     if len(found) not in (9, 12, 18):
         refuse_data(path, f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18")
@@ -71,15 +71,15 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
         meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}
         notes += (f"w p r are taken as {meaning.get(euler, euler)}; other conventions: euler in the options",)
         if silent and max(np.abs(table.numbers(name, "angle")).max() for name in "wpr") < 1.001 * np.pi * DEG:
-            message = "all angles are within ±3.15: deg as RoboDK's manual says, or rad as its macro takes them?"
+            message = "all angles are within ±3.15: deg as in RoboDK's manual, or rad as in its macro?"
             message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
             table.fail(message, "w", 0)
-    read = f"read as RoboDK's {kind}s: joints in deg, positions in mm where the header says nothing else"
+    read = f"read as RoboDK's {kind}s: joints in deg, positions in mm unless the header states other units"
     return table, replace(options, columns=columns, kind=kind, euler=euler), (read, *notes)
 
 
 def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
-    """Read the headerless CSV of three reflectors, as `read_robodk`."""
+    """Return the headerless CSV of three reflectors as a table, options and notes, as `read_robodk`."""
     targets = [f"{axis}{k}" for k in (1, 2, 3) for axis in "xyz"]
     width = row_width(path)
     padding = width - 9 - joints
@@ -101,7 +101,7 @@ def _plain(name: str) -> str:
 
 
 def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple[Table, tuple[str, ...]]:
-    """Return the table with a column ``tool`` where rows have different TCPs."""
+    """Return the table with a column ``tool`` if the rows have different TCPs, and a note."""
     if not tcp:
         return table, ()
     triples = [tuple(row) for row in np.round(np.stack([table.numbers(name) for name in tcp], axis=1), 3)]
@@ -111,8 +111,8 @@ def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple
     values = "; ".join(f"{label}: {', '.join(f'{value:g}' for value in triple)}" for triple, label in labels.items())
     cells = (*table.cells, np.array([labels[triple] for triple in triples], dtype=object))
     table = replace(table, header=(*table.header, "tool"), units=(*table.units, ""), cells=cells)
-    return table, (f"{len(labels)} different TCPs, hence as many tools ({values})",)
+    return table, (f"{len(labels)} different TCPs, read as different tools ({values})",)
 
 
 FORMS: dict[str, Callable[[str | Path, int, FileOptions], Read]] = {"robodk": read_robodk, "three_smr": read_three_smr}
-"""The readers of the options' ``format``; other files are plain tables."""
+"""Readers by the options' ``format``; other files are standard tables."""

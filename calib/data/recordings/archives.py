@@ -41,13 +41,13 @@ Ends = tuple[float | None, float | None]
 
 
 def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
-    """Return the rows of a NumPy archive (.npz) from ends[0] to ends[1] [s], unchecked but for their shapes."""
+    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; only shapes are checked."""
     with _opened(path) as archive:
         return _recording(archive, joints, options, ends)
 
 
 def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps (N,) [s] and positions (N, n) of an archive without torques: q_ref, or q where there is none."""
+    """Return stamps (N,) [s] and positions (N, n) of an archive without torques: q_ref, else q."""
     with _opened(path) as archive:
         found = find_names(tuple(archive.members), options, path)
         ours = "q_ref" if "q_ref" in found else "q"
@@ -67,7 +67,7 @@ def _opened(path: Path) -> Iterator["_Archive"]:
     with (
         refused_as(MeasurementError, OSError, "cannot be read: {}", path),
         refused_as(MeasurementError, packed, "cannot be unpacked ({}): save it with np.savez", path),
-        refused_as(MeasurementError, damaged, "is a damaged archive ({}): was it copied whole?", path),
+        refused_as(MeasurementError, damaged, "is a damaged archive ({}): is the copy complete?", path),
         zipfile.ZipFile(path) as archive,
     ):
         yield _Archive(archive, path)
@@ -75,7 +75,7 @@ def _opened(path: Path) -> Iterator["_Archive"]:
 
 @dataclass(frozen=True)
 class _Archive:
-    """The open file, and where it is."""
+    """An open NumPy archive and its path."""
 
     file: zipfile.ZipFile
     path: Path
@@ -86,15 +86,15 @@ class _Archive:
         return {name.removesuffix(".npy"): name for name in self.file.namelist()}
 
     def fail(self, message: str, name: str | None = None) -> NoReturn:
-        """Refuse the archive, or a member of it."""
+        """Refuse the archive, or one of its members."""
         refuse_data(self.path, message, name)
 
     def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
-        """Open a member behind its header; return it with shape, order and type."""
+        """Return a member's stream after its header, its shape, whether its order is Fortran's, and its type."""
         member, kinds = self.members[name], (ValueError, TypeError, KeyError, SyntaxError, tokenize.TokenError)
         stream = self.file.open(member)
         with refused_as(
-            MeasurementError, (*kinds, RecursionError, OverflowError), "is no NumPy array ({})", self.path, None, name
+            MeasurementError, (*kinds, RecursionError, OverflowError), "not a NumPy array ({})", self.path, None, name
         ):
             version = npy.read_magic(stream)
             read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
@@ -103,21 +103,21 @@ class _Archive:
         if dtype.hasobject:
             self.fail("holds Python objects, which are not read (they could run code): save plain arrays", name)
         if any(length < 0 for length in shape) or size > self.file.getinfo(member).file_size:
-            self.fail(f"says that it is {shape}, which is more than there is: was it copied whole?", name)
+            self.fail(f"states the shape {shape}, but the file is shorter: is the copy complete?", name)
         if size > MAX_BYTES:
             self.fail(f"holds {size / 1e9:.3g} GB, more than {MAX_BYTES / 1e9:g}: cut the recording", name)
         return stream, shape, fortran, dtype
 
     def read(self, name: str, rows: slice | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
-        """Return the `rows` of a member as floats (with `exact` in its own type) without holding the others.
+        """Return the `rows` of a member as floats (`exact`: in its stored type), without loading the others.
 
         Args:
-            kinds: of numpy's types that are what it should hold.
+            kinds: accepted kinds of numpy's types.
         """
         stream, shape, fortran, dtype = self.header(name)
         with stream:
             if dtype.kind not in kinds:
-                self.fail(f"holds {dtype}, expected {'texts' if 'U' in kinds else 'numbers'}", name)
+                self.fail(f"contains {dtype}, expected {'texts' if 'U' in kinds else 'numbers'}", name)
             if fortran or not shape or rows is None:
                 rows = slice(0, shape[0] if shape else 1) if rows is None else rows
                 values = np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
@@ -130,7 +130,7 @@ class _Archive:
         return values if exact else values.astype(float)
 
     def few(self, name: str, count: int) -> np.ndarray | None:
-        """Return a member of `count` finite numbers; None where there is none of that name."""
+        """Return a member of `count` finite numbers; None if the archive has no such member."""
         if name not in self.members:
             return None
         values = self.read(name, kinds="fiu").ravel()
@@ -159,11 +159,11 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
             continue
         values = archive.read(theirs, rows)
         if values.shape != q.shape:
-            archive.fail(f"has shape {values.shape} where {found['q']} has {q.shape} (samples, joints)", theirs)
+            archive.fail(f"has shape {values.shape}, {found['q']} has {q.shape} (samples, joints)", theirs)
         series["effort" if ours == kind else ours] = _arrange(values, order, options.factor(ours))
     gain = archive.few("drive_gain", q.shape[1])
     if gain is not None and (gain == 0.0).any():
-        archive.fail("has a gain of zero: no current makes a torque there", "drive_gain")
+        archive.fail("has a gain of zero: the current would cause no torque", "drive_gain")
     variance = f"variance_{found.get(kind, '')}"
     used = (*found.values(), *KEYS_BESIDE_SERIES, *RATES, "periods", variance)
     unused = [name for name in archive.members if name not in used]
@@ -183,7 +183,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
 
 
 def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: slice) -> np.ndarray | None:
-    """Return the mean variance (n,) of the averaged effort: that of one sample over the number of periods."""
+    """Return the mean variance (n,) of the effort averaged over periods (variance of one sample / periods)."""
     periods = archive.few("periods", 1)
     if name not in archive.members or periods is None:
         return None
@@ -192,13 +192,13 @@ def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: slice)
         archive.fail(f"has shape {values.shape}, expected {shape} (samples, joints)", name)
     if not (periods[0] >= 1 and np.isfinite(values).all() and (values >= 0).all()):
         archive.fail(
-            f"expected variances, finite and not negative, over one period or more; periods is {periods[0]:g}", name
+            f"periods is {periods[0]:g}; expected 1 or more, and variances that are finite and not negative", name
         )
     return np.asarray(values.mean(axis=0) / periods[0])
 
 
 def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
-    """Return all stamps (N,) [s] from the first, or the counts of the samples over a stated rate."""
+    """Return the time (N,) [s] of all samples since the first, from stamps or from a stated rate."""
     if "t" not in found:
         stated = next((name for name in RATES if name in archive.members), "")
         own = archive.few(stated, 1) if not options.rate else None
@@ -209,12 +209,12 @@ def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptio
         return np.arange(count) / rate
     t = archive.read(found["t"], exact=True, kinds="fiu").ravel()
     if len(t) != count:
-        archive.fail(f"has {len(t)} stamps where q has {count} samples", found["t"])
+        archive.fail(f"has {len(t)} stamps, q has {count} samples", found["t"])
     return (t - t[0] if len(t) else t).astype(float) * options.factor("t")
 
 
 def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[slice, list[str]]:
-    """Return the rows to read: of the cut, else of the file's use_range, else all."""
+    """Return the rows to read (from the cut, else the file's use_range, else all), and notes."""
     if ends != (None, None):
         ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
         return rows_of_cut(ordered, *ends, archive.path), []
@@ -223,13 +223,13 @@ def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: En
         return slice(0, len(t)), []
     first, end = (int(value) for value in np.clip(stated, -1, len(t) + 1))
     if not 0 <= first < end <= len(t):
-        archive.fail(f"is {first} to {end}, but there are {len(t)} samples", "use_range")
+        archive.fail(f"is {first} to {end}, the file has {len(t)} samples", "use_range")
     whole = first == 0 and end == len(t)
-    return slice(first, end), [] if whole else [f"rows {first + 1} to {end} of {len(t)} are used: its use_range"]
+    return slice(first, end), [] if whole else [f"rows {first + 1} to {end} of {len(t)} are used, by its use_range"]
 
 
 def _names(archive: _Archive) -> list[str]:
-    """Return the joints' names; none where the archive has none."""
+    """Return the joints' names; an empty list if the archive states none."""
     if "joint_names" not in archive.members:
         return []
     values = archive.read("joint_names", exact=True, kinds="US").ravel()
@@ -237,12 +237,12 @@ def _names(archive: _Archive) -> list[str]:
 
 
 def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
-    """Return the columns in `order`, in SI, without a copy where nothing is to do."""
+    """Return the columns in `order`, in SI; copied only if they change."""
     values = values if order == list(range(values.shape[1])) else values[:, order]
     return read_only(values if factor == 1.0 else values * factor)
 
 
 def _skip(stream: IO[bytes], size: int) -> None:
-    """Read `size` bytes, or to the end."""
+    """Skip `size` bytes of a stream, or the rest."""
     while size > 0 and (got := len(stream.read(min(size, 1 << 22)))):
         size -= got

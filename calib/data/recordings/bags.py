@@ -23,7 +23,7 @@ JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
-    """Return the joint states of a bag, unchecked but for their shapes."""
+    """Return the recording of a bag's joint states; only shapes are checked."""
     with opened(path) as reader:
         connections = connections_of(
             reader, JOINT_STATE, options.topic, path, "joint states", "topic = '...'", "/joint_states"
@@ -31,9 +31,9 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         names, parts, skipped = joint_states(reader, connections, joints, path)
     for ours, what in (("q", "positions"), ("effort", "efforts")):
         require(parts[ours].size, f"its joint states have no {what}", MeasurementError, path)
-    notes = [f"{skipped} messages lack one of the joints; left out"] if skipped else []
+    notes = [f"{skipped} messages without one of the joints are not used"] if skipped else []
     if not parts["header"].any():
-        notes.append("the headers have no stamps; the times of logging are used, which jitter more")
+        notes.append("message headers have no stamps; the logging times are used, which jitter more")
     return Recording(
         (parts["stamp"] - parts["stamp"][0]) * 1e-9, parts["q"], parts["effort"], options.kind or "torque", names,
         v=parts["v"] if parts["v"].size else None, file=str(path), notes=tuple(notes),
@@ -42,7 +42,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Yield a reader of a bag; what others' readers raise of it is raised as `MeasurementError`."""
+    """Yield a reader of a bag; convert all errors of `rosbags` to `MeasurementError`."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -57,11 +57,11 @@ def opened(path: Path) -> Iterator[Any]:
 def connections_of(
     reader: Any, kinds: Sequence[str], topic: str, path: Path, what: str, option: str, usual: str = ""
 ) -> list[Any]:
-    """Return a bag's connections of one topic whose messages are of some kinds.
+    """Return a bag's connections of one topic with messages of the given types.
 
     Args:
-        topic: the one that is asked for; empty: the only one there is, or the `usual` one.
-        what, option: for messages: what such topics hold, and how to ask for one.
+        topic: the requested topic; if empty, the only topic found, or the `usual` one.
+        what, option: contents of such topics and the option that selects one, for messages.
 
     Raises:
         MeasurementError: without such a topic, or with several of which none is asked for.
@@ -72,7 +72,7 @@ def connections_of(
         refuse_data(path, f"has no topic of {what} ({', '.join(kinds)}); found: {topics}")
     chosen = topic or (found[0] if len(found) == 1 else usual)
     if chosen not in found:
-        message = f"there are {what} on {', '.join(found)}: say which ({option})"
+        message = f"{len(found)} topics have {what}: {', '.join(found)}; state one ({option})"
         if topic:
             message = f"has no {what} on '{topic}'{suggestion(topic, found)}; found: {', '.join(found)}"
         refuse_data(path, message)
@@ -82,7 +82,7 @@ def connections_of(
 def joint_states(
     reader: Any, connections: list[Any], joints: Joints | None, path: Path
 ) -> tuple[tuple[str, ...], dict[str, np.ndarray], int]:
-    """Return the joints' names, arrays of stamps [ns], q, v and effort, and the number of messages left out."""
+    """Return the joint names, arrays of stamps [ns], q, v and effort, and the number of unused messages."""
     names = joints.names if joints else ()
     order: dict[tuple[str, ...], list[int] | None] = {}
     rows: dict[str, list[Any]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
@@ -108,17 +108,17 @@ def joint_states(
 
 
 def header_stamp(message: Any) -> int:
-    """Return the stamp of a message's header [ns]; 0 where it has none."""
+    """Return the stamp in a message's header [ns]; 0 if not set."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:
-    """Return the rows as one array; an empty one where no message has the quantity."""
+    """Return the rows as one array; an empty array if no message has the quantity."""
     missing = [k for k, value in enumerate(values) if value is None]
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        refuse_data(path, f"the message has no {ours} of its joints, others do", ours, missing[0] + 1)
+        refuse_data(path, f"this message has no {ours} for its joints, others have", ours, missing[0] + 1)
     return np.array(values)
 
 

@@ -1,6 +1,6 @@
-"""Can a recording be what it claims? Each complaint names the row, the column and the likely cause.
+"""Plausibility checks of recordings: each error names the row, the column and the likely cause.
 
-What cannot be is refused; what is odd but possible becomes a note. Thresholds: `RecordingBounds`.
+Impossible values are refused; odd but possible values become notes. Thresholds: `RecordingBounds`.
 """
 
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ from calib.units import DEG
 
 @dataclass(frozen=True)
 class RecordingBounds:
-    """What a recording of a robot stays within; all of them our choice.
+    """Bounds on the values of a recording; all of them our choice.
 
     Attributes:
-        min_samples: of a recording; filters at both ends eat some 50.
+        min_samples: of a recording; filters at both ends remove about 50.
         min_rate, max_rate: of sampling [Hz].
-        min_travel: a joint that goes less far has not moved [rad or m]: above encoder noise.
-        max_compared: rows among which two alike poses are looked for.
-        max_apart: share of each joint's travel by which two poses may differ to be one.
-        max_effort: times its limit that a joint's torque reaches.
-        max_spike_share, max_spikes: of the rows (the larger counts) that may be spikes of a torque.
-        max_unit_share: of the rows, from which on they are no spikes but another unit.
+        min_travel: smallest travel of a moving joint [rad or m], above encoder noise.
+        max_compared: rows searched for two nearly equal poses.
+        max_apart: largest difference of nearly equal poses, as a share of each joint's travel.
+        max_effort: largest plausible torque, as a multiple of the joint's limit.
+        max_spike_share, max_spikes: largest share and number of rows with torque spikes (the larger counts).
+        max_unit_share: share of rows above which large torques mean another unit, not spikes.
         min_spike_beyond, min_spike: times what the other rows stay below, of a spike beyond the joint's limit, or
             within it.
         max_number: of any quantity of a robot, whatever its unit.
@@ -53,14 +53,14 @@ NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
 def check_recording(recording: Recording, joints: Joints | None = None) -> Recording:
-    """Return the recording with its notes, or refuse it.
+    """Return the recording with the notes of all checks, or refuse it.
 
     Raises:
         MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
             for radians, a torque that is one number while its joint moves.
     """
     few = (
-        f"{len(recording)} samples are too few to filter and to identify from; at least {LIMITS.min_samples} are needed"
+        f"{len(recording)} samples are too few for filters and identification; at least {LIMITS.min_samples} are needed"
     )
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     _check_finite(recording)
@@ -75,16 +75,16 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
 
 
 def _check_finite(recording: Recording, most: float = np.inf) -> None:
-    """Refuse NaN, infinities and what is beyond `most`; NaN in `q_link` says that a joint has no second encoder."""
+    """Refuse NaN, infinities and values beyond `most`; NaN in `q_link` means: no second encoder."""
     for name in NEEDED:
         if (values := getattr(recording, name)) is not None and (bad := ~(np.abs(values) < most)).any():
             columns = ["t"] if name == "t" else _columns(recording, name)
             worst = values[bad][0]
-            refuse(recording, bad, columns, lambda *_: f"found {worst:g}; cut that part out, or leave the rows out")  # noqa: B023
+            refuse(recording, bad, columns, lambda *_: f"found {worst:g}; cut this part out")  # noqa: B023
 
 
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
-    """Return the recording without the few rows in which a torque is one that its joint cannot have.
+    """Return the recording without the few rows that have impossible torques (spikes of the log).
 
     Such a torque is beyond `max_effort` times the limit and `min_spike_beyond` times what all but `max_spike_share` of
     the rows stay below, or `min_spike` times that.
@@ -112,7 +112,7 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
         refuse(
             recording, wild, columns,
             lambda row, j: f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s, {median} {usual[j]:.4g} of "
-            "its median: spikes of the log, too many to be left out? Cut those parts out",
+            "its median: spikes of the log? They are too many to ignore; cut those parts out",
         )  # fmt: skip
     row = int(np.argmax(rows))
     j = int(np.argmax(wild[row]))
@@ -120,7 +120,7 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     note = (
         f"row {recording.rows[row]}: the {columns[j]} is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
         f"{more}, the other rows are within "
-        f"{size[~rows, j].max():.4g} of its median: a spike of the log; left out"
+        f"{size[~rows, j].max():.4g} of its median: a spike of the log, not used"
     )
     return _noted(recording.take(~rows), note)
 
@@ -134,16 +134,16 @@ def _drop_repeats(recording: Recording) -> Recording:
         return recording
     first = int(recording.rows[int(np.argmax(same)) + 1])
     kept = recording.take(np.concatenate([[True], ~same]))
-    return _noted(kept, f"{int(same.sum())} rows repeat the one before, stamp and all (first: row {first}); dropped")
+    return _noted(kept, f"{int(same.sum())} rows repeat the row before, with its stamp (first: row {first}); not used")
 
 
 def _check_time(recording: Recording) -> None:
-    """Refuse stamps (N,) [s] that do not rise, and those whose step looks like another unit."""
+    """Refuse stamps (N,) [s] that do not increase, or whose step looks like another unit."""
     t = recording.t
     step = np.diff(t)
     back, stands = np.append(False, step < 0), np.append(False, step == 0)
     if len(step) and back[1:].all():
-        refuse_data(recording.file, "time runs backwards in every row: turn the rows around, last one first")
+        refuse_data(recording.file, "time runs backwards in every row: reverse the order of the rows")
     refuse(
         recording, back, ["t"],
         lambda i, _: f"time goes back from {t[i - 1]:.6g} s to {t[i]:.6g} s: were two logs joined, or was the clock "
@@ -152,7 +152,7 @@ def _check_time(recording: Recording) -> None:
     refuse(
         recording, stands, ["t"],
         lambda i, _: f"two samples have the stamp {t[i]:.6g} s but different values: is the clock too coarse? Number "
-        "the samples, or leave one of each pair out",
+        "the samples, or remove one of each pair",
     )  # fmt: skip
     rate = 1 / float(np.median(step))
     if not LIMITS.min_rate <= rate <= LIMITS.max_rate:
@@ -160,12 +160,12 @@ def _check_time(recording: Recording) -> None:
         likely = next(
             (unit for unit, factor in units.items() if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate), ""
         )
-        hint = f"the stamps look like {likely}; if so, say so (units: t = '{likely}')" if likely else "check the stamps"
+        hint = f"stamps look like {likely}; if so, state it (units: t = '{likely}')" if likely else "check the stamps"
         refuse_data(recording.file, f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", "t")
 
 
 def _check_size(recording: Recording, joints: Joints | None = None) -> None:
-    """Refuse positions that no joint has: degrees, millimetres, or the columns of another robot."""
+    """Refuse positions beyond any joint's travel: degrees, millimetres, or columns of another robot."""
     kinds = joints.kinds if joints else ("revolute",) * recording.n
     most = max_travel(kinds)
     if joints is not None:
@@ -173,12 +173,12 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
         most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
     check_travel(
         recording.q, most, recording, _columns(recording, "q"), recording.joint_names, kinds,
-        lambda j, other: f"looks like {other}; if so, say so (a header 'q{j + 1} [{other}]', or units: q = '{other}')",
+        lambda j, other: f"looks like {other}; if so, state it (header 'q{j + 1} [{other}]', or units: q = '{other}')",
     )  # fmt: skip
 
 
 def _check_speed(recording: Recording) -> None:
-    """Refuse measured velocities that differ from the slope of the positions by 180/π: one of them is in degrees."""
+    """Refuse velocities that differ from the slope of the positions by the factor 180/π (degrees)."""
     if recording.v is None:
         return
     slope = np.diff(recording.q, axis=0) / np.diff(recording.t)[:, None]
@@ -189,12 +189,12 @@ def _check_speed(recording: Recording) -> None:
     for j in np.flatnonzero(alike & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
         for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
-                message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, say so in the header or the units"
+                message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, state it in header or units"
                 refuse_data(recording.file, message, _columns(recording, "v")[j])
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
-    """Return in words which positions jump, whatever the rows around do: an encoder, a clock, a join."""
+    """Return a description of positions that jump relative to the surrounding rows (encoder, clock, joined logs)."""
     if len(recording) < 5:
         return []
     step = np.diff(recording.t)
@@ -211,13 +211,13 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
         size = f"{1e3 * off[row, j]:.3g} {'mm' if kinds[j] == 'prismatic' else 'mrad'}"
         notes.append(
             f"{recording.joint_names[j]} jumps by {size} between rows {recording.rows[row + 2]} and "
-            f"{recording.rows[row + 3]}: an encoder, or two logs joined? Cut the file there"
+            f"{recording.rows[row + 3]}: an encoder error, or two joined logs? Cut the file there"
         )
     return notes
 
 
 def _columns(recording: Recording, name: str) -> list[str]:
-    """Return how messages call the columns of a series: ``effort of elbow (joint 3)``."""
+    """Return the column labels of a series for messages: ``effort of elbow (joint 3)``."""
     label = recording.kind if name == "effort" else name
     return [f"{label} of {joint} (joint {j + 1})" for j, joint in enumerate(recording.joint_names)]
 
@@ -225,7 +225,7 @@ def _columns(recording: Recording, name: str) -> list[str]:
 def _still(recording: Recording) -> list[str]:
     still = np.ptp(recording.q, axis=0) < LIMITS.min_travel
     if still.all():
-        return ["no joint moves in this recording: it shows gravity in one pose, and nothing else"]
+        return ["no joint moves in this recording: it contains only gravity in one pose"]
     notes = []
     for j, dead in enumerate(np.ptp(recording.effort, axis=0) == 0):
         if dead and not still[j]:
@@ -244,7 +244,7 @@ def _still(recording: Recording) -> list[str]:
 
 
 def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
-    """Note efforts that do not suit the limits: currents given as torques differ from them by the gear.
+    """Return notes on torques that do not suit the effort limits (currents, or torques before the gear).
 
     Raises:
         MeasurementError: where every joint is far beyond its limit: another unit.
@@ -257,8 +257,8 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     if known.any() and (usual[known] > LIMITS.max_effort * limit[known]).all():
         j = int(np.argmax(np.where(known, usual / np.where(known, limit, 1.0), 0.0)))
         message = (
-            f"|torque| reaches {usual[j]:.4g} where the joint's limit is {limit[j]:g}, and every joint is beyond "
-            f"{LIMITS.max_effort:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header "
+            f"|torque| reaches {usual[j]:.4g}, the joint's limit is {limit[j]:g}; every joint exceeds "
+            f"{LIMITS.max_effort:g} times its limit: N mm, or another robot? If N mm, state the unit (a header "
             "'tau_1 [Nmm]', or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
         refuse_data(recording.file, message, _columns(recording, "effort")[j])
@@ -269,8 +269,8 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     ]
     if known.any() and (most[known] < 0.03 * limit[known]).all():
         notes.append(
-            "no torque reaches 3 % of its joint's limit: are these currents, or torques before the gear? If currents,"
-            " say kind = 'current', and their gains are identified"
+            "no torque reaches 3 % of its joint's limit: currents, or torques before the gear? If currents,"
+            " state kind = 'current': their gains are then identified"
         )
     return notes
 
@@ -287,7 +287,7 @@ def _limit_notes(recording: Recording, joints: Joints | None) -> list[str]:
 
 
 def _work_notes(recording: Recording) -> list[str]:
-    """Note torques that take energy out of the robot: from a pose back to it drives pay for friction, ∫τᵀ dq > 0.
+    """Return a note if torques take energy out of the robot: over a closed path friction requires ∫τᵀ dq > 0.
 
     Between different poses gravity pays too, an arm that comes down gives energy back: there nothing is said.
     """
@@ -303,7 +303,7 @@ def _work_notes(recording: Recording) -> list[str]:
 
 
 def _round_trip(q: np.ndarray) -> slice | None:
-    """Return the steps between two rows of nearly one pose, far apart; None where the motion does not come back."""
+    """Return the steps between two distant rows of nearly equal poses; None if the motion does not return."""
     every = max(1, len(q) // LIMITS.max_compared)
     poses = q[::every] / np.maximum(np.ptp(q, axis=0), LIMITS.min_travel)
     apart = np.abs(poses[:, None] - poses[None]).max(axis=2)

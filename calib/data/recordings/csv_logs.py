@@ -1,7 +1,7 @@
-"""Recordings in CSV tables: a column of stamps, and one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``).
+"""Recordings in CSV tables: one column of stamps, one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``).
 
-A quantity's name (`recording_options`) stands before or behind the joint's number or name, with or without a ``_``
-(``q1``, ``q_1``, ``position_elbow``, ``elbow_position``, ``J1 pos``; in ``q[1]`` is no unit but a number); numbers
+A quantity's name (`recording_options`) is before or after the joint's number or name, with or without a ``_``
+(``q1``, ``q_1``, ``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers
 start at 0 or 1.
 """
 
@@ -29,7 +29,7 @@ from calib.errors import refuse_data, suggestion
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
-    """Return the rows of a CSV table, unchecked but for their shapes; some 20 MB/s."""
+    """Return the recording in a CSV table; only shapes are checked; about 20 MB/s."""
     table = _numbered_brackets(read_table(path, doubles=True))
     found = _find(table, options, joints.names if joints else ())
     chosen = one_effort({ours: ours for ours in found}, options, table.header, path)
@@ -52,7 +52,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         if stem_of(table.header[columns[0]])[0].startswith(MEASURED):
             notes.append(f"{ours} is read from {', '.join(_called(table, columns))}")
         if len(units := dict.fromkeys(table.units[place] or "no unit" for place in columns)) > 1:
-            notes.append(f"the columns of {ours} differ in their units ({', '.join(units)}): is that meant?")
+            notes.append(f"the columns of {ours} have different units ({', '.join(units)}): is this intended?")
     names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
     return Recording(
         _stamps(table, found, options),
@@ -67,21 +67,21 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
 
 
 def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps (N,) [s] and positions (N, n) of a table without torques: of q_ref, or of q where that is not."""
+    """Return stamps (N,) [s] and positions (N, n) of a table without torques: q_ref, else q."""
     table = _numbered_brackets(read_table(path, doubles=True))
     here = replace(options, names={key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")})
     found = _find(table, here, joints.names)
     ours = "q_ref" if "q_ref" in found else "q"
     if ours not in found:
         wanted = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
-        message = f"has no positions that were asked for ({wanted}, with the joints' numbers or names)"
+        message = f"has no reference positions ({wanted}, with the joints' numbers or names)"
         refuse_data(path, f"{message}; found: {', '.join(table.header)}")
     q = np.column_stack([_values(table, place, ours, options) for place in found[ours]])
     return _stamps(table, found, options), q
 
 
 def _numbered_brackets(table: Table) -> Table:
-    """Return the table with headings like ``q[1]``, whose bracket holds a joint's number, undone."""
+    """Return the table with headings like ``q[1]`` (joint number in brackets) renamed to ``q1``."""
     if not any(unit.isdigit() for unit in table.units):
         return table
     header = tuple(name + unit if unit.isdigit() else name for name, unit in zip(table.header, table.units))
@@ -90,7 +90,7 @@ def _numbered_brackets(table: Table) -> Table:
 
 
 def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
-    """Return our name → the places of its columns, in the robot's order."""
+    """Return our name → indices of its columns, in the robot's order."""
     found = {}
     for ours, synonyms in SYNONYMS.items():
         stems = (options.names[ours],) if ours in options.names else synonyms
@@ -104,13 +104,13 @@ def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dic
 
 
 def _alone(table: Table, stem: str) -> list[int]:
-    """Return the place of the one column of this name."""
+    """Return the index of the one column with this name; [] if absent."""
     header = [name.lower() for name in table.header]
     return [header.index(stem.lower())] if stem.lower() in header else []
 
 
 def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
-    """Return the places of the columns of one quantity that have the joints' names."""
+    """Return the indices of the columns of one quantity that are named after the joints."""
     header, stem = [name.lower() for name in table.header], stem.lower()
     for pattern in (f"{stem}_{{}}", f"{stem}{{}}", f"{stem} {{}}", f"{{}}_{stem}", f"{{}}.{stem}", f"{stem}.{{}}"):
         columns = [pattern.format(joint.lower()) for joint in joints]
@@ -120,7 +120,7 @@ def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
 
 
 def _numbered(table: Table, stem: str) -> list[int]:
-    """Return the places of the columns of one quantity by their numbers, which go from 0 or 1 on without a gap."""
+    """Return the indices of the numbered columns of one quantity; [] unless numbered from 0 or 1 without gaps."""
     found: dict[str, list[tuple[int, int]]] = {}
     for place, name in enumerate(table.header):
         own, number = stem_of(name)
@@ -143,7 +143,7 @@ def _joint_names(table: Table, places: Sequence[int]) -> list[str]:
 
 
 def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> np.ndarray:
-    """Return a column in SI; a NaN stays, and is refused later with the rows of the cut alone."""
+    """Return a column in SI; NaN is kept and refused later, if it is within the cut."""
     if table.cells[place].dtype != float:
         table.numbers(table.header[place])  # refuses, with the row
     return table.cells[place] * table.factor(place, SCALES[ours], options.units.get(ours, ""))
@@ -156,5 +156,5 @@ def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions
     if options.rate:
         return np.arange(len(table)) / options.rate
     wanted = ", ".join(SYNONYMS["t"])
-    message = f"has no column of stamps ({wanted}), and the options state no rate; found: {', '.join(table.header)}"
+    message = f"has no column of stamps ({wanted}), the options state no rate; found: {', '.join(table.header)}"
     table.fail(message)

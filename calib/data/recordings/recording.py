@@ -1,4 +1,4 @@
-"""What a controller logged while the robot moved: one frozen block per file, untouched; knows no robot."""
+"""Recording logged by a controller during motion: one frozen block per file, independent of the robot."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """What a reader may hold a recording against; NaN or infinity where a limit is not known.
+    """Joint data for checking a recording; NaN or infinity if a limit is unknown.
 
     Attributes:
         names: n joint names in the robot's order.
@@ -56,20 +56,20 @@ class Recording:
         t: (N,) time since the file's first sample [s], strictly rising, not necessarily uniform; a part that was cut
             out keeps the time of the whole file.
         q: (N, n) joint positions on the motor side of any elasticity [rad or m].
-        effort: (N, n) what drives the joints: torques on the joint side [N·m or N], or motor currents [A].
-        kind: ``torque`` or ``current``: what `effort` is.
+        effort: (N, n) torques on the joint side [N·m or N], or motor currents [A].
+        kind: kind of `effort`, ``torque`` or ``current``.
         joint_names: n names.
         v: (N, n) measured velocities [rad/s or m/s]; None where not recorded.
         tau_link: (N, n) a second torque, of sensors behind the gear [N·m or N]; None where not recorded.
         tau_motor: (N, n) torque on the motor's side of the gear, as recorded [N·m]; None where not recorded.
         q_link: (N, n) second encoders, behind the gear [rad or m]; NaN in the columns of joints that have none.
-        q_ref: (N, n) positions that were asked for [rad or m]; tau_ff: (N, n) torque the controller added open loop,
+        q_ref: (N, n) reference positions [rad or m]; tau_ff: (N, n) feedforward torque added by the controller,
             as torques; None where not recorded.
         drive_gain: (n,) torque per current that the file states [N·m/A or N/A]; None where it states none.
         effort_variance: (n,) mean variance of the effort's samples, from repeats [its unit²]; None where not known.
         file: where it came from.
         rows: (N,) number of each sample in the file, counted from 1.
-        notes: what is odd but was accepted, for the message; jumps: of positions, in words.
+        notes: odd but accepted findings, for the message; jumps: descriptions of position jumps.
     """
 
     t: np.ndarray
@@ -118,7 +118,7 @@ class Recording:
         joint_names: Sequence[str] = (),
         **more: Any,
     ) -> Recording:
-        """Return arrays as a recording.
+        """Return a recording from arrays.
 
         Args:
             t: (N,) stamps [s]; q: (N, n) positions [rad or m]; tau: (N, n) torques [N m or N], or currents [A].
@@ -127,7 +127,7 @@ class Recording:
             more: other fields: ``v``, ``tau_link``, ``q_ref`` ...
 
         Raises:
-            MeasurementError: for shapes that do not go together.
+            MeasurementError: for inconsistent shapes.
         """
         q = np.asarray(q, dtype=float)
         return Recording(np.asarray(t), q, np.asarray(tau), kind, named(joint_names, q.shape[1]), **more)
@@ -146,7 +146,7 @@ class Recording:
         return float(self.t[-1] - self.t[0]) if len(self) else 0.0
 
     def cut(self, start: float | None = None, stop: float | None = None) -> Recording:
-        """Return the samples with start ≤ t < stop [s]; None leaves that end open.
+        """Return the recording of the samples with start ≤ t < stop [s]; None: no bound at that end.
 
         Raises:
             MeasurementError: where nothing is left.
@@ -154,28 +154,28 @@ class Recording:
         return self.take(rows_of_cut(self.t, start, stop, self.file))
 
     def take(self, index: slice | np.ndarray) -> Recording:
-        """Return the samples at `index`, a slice or a mask (N,); they keep their times and row numbers."""
+        """Return the recording of the samples at `index`, a slice or a mask (N,), with their times and row numbers."""
         picked = {name: None if (value := getattr(self, name)) is None else value[index] for name in SERIES}
         return replace(self, t=self.t[index], rows=self.rows[index], **picked)
 
 
 def settled(values: np.ndarray) -> np.ndarray:
-    """Return `values` themselves where they are read-only floats already, else a frozen copy: logs are large."""
+    """Return `values` itself if it is a read-only float array, else a frozen copy (logs are large)."""
     owner = values.base if isinstance(values, np.ndarray) and values.base is not None else values
     fixed = isinstance(owner, np.ndarray) and not owner.flags.writeable and values.dtype == float
     return values if fixed else frozen(values)
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
-    """Return `values`, which nobody else holds, locked."""
+    """Return `values`, made read-only; the caller must own the array."""
     values.flags.writeable = False
     return values
 
 
 def earlier(recording: Recording, lag: float) -> Recording:
-    """Return the recording with torques and currents `lag` [s] earlier: they had come that much later than positions.
+    """Return the recording with torques and currents shifted `lag` [s] earlier, to the time of the positions.
 
-    Samples whose torque was not recorded go.
+    Samples without a recorded torque are removed.
 
     Raises:
         MeasurementError: where nothing is left.
@@ -185,18 +185,18 @@ def earlier(recording: Recording, lag: float) -> Recording:
     t = recording.t + lag
     inside = (t >= recording.t[0]) & (t <= recording.t[-1]) if len(t) else np.zeros(0, bool)
     if not inside.any():
-        refuse_data(recording.file, f"torques {lag:g} s late leave no sample of {recording.duration:.3g} s")
+        refuse_data(recording.file, f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s")
     moved = {
         name: np.column_stack([np.interp(t, recording.t, own) for own in value.T])
         for name in LATE
         if (value := getattr(recording, name)) is not None
     }
-    notes = (*recording.notes, f"torques are taken {1e3 * lag:g} ms earlier, as asked for")
+    notes = (*recording.notes, f"torques are shifted {1e3 * lag:g} ms earlier, as stated by lag")
     return replace(recording, notes=notes, **moved).take(inside)
 
 
 def rows_of_cut(t: np.ndarray, start: float | None, stop: float | None, file: str | Path) -> slice:
-    """Return the samples with start ≤ t < stop, refusing a cut without any; a grain of 1 ns forgives rounding."""
+    """Return the slice of samples with start ≤ t < stop (tolerance 1 ns); refuse a cut without samples."""
     first = 0 if start is None else int(np.searchsorted(t, start - 1e-9))
     end = len(t) if stop is None else int(np.searchsorted(t, stop - 1e-9))
     if first >= end:
@@ -207,7 +207,7 @@ def rows_of_cut(t: np.ndarray, start: float | None, stop: float | None, file: st
 
 
 def parse_cut(text: str) -> tuple[str, float | None, float | None]:
-    """Return the file, start and stop [s] that ``log.npz@0:9.4`` says; either end may be left out (``log.npz@2:``).
+    """Return file, start and stop [s] of a text like ``log.npz@0:9.4``; either end may be absent (``log.npz@2:``).
 
     Seconds count from the file's first sample. Without an ``@`` the whole text is the file.
 
@@ -222,16 +222,16 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
         try:
             ends.append(float(part) if part.strip() else None)
         except ValueError as error:
-            message = f"{text}: '{part}' is no time in seconds; a cut is written log.npz@0:9.4"
+            message = f"{text}: '{part}' is not a time in seconds; write a cut as log.npz@0:9.4"
             raise UsageError(message) from error
     start, stop = ends
     if start is not None and start < 0.0:
-        refuse_option(text, f"the cut starts at {start:g} s, before the recording does; seconds count from its start")
+        refuse_option(text, f"the cut starts at {start:g} s, before the recording; seconds count from its start")
     if start is not None and stop is not None and not start < stop:
         refuse_option(text, f"the cut ends at {stop:g} s, before it starts at {start:g} s")
     return match["file"], start, stop
 
 
 def named(names: Sequence[str], n: int) -> tuple[str, ...]:
-    """Return `names`, or q1 … qn where there are none."""
+    """Return `names`, or q1 … qn if empty."""
     return tuple(names) if len(names) else tuple(f"q{j + 1}" for j in range(n))

@@ -1,4 +1,4 @@
-"""Recordings from files: NumPy archives, CSV tables, ROS bags; the first bytes say which."""
+"""Recordings from files: NumPy archives, CSV tables or ROS bags, recognised by their first bytes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,11 +22,11 @@ def read_recording(
     """Return the checked recording at `path`, which may be cut in time (``log.npz@0:9.4``).
 
     Args:
-        joints: the robot's; columns are put in their order where the file names its own.
+        joints: the robot's; columns are put in their order if the file names its joints.
 
     Raises:
         MeasurementError: where the file cannot be what it should be; with row and column.
-        UsageError: for a cut that is none.
+        UsageError: for an invalid cut.
     """
     file, start, stop = parse_cut(str(path))
     options = options or RecordingOptions()
@@ -41,7 +41,7 @@ def read_recording(
 
 
 def _check_names(recording: Recording, joints: Joints) -> None:
-    """Refuse a recording of another number of joints, or of other joints, than the robot has."""
+    """Refuse a recording whose number of joints differs from the robot's."""
     if recording.n != len(joints.names):
         message = (
             f"has {recording.n} joints ({', '.join(recording.joint_names)}), the robot has {len(joints.names)} "
@@ -51,7 +51,7 @@ def _check_names(recording: Recording, joints: Joints) -> None:
 
 
 def _reader(path: Path, ends: Ends) -> Reader:
-    """Return the reader that the first bytes of the file, or a folder, ask for."""
+    """Return the reader for a path, chosen by the file's first bytes or suffix; a folder is a bag."""
     try:
         if path.exists():
             check_regular(path)
@@ -60,15 +60,15 @@ def _reader(path: Path, ends: Ends) -> Reader:
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:
-        hint = "; a cut is written log.npz@0:9.4, in seconds" if "@" in path.name else ""
+        hint = "; write a cut as log.npz@0:9.4, in seconds" if "@" in path.name else ""
         raise MeasurementError(f"cannot be read: {error.strerror}{hint}", path) from error
     if head[:2] == b"PK":
         return partial(read_archive, ends=ends)  # other rows are not kept
     if head and path.suffix == ".npz":
-        refuse_data(path, "is no NumPy archive, whatever its name says: was it written by np.savez?")
+        refuse_data(path, "is not a NumPy archive despite its name: was it written by np.savez?")
     if not head or b"\0" in head:
         found = "is empty" if not head else "is neither a NumPy archive, a bag nor text"
         refuse_data(path, f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
-        refuse_data(path, "has a first line of more than 64 kB: this is no table")
+        refuse_data(path, "has a first line of more than 64 kB: not a table")
     return read_log

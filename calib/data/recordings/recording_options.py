@@ -1,6 +1,6 @@
-"""How recordings call what they hold: the names that are understood, their units, and what a caller may say instead.
+"""Options for reading recordings: accepted names of series, their units, and names stated by the user.
 
-Names that are understood (the first of a row that the file has is taken; case and blanks do not matter):
+Accepted names (the first name of a row found in the file is used; case and blanks do not matter):
 
 ========== =============================================================================================
 ours       in an archive, and in a table before the joint's number or name
@@ -18,7 +18,7 @@ q_ref      q_ref, q_des, q_cmd, q_desired, q_reference, q_command, q_target, pos
 tau_ff     tau_ff, tau_feedforward, torque_feedforward
 ========== =============================================================================================
 
-FloBaRoID writes times, positions, velocities, torques. Words before a name that say no more than that it was measured
+FloBaRoID writes times, positions, velocities, torques. Words before a name that only mean "measured"
 (`MEASURED`: ``actual_q_0``, ``state.q[0]``) do not matter where no column has the plain name.
 """
 
@@ -61,37 +61,37 @@ SCALES = {
 
 
 def _ours(names: Any) -> Any:
-    """Refuse a name that is none of ours."""
+    """Return `names`; refuse a name unknown to this toolkit."""
     for name in names if isinstance(names, Mapping) else ():
-        words = f"'{name}' is none of our names{suggestion(name, SYNONYMS)}; ours are {', '.join(SYNONYMS)}"
+        words = f"'{name}' is not a known name{suggestion(name, SYNONYMS)}; known are {', '.join(SYNONYMS)}"
         require(name in SYNONYMS, words, ValueError)
     return names
 
 
 def _known(units: Any) -> Any:
-    """Refuse a unit that its series cannot have."""
+    """Return `units`; refuse a unit that does not suit its series."""
     for name, unit in _ours(units).items() if isinstance(units, Mapping) else ():
         if unit and (not isinstance(unit, str) or unit.lower() not in SCALES[name]):
-            raise ValueError(f"unit {shown(unit)} of {name} is none of {', '.join(SCALES[name])}")
+            raise ValueError(f"unit {shown(unit)} of {name} is unknown; expected one of {', '.join(SCALES[name])}")
     return units
 
 
 @strict
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How a recording is to be read; the defaults leave everything to the file.
+    """Options for reading a recording; by default the file determines everything.
 
     Attributes:
-        kind: ``torque`` or ``current``, where a file has both or calls one the other.
+        kind: ``torque`` or ``current``, if a file has both, or currents named as torques.
         names: our name (`SYNONYMS`) → the file's.
-        units: our name → unit, where the file states none; for SI nothing is needed.
+        units: our name → unit, if the file states none; default SI.
         rate: sampling rate of a file without stamps [Hz].
         topic: of a ROS bag with several topics of joint states.
-        use_range: follow the file's own `use_range` where the path has no cut.
-        lag: by which torques and currents come later than the positions of their row [s].
-        rows: what the torques to be explained are called, for messages.
-        motors, sensors: whether they need the motors' torques, those of sensors behind the gears: where they need
-            these and no column is called a torque or current, tau_motor is the effort.
+        use_range: use only the rows of the file's `use_range` if the path has no cut.
+        lag: delay of torques and currents relative to the positions of their row [s].
+        rows: name of the torques to be explained, for messages.
+        motors, sensors: whether these need the motors' torques, the torques of sensors after the gears; if they need
+            sensors and no column is named torque or current, tau_motor is the effort.
     """
 
     kind: Annotated[str, OneOf(("torque", "current"))] = ""
@@ -113,23 +113,23 @@ class RecordingOptions:
             _known(self.units)
 
     def factor(self, name: str) -> float:
-        """Return the factor to SI from the unit that is stated for one of our names."""
+        """Return the factor to SI of the unit stated for one of our names; 1 if none is stated."""
         unit = self.units.get(name, "")
         return SCALES[name][unit.lower()] if unit else 1.0
 
 
 def check_units(name: str, units: Sequence[str], joints: Joints | None, path: str | Path) -> None:
-    """Refuse units, one per column of the series `name`, that turning or sliding joints do not have; "" is SI."""
+    """Refuse units of the series `name` (one per column, "" is SI) that do not suit revolute or prismatic joints."""
     if joints is None or len(units) != len(joints.names) or name not in ("q", "v", "q_link", "q_ref"):
         return
     for joint, kind, unit in zip(joints.names, joints.kinds, units):
         if unit and (unit.lower() in TURNED) == (kind == "prismatic"):
-            message = f"the unit [{unit}] of {name} does not suit {joint}, a {kind} joint: is it what the file is in?"
+            message = f"the unit [{unit}] of {name} does not suit {joint}, a {kind} joint: is it the file's unit?"
             refuse_data(path, message)
 
 
 def stem_of(name: str) -> tuple[str, int | None]:
-    """Return what a column is of, in small letters with ``_`` between words, and its last number: q, 1 of ``J1 q``."""
+    """Return a column's quantity in lower case, words joined by ``_``, and its last number: (q, 1) for ``J1 q``."""
     number = _NUMBER.search(name)
     rest = f"{name[: number.start()]} {name[number.end() :]}" if number else name
     words = [word for word in re.split(r"[\W_]+", rest.lower()) if word not in ("", "joint", "j")]
@@ -137,7 +137,7 @@ def stem_of(name: str) -> tuple[str, int | None]:
 
 
 def plain_stems(stems: Sequence[str]) -> dict[str, str]:
-    """Return stem → itself, and without the words of `MEASURED` before it → the one stem that has them."""
+    """Return stem → stem, and also the stem without leading words of `MEASURED` → stem, if only one fits."""
     short: dict[str, list[str]] = {}
     for stem in stems:
         words = stem.split("_")
@@ -148,14 +148,14 @@ def plain_stems(stems: Sequence[str]) -> dict[str, str]:
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
-    """Return our name → the file's, of all series that the file has."""
+    """Return our name → the file's name, for all series of the file."""
     plain = {stem: member for member in reversed(members) if not (named := stem_of(member))[1] for stem in [named[0]]}
     plain = {name: plain[stem] for name, stem in plain_stems(tuple(plain)).items()}
     found = {}
     for ours, synonyms in SYNONYMS.items():
         if ours in options.names:
             if options.names[ours] not in members:
-                message = f"there is no '{options.names[ours]}'{suggestion(options.names[ours], members)}"
+                message = f"has no '{options.names[ours]}'{suggestion(options.names[ours], members)}"
                 refuse_data(path, f"{message}; found: {', '.join(members)}")
             found[ours] = options.names[ours]
         elif name := next((plain[own] for synonym in synonyms if (own := stem_of(synonym)[0]) in plain), ""):
@@ -166,7 +166,7 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
 def one_effort(
     found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path
 ) -> dict[str, str]:
-    """Return `found` with one of ``torque`` and ``current``; sensors behind the gear serve where there is neither."""
+    """Return `found` with either ``torque`` or ``current``; without both, ``tau_link`` becomes the torque."""
     if "q" not in found:
         wanted = ", ".join(SYNONYMS["q"])
         message = f"has no joint positions ({wanted}); found: {', '.join(members)}"
@@ -188,7 +188,7 @@ def one_effort(
 
 
 def _cure(found: Mapping[str, str], members: Sequence[str]) -> str:
-    """Return how the options can name what is missing: columns that share a word with it, else the first and last."""
+    """Return advice to name the missing series in the options, with likely columns (by a shared word)."""
     stems = [stem for member in members for stem in [stem_of(member)[0]] if stem not in (*found.values(), "")]
     several = [stem for stem in stems if stems.count(stem) > 1] or stems or ["..."]
     likely = {}
@@ -198,11 +198,11 @@ def _cure(found: Mapping[str, str], members: Sequence[str]) -> str:
             likely[ours] = own
     likely = likely or {"q": several[0], "torque": several[-1]}
     names = ", ".join(f'{ours} = "{stem}"' for ours, stem in likely.items())
-    return f". Say in the options what they are called, as in [recording] names = {{ {names} }}"
+    return f". State their names in the options, as in [recording] names = {{ {names} }}"
 
 
 def _two_torques(found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:
-    """Add the motors' torque (or the sensors', where only theirs is needed) to `found` as the effort."""
+    """Add the motors' torque to `found` as the effort (the sensors' torque if only that is needed)."""
     own = "tau_motor" if "tau_motor" in found else "tau_link"
     if "tau_link" not in found or (options.motors and own == "tau_link"):
         what = "two torques, of motors and of sensors" if options.motors else "torques of sensors"
@@ -216,7 +216,7 @@ def _two_torques(found: dict[str, str], options: RecordingOptions, members: tupl
 
 
 def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Path) -> tuple[list[int], tuple[str, ...]]:
-    """Return where the robot's joints stand among the file's, and their names; the file may hold more joints."""
+    """Return the indices of the robot's joints among the file's, and their names; the file may have more joints."""
     if names and len(names) != n:
         refuse_data(path, f"joint_names has {len(names)} names for {n} columns")
     if joints is None or not names:

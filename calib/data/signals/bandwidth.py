@@ -1,4 +1,4 @@
-"""Cut-offs from the data: how far up the motion reaches, where noise begins, and which filters follow.
+"""Cut-off frequencies from the data: bandwidth of the motion, noise level, and the filters for them.
 
 Gautier's rules, with ω_dyn the highest frequency at which the rigid body moves: the positions' low-pass filter at
 ω_f ≥ 5 ω_dyn, so that it bends nothing in the band, and the parallel decimation at ω_fp ≥ 2 ω_dyn, with
@@ -23,14 +23,14 @@ USABLE = 0.8  # of the Nyquist frequency
 
 @dataclass(frozen=True, eq=False)
 class Cutoffs:
-    """Proposed cut-offs.
+    """Proposed cut-off frequencies of filters and decimation.
 
     Attributes:
         dynamics: f_dyn of the robot [Hz].
         position: cut-off of the positions' Butterworth filter, f_q [Hz].
         band: cut-off of the parallel decimation, f_p [Hz], factor: its n_d.
         noise: (n,) standard deviation of white noise in the positions [rad or m], read above the motion.
-        reasons: how the values came about, in words.
+        reasons: explanations of the values.
     """
 
     dynamics: float
@@ -41,7 +41,7 @@ class Cutoffs:
     reasons: tuple[str, ...]
 
     def acceleration_noise(self, cutoff: float | np.ndarray, rate: float) -> np.ndarray:
-        """Return (n,) what white position noise makes of the accelerations at a cut-off f_q [Hz], one or (n,).
+        """Return the acceleration noise (n,) due to white position noise at a cut-off f_q [Hz], one or (n,).
 
         σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)), with `rate` f_s [Hz].
         """
@@ -49,10 +49,10 @@ class Cutoffs:
 
 
 def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoffs:
-    """Return the cut-offs that `sampled` asks for.
+    """Return the cut-offs proposed for a resampled recording.
 
     Args:
-        dynamics: f_dyn where it is known [Hz] (the bandwidth of the position loop); else it is read from the data.
+        dynamics: f_dyn if known [Hz] (the bandwidth of the position loop); else estimated from the data.
     """
     longest = np.bincount(sampled.segment).argmax()
     start, stop = (int(i) for i in np.searchsorted(sampled.segment, [longest, longest + 1]))
@@ -66,7 +66,7 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     dynamics, reason = _choose(np.array([joint for joint, _ in read]), dynamics)
     reasons = [reason]
     reasons += [
-        f"joint {j + 1}: a resonance, or noise of the loop, at {peak:.3g} Hz is left out"
+        f"joint {j + 1}: a peak at {peak:.3g} Hz (resonance, or noise of the loop) is ignored"
         for j, (_, peak) in enumerate(read)
         if np.isfinite(peak)
     ]
@@ -80,7 +80,7 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
 def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies (F,) [Hz] and one-sided power densities (F, n) [unit²/Hz] of `values` (N, n), by Welch.
 
-    Windows of `size` samples (Hann's), half overlapping, a straight line taken off each.
+    Hann windows of `size` samples, half overlapping, each with its straight line subtracted.
     """
     window = hann(size)
     line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
@@ -96,7 +96,7 @@ def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
-    """Refuse a cut-off that the sampling rate does not allow [Hz]."""
+    """Refuse a cut-off [Hz] that is not between 0 and half the sampling rate."""
     if not 0 < cutoff < rate / 2:
         message = (
             f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency, {rate / 2:g} Hz at {rate:g} Hz: "
@@ -108,7 +108,7 @@ def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
 def _position_cutoff(
     f: np.ndarray, power: np.ndarray, floor: np.ndarray, active: np.ndarray, dynamics: float, rate: float
 ) -> tuple[float, str]:
-    """Return f_q [Hz] and why: 5 f_dyn, less where noise would reach 5 % of the acceleration, but at least 2 f_dyn.
+    """Return f_q [Hz] and the reason: 5 f_dyn, or less if noise exceeds 5 % of the acceleration, at least 2 f_dyn.
 
     White noise of density S_0 becomes an acceleration of variance (2π)⁴ S_0 f_q⁵/5.
     """
@@ -127,16 +127,16 @@ def _position_cutoff(
 
 
 def _active(q: np.ndarray, min_speed_share: float = 0.05) -> np.ndarray:
-    """Return (n,) which joints move fast enough to show the bandwidth.
+    """Return the mask (n,) of joints that move fast enough to determine the bandwidth.
 
-    `min_speed_share`: a joint of less than this share of the fastest one's speed says nothing.
+    `min_speed_share`: slower joints, relative to the fastest one, are not used.
     """
     speed = np.quantile(np.abs(np.diff(q, axis=0)), 0.95, axis=0)
     return speed > min_speed_share * speed.max()
 
 
 def _choose(per_joint: np.ndarray, stated: float | None, max_cutoff: float = 20.0) -> tuple[float, str]:
-    """Return f_dyn of the robot [Hz] and why.
+    """Return f_dyn of the robot [Hz] and the reason.
 
     `max_cutoff`: [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend.
     """
@@ -147,19 +147,19 @@ def _choose(per_joint: np.ndarray, stated: float | None, max_cutoff: float = 20.
     max_spread = 3.0  # a joint this many times above the median of all is taken to vibrate
     found = min(top, max_spread * middle)
     if found < LOWEST:
-        where = f"ends at {found:.2g} Hz" if found else "hardly stands out of the noise"
-        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {where}, but friction turns faster"
+        where = f"ends at {found:.2g} Hz" if found else "hardly exceeds the noise"
+        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {where}; friction is faster"
     if found > max_cutoff:
         why = f"joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
         return max_cutoff, f"f_dyn = {max_cutoff:g} Hz: {why}"
     if found < top:
-        why = f"{max_spread:g} times the median: joint {fastest + 1}'s {top:.3g} Hz stands apart"
+        why = f"{max_spread:g} times the median: joint {fastest + 1}'s {top:.3g} Hz is an outlier"
         return found, f"f_dyn = {found:.3g} Hz, {why}"
     return found, f"f_dyn = {found:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
 
 
 def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float, min_rise: float = 30.0) -> tuple[float, float]:
-    """Return how far up one joint's motion reaches [Hz], and where a resonance above it stands (NaN: none).
+    """Return the highest frequency of one joint's motion and of a resonance above it [Hz] (NaN: none).
 
     `min_rise`: a power that rises this far again above the motion is a resonance, not a gap between two lines.
     """

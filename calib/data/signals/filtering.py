@@ -1,4 +1,4 @@
-"""Zero-phase low-pass filters and central differences, along the first axis of evenly sampled arrays.
+"""Zero-phase low-pass filters and central differences along the first axis of evenly sampled arrays.
 
 Parallel decimation: the same low-pass filter and thinning for the torque and for every column of W.
 
@@ -27,13 +27,13 @@ KAISER = 0.1102 * (60.0 - 8.7)  # beta of a window whose stop band is 60 dB down
 
 @dataclass(frozen=True, eq=False)
 class Decimator:
-    """A low-pass filter that keeps one sample in `factor`.
+    """Low-pass filter and decimation that keeps one of `factor` samples.
 
     Attributes:
         factor: n_d; 1 changes nothing.
         taps: (2 h + 1,) weights of the samples k-h … k+h, symmetric, of sum 1.
         rate: of the signal before [Hz].
-        band: the cut-off f_p = 0.8 rate / (2 n_d) [Hz]: what is below survives.
+        band: the cut-off f_p = 0.8 rate / (2 n_d) [Hz]; lower frequencies pass.
     """
 
     factor: int
@@ -43,12 +43,12 @@ class Decimator:
 
     @property
     def reach(self) -> int:
-        """h, the samples on each side that a kept one needs."""
+        """Number of samples h that the filter needs on each side of a kept sample."""
         return len(self.taps) // 2
 
 
 def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimator:
-    """Return the filter for keeping one sample in `factor` of a signal at `rate` [Hz].
+    """Return the filter that keeps one of `factor` samples of a signal at `rate` [Hz].
 
     ``chebyshev``: Matlab's and Gautier's decimate: type I, order 8, 0.05 dB, cut-off 0.8 of the new Nyquist frequency,
     run forwards and backwards; taken as its impulse response (the inverse transform of |H|²), cut where 1e-4 of it is
@@ -73,7 +73,7 @@ def factor_for(rate: float, band: float) -> int:
 
 
 def kept(segment: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return the indices (M,) of the samples that `decimate` keeps, from the segment numbers (N,), which rise."""
+    """Return the indices (M,) of the samples that `decimate` keeps, given rising segment numbers (N,)."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
     h, r = decimator.reach, decimator.factor
     parts = [np.arange(a + h, b - h, r) for a, b in pairwise(edges)]
@@ -81,7 +81,7 @@ def kept(segment: np.ndarray, decimator: Decimator) -> np.ndarray:
 
 
 def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | None = None) -> np.ndarray:
-    """Return `values` (N, ...) filtered and thinned to (M, ...), at the samples `kept`; each segment (N,) by itself."""
+    """Return `values` (N, ...) filtered and decimated to the samples `kept` (M, ...), segment by segment."""
     values = np.asarray(values, dtype=float)
     segment = np.zeros(len(values), dtype=int) if segment is None else segment
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
@@ -109,7 +109,7 @@ def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
 
 
 def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Iterator[np.ndarray]:
-    """Return, block by block, what `decimate` returns of the blocks (..., N_i) of one segment joined together.
+    """Yield, block by block, the decimation of one segment given as blocks (..., N_i).
 
     The sample axis is the last one. Holds one block, and of those before it the samples that windows still need.
     """
@@ -126,7 +126,7 @@ def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Itera
 
 
 def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.ndarray:
-    """Return the first `count` windows (..., count) of values (..., N), one every r samples.
+    """Return the filtered values (..., count) of the first `count` windows of values (..., N), one every r samples.
 
     As many windows at a time as one is long, as a product with their band of taps: twice the multiplications, which
     the processor's cache makes up for many times over.
@@ -165,12 +165,12 @@ def _chebyshev(factor: int, ripple: float = 0.05) -> np.ndarray:
 
 
 def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
-    """Return the complaint that no window of the filter fits into a motion."""
+    """Return the error for a motion shorter than the filter's window."""
     need = len(decimator.taps) / decimator.rate
     message = (
-        f"decimation by {decimator.factor} needs {need:.3g} s without a gap, of {motion_length / decimator.rate:.3g}"
+        f"decimation by {decimator.factor} needs {need:.3g} s without a gap, found {motion_length / decimator.rate:.3g}"
     )
-    return MeasurementError(message + " s there are: raise the band, or record longer")
+    return MeasurementError(message + " s: raise the band, or record longer")
 
 
 ORDER = 4  # of the Butterworth filter, run forwards and backwards (Gautier's choice; the studies' too)
@@ -181,10 +181,10 @@ CURVATURE = {1: (1.0,), 2: (4 / 3, -1 / 12), 3: (3 / 2, -3 / 20, 1 / 90), 4: (8 
 
 
 def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER) -> np.ndarray:
-    """Return `values` (N, ...) through a Butterworth filter run forwards and backwards: no phase shift.
+    """Return `values` (N, ...) low-passed by a Butterworth filter, forwards and backwards (no phase shift).
 
     Gain |H(f)|² = 1 / (1 + (f/f_c)^(2 order)): 1/2 at the cut-off f_c, where one pass has 1/√2. The ends are continued
-    by their odd reflection over 3 rate/f_c samples; some 2/f_c seconds at each end still feel it.
+    by their odd reflection over 3 rate/f_c samples; about 2/f_c seconds at each end are affected.
 
     Args:
         values: with no NaN; a segment without gaps.
@@ -206,10 +206,10 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
 
 
 def _butterworth(order: int, share: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the sections b, a (3,) of a low-pass filter by the bilinear transform, each of gain one at rest.
+    """Return the sections b, a (3,) of a Butterworth low-pass filter by the bilinear transform, each of DC gain 1.
 
     Args:
-        share: of the sampling rate, the cut-off; below one half.
+        share: cut-off as a share of the sampling rate, below one half.
     """
     k, found = np.tan(np.pi * share), []
     for i in range(order // 2):
@@ -222,7 +222,7 @@ def _butterworth(order: int, share: float) -> list[tuple[np.ndarray, np.ndarray]
 
 
 def _filtered(sections: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray) -> np.ndarray:
-    """Return x (N, k) through all sections, which have seen its first value for ever.
+    """Return x (N, k) filtered by all sections; initially they are in steady state at its first value.
 
     The recursion a_0 y_k + a_1 y_{k-1} + a_2 y_{k-2} = … is a triangular system with a band of three: LAPACK's, since
     scipy.signal takes longer to load than a long log to filter.
@@ -237,12 +237,12 @@ def _filtered(sections: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray) -> n
 
 
 def border(rate: float, cutoff: float) -> int:
-    """Return the number of samples at each end that a `low_pass` spoils: 2 rate/f_c, our choice (0.8 % is left)."""
+    """Return the number of samples at each end affected by `low_pass`: 2 rate/f_c, our choice (0.8 % remain)."""
     return int(np.ceil(2 * rate / cutoff))
 
 
 def hann(size: int) -> np.ndarray:
-    """Return Hann's window (size,) for a spectrum: one period, its last zero left out."""
+    """Return the periodic Hann window (size,) for a spectrum."""
     return 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, size + 1)[:-1])
 
 
@@ -265,7 +265,7 @@ def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
 
 
 def moving_cubics(values: np.ndarray, width: int, order: int = 0) -> np.ndarray:
-    """Return `values` (N, n), or a derivative per sample, by the cubic that fits the `width` samples on either side.
+    """Return `values` (N, n), or a derivative per sample, from cubics fitted to `width` samples on either side.
 
     Savitzky and Golay (1964); the first and last `width` rows are on the cubics of the outermost windows.
     """

@@ -1,4 +1,4 @@
-"""From a raw log to what a dynamic model can be compared with: positions filtered, derivatives, torques on one grid.
+"""Motion for identification from a raw recording: filtered positions, derivatives and torques on one even grid.
 
 `Motion` is the only type that carries accelerations, so an unfiltered log cannot reach a regressor. Its torques are as
 recorded (on the even grid): what filters them is the parallel decimation, which filters every column of W alike
@@ -36,18 +36,18 @@ CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
 @strict
 @dataclass(frozen=True)
 class FilterOptions:
-    """How a recording becomes a motion; None: from the data, by Gautier's rules (`calib.data.signals.bandwidth`).
+    """Options of filtering a recording; None: from the data, by Gautier's rules (`calib.data.signals.bandwidth`).
 
     Attributes:
-        cutoff: f_q of the positions' Butterworth filter [Hz]: one, or one per joint.
-        velocity_cutoff: f_v of the positions that velocities come from [Hz], likewise; None: f_q where that is stated,
+        cutoff: cut-off f_q of the positions' Butterworth filter [Hz], one, or one per joint.
+        velocity_cutoff: cut-off f_v of the positions differentiated to velocities [Hz]; None: f_q if that is stated,
             else above it (`Motion`).
-        order: of one pass of it.
-        band: f_p of the parallel decimation [Hz], above which nothing is compared.
-        dynamics: f_dyn, where it is known [Hz].
+        order: of one pass of the Butterworth filter.
+        band: cut-off f_p of the parallel decimation [Hz]; only lower frequencies are compared.
+        dynamics: bandwidth f_dyn of the robot's motion [Hz], if known.
         width: half-width of the central differences (`calib.data.signals.filtering`).
         clock, gap: as in `calib.data.signals.resampling`; gap [s].
-        borders: time left out at both ends of each segment [s].
+        borders: time removed at both ends of each segment [s].
         decimator: ``kaiser`` or ``chebyshev``.
     """
 
@@ -65,7 +65,7 @@ class FilterOptions:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """N samples on an even grid, in segments without gaps.
+    """Filtered motion: N samples on an even grid, in segments without gaps.
 
     Coulomb friction bends the velocity where it changes its sign: the acceleration falls by 2 Fc / M from one side to
     the other. A filter rounds that corner off and moves the zero to later, friction's column lags behind, and Ia, whose
@@ -127,7 +127,7 @@ class Motion:
         return self.q.shape[1]
 
     def in_band(self, values: np.ndarray) -> np.ndarray:
-        """Return `values` (N, ...) below the identification band at the full rate, without phase shift; by segments."""
+        """Return `values` (N, ...) low-passed to the identification band, at the full rate, segment by segment."""
         parts = [
             filtering.low_pass(values[self.segment == i], self.rate, min(self.band, USABLE * self.rate / 2))
             for i in np.unique(self.segment)
@@ -135,11 +135,11 @@ class Motion:
         return np.concatenate(parts)
 
     def standstill(self, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
-        """Return (N,) whether all joints stand: friction is then any value up to Coulomb's, unknown."""
+        """Return the mask (N,) of samples with all joints at rest, where friction is unknown up to Coulomb's value."""
         return np.asarray(~moving(self, slow).any(axis=1))
 
     def velocity_noise(self, cutoff: float | None = None) -> np.ndarray:
-        """Return (n,) the standard deviation of white position noise in the filtered velocities [rad/s or m/s].
+        """Return the standard deviation (n,) of filtered velocities due to white position noise [rad/s or m/s].
 
         With `cutoff` [Hz], in those of positions filtered to less than the motion's.
 
@@ -156,10 +156,10 @@ ROWS = (
 
 
 def make_motion(recording: Recording, options: FilterOptions | None = None, sampled: Resampled | None = None) -> Motion:
-    """Return the motion of a recording: dated, on an even grid, low-passed without phase shift, differentiated.
+    """Return the motion of a recording: resampled to an even grid, low-passed without phase shift, differentiated.
 
     Args:
-        sampled: the recording on its grid, where it is known from before, with the same clock and gap (`sample`).
+        sampled: the recording on its grid if already computed with the same clock and gap (`sample`).
 
     Raises:
         MeasurementError: for a cut-off at or above the Nyquist frequency; for segments that the filters eat up.
@@ -212,17 +212,17 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
 
 
 def sample(recording: Recording, options: FilterOptions) -> Resampled:
-    """Return a recording on its even grid: the part of `make_motion` that no filter changes."""
+    """Return a recording resampled to its even grid, before filtering."""
     return resample(recording, options.clock, options.gap)
 
 
 def with_reference(motion: Motion, path: Path, joints: Joints, options: RecordingOptions) -> Motion:
-    """Return the motion with the reference that the file at `path` holds, at the motion's instants.
+    """Return the motion with the reference positions of the file at `path`, interpolated at its samples.
 
     Both files count time from their first sample.
 
     Raises:
-        MeasurementError: where the file is none, has other joints, or does not span the motion.
+        MeasurementError: if the file is not a reference, has other joints, or does not span the motion.
     """
     with refused_as(MeasurementError, OSError, "cannot be read: {}", path):
         check_regular(path)
@@ -232,19 +232,19 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
     if q.shape[1:] != (motion.n,):
         refuse_data(path, f"has {q.shape[1]} joints, the recording {motion.n}")
     if len(t) < 10 or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
-        refuse_data(path, "a reference needs ten samples or more, numbers throughout and rising stamps")
+        refuse_data(path, "a reference needs ten samples or more, finite numbers and increasing stamps")
     slack = 1.5 * float(np.median(np.diff(t)))
     if motion.t[0] < t[0] - slack or motion.t[-1] > t[-1] + slack:
         message = (
-            f"{len(t)} samples from {t[0]:.6g} s to {t[-1]:.6g} s do not span the recording {motion.file}, which is "
-            f"used from {motion.t[0]:.6g} s to {motion.t[-1]:.6g} s: both count from their first sample"
+            f"{len(t)} samples from {t[0]:.6g} s to {t[-1]:.6g} s do not span the recording {motion.file}, "
+            f"used from {motion.t[0]:.6g} s to {motion.t[-1]:.6g} s: times count from each file's first sample"
         )
         refuse_data(path, message)
     return replace(motion, q_ref=frozen(CubicSpline(t, q)(np.clip(motion.t, t[0], t[-1]))))
 
 
 def thin(motion: Motion) -> Motion:
-    """Return the motion at the samples its decimator keeps: q, v, a as they are there, efforts filtered to the band.
+    """Return the motion at the samples kept by its decimator: q, v, a unchanged, efforts filtered to the band.
 
     W for it is that of the *whole* motion, decimated; building W from the thinned q, v, a would not be parallel.
     """
@@ -263,7 +263,7 @@ def thin(motion: Motion) -> Motion:
 
 
 def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
-    """Return (N, n) whether each joint moves: |v_j| at or above `slow`, a share of its peak or (n,) [rad/s or m/s]."""
+    """Return the mask (N, n) of moving joints: |v_j| ≥ `slow`, a share of the peak, or (n,) [rad/s or m/s]."""
     peak = np.abs(motion.v).max(axis=0)
     threshold = slow * peak if isinstance(slow, (int, float)) else np.asarray(slow, dtype=float)
     noise = 3 * motion.velocity_noise()
@@ -271,7 +271,7 @@ def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> 
 
 
 def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: float) -> np.ndarray:
-    """Return (n,) f_v [Hz]: where noise reaches `max_noise` of a joint's accelerations (N, n); f_q to 5 f_q."""
+    """Return f_v (n,) [Hz], at which noise reaches `max_noise` of the accelerations (N, n); between f_q and 5 f_q."""
     share = cutoffs.acceleration_noise(cutoff, rate) / np.maximum(np.sqrt(np.mean(a**2, axis=0)), 1e-12)
     # noise in the accelerations that velocities of the same cut-off can bear, of their rms (our choice)
     max_noise = 0.1
@@ -280,7 +280,7 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
-    """Return the positions (N, n), each segment low-passed by itself, each joint at its cut-off (n,) [Hz]."""
+    """Return the positions (N, n) low-passed at each joint's cut-off (n,) [Hz], segment by segment."""
     q = sampled.series["q"]
     result = np.empty_like(q)
     for own in _segments(sampled):
@@ -292,12 +292,12 @@ def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
 def _differences(
     of: Callable[[np.ndarray, float, int], np.ndarray], q: np.ndarray, sampled: Resampled, width: int
 ) -> np.ndarray:
-    """Return slopes or curvatures of q (N, n), segment by segment."""
+    """Return slopes or curvatures (N, n) of q (N, n), segment by segment."""
     return np.concatenate([of(q[own], sampled.rate, width) for own in _segments(sampled)])
 
 
 def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
-    """Return the mask (N,) of the samples that the filters' ends do not spoil; at least one, or it is refused."""
+    """Return the mask (N,) of samples not affected by the filters' ends; refuse a motion without any."""
     inside = np.zeros(len(sampled.t), dtype=bool)
     edge = filtering.border(sampled.rate, float(cutoff.min()))
     edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))
@@ -306,7 +306,7 @@ def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file
         inside[own.start + edge : max(own.start + edge, own.stop - edge)] = True
     if not inside.any():
         why = "the filters' ends" if options.borders is None else f"borders = {options.borders:g}"
-        message = f"no part without a gap is longer than {2 * edge / sampled.rate:.3g} s, which {why} take away"
+        message = f"no part without a gap is longer than {2 * edge / sampled.rate:.3g} s, the part removed by {why}"
         refuse_data(file, f"{message}: record longer, or lower the borders")
     return inside
 
@@ -317,7 +317,7 @@ def _segments(sampled: Resampled) -> list[slice]:
 
 
 def _span(mask: np.ndarray) -> np.ndarray | slice:
-    """Return a mask (N,) as a slice where it is one run: slices copy nothing."""
+    """Return a mask (N,), or a slice if its samples are contiguous (slices copy nothing)."""
     first, stop = int(np.argmax(mask)), len(mask) - int(np.argmax(mask[::-1]))
     return slice(first, stop) if mask[first:stop].all() else mask
 
@@ -330,8 +330,8 @@ def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, fil
         message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
         refuse_data(file, message)
     if (factor := filtering.factor_for(rate, options.band)) > len(sampled.t):
-        message = f"an identification band of {options.band:g} Hz keeps one sample of {factor}, of {len(sampled.t)}"
-        refuse_data(file, f"{message} there are: raise the band, or leave it to the data")
+        message = f"a band of {options.band:g} Hz keeps one of {factor} samples; there are only {len(sampled.t)}"
+        refuse_data(file, f"{message}: raise the band, or leave it out")
     return filtering.design_decimator(rate, filtering.factor_for(rate, options.band), options.decimator)
 
 
@@ -343,7 +343,7 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
 
 
 def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
-    """Return in words where the cut-offs come from."""
+    """Return a description of the origin of the cut-offs."""
     stated = {name: value for name in ("cutoff", "band") if (value := getattr(options, name)) is not None}
     lines = [
         f"{name} = {' '.join(f'{one:.4g}' for one in np.atleast_1d(value))} Hz, as stated or as in the training motion"

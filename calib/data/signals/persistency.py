@@ -1,4 +1,4 @@
-"""What a motion can excite, before any model: is it one sine, do joints move together, is it the motion seen before?"""
+"""Persistency of excitation of a motion, without a model: single sines, coupled joints, repeats of a motion."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -18,12 +18,12 @@ MAX_STATES = 20_000  # states of a motion that are compared
 
 @dataclass(frozen=True)
 class ExcitationReport:
-    """How rich the motion of the joints is.
+    """Richness of the motion of the joints.
 
     Attributes:
-        functions: number of independent functions of time that all positions are made of (2 for one sine).
+        functions: number of independent functions of time in all positions (2 for one sine).
         poor: whether the motion is one frequency, or fewer functions of time than half the joints that move.
-        seconds: for which any joint moves [s].
+        seconds: duration with at least one moving joint [s].
         notes: for the user.
     """
 
@@ -34,7 +34,7 @@ class ExcitationReport:
 
 
 def report_excitation(motion: Motion) -> ExcitationReport:
-    """Return what the positions of `motion` say of its richness; its longest segment is looked at.
+    """Return the richness of a motion, from the positions of its longest segment.
 
     One frequency cannot separate inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
     """
@@ -56,20 +56,20 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     if len(moving) and one_frequency:
         low, high = strongest.min(), strongest.max()
         hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
-        notes.append(f"each joint moves at one frequency ({hertz}): inertia and gravity or stiffness look alike")
+        notes.append(f"each joint moves at one frequency ({hertz}): inertia looks like gravity or stiffness")
     correlation = unit.T @ unit
     min_correlation = 0.98  # of two joints that move as one
     pairs = [f"{names[i]}–{names[j]}" for i, j in combinations(moving, 2) if abs(correlation[i, j]) > min_correlation]
     if pairs:
-        notes.append(f"joints that move as one (correlation above {min_correlation:g}): {listing(pairs, 6)}")
+        notes.append(f"joints that move together (correlation above {min_correlation:g}): {listing(pairs, 6)}")
     if len(moving) > 1 and functions < len(moving):
-        notes.append(f"all {len(moving)} moving joints follow {functions} functions of time")
+        notes.append(f"all {len(moving)} moving joints follow only {functions} independent functions of time")
     seconds = float((~motion.standstill()).sum() / motion.rate)
     return ExcitationReport(functions, one_frequency or functions < 0.5 * len(moving), seconds, tuple(notes))
 
 
 def repeats(training: Motion, other: Motion) -> float:
-    """Return the share of `other`'s moving samples whose state the training motion has been in, 0 to 1.
+    """Return the share (0 to 1) of `other`'s moving samples whose state also occurs in the training motion.
 
     A state is (q, v); it was met before where the nearest one of the training motion differs by less than 5 % of that
     motion's spread, in the rms over the coordinates. Neither a shift in time, nor another number of laps, nor another
@@ -98,7 +98,7 @@ def repeats(training: Motion, other: Motion) -> float:
 
 
 def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
-    """Return the part of the variance of a series (N,) that its best sine explains, and the sine's frequency [Hz]."""
+    """Return the share of the variance of a series (N,) explained by its best sine, and the frequency [Hz]."""
     window, size = hann(len(q)), int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
     eighths = int(np.argmax(power)) + np.arange(-16, 17) / 8  # of a step of the transform, about its strongest line
@@ -106,7 +106,7 @@ def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
 
 
 def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
-    """Return the part of the variance of `q` (N,) that one sine of frequency `f` [Hz] and a constant explain."""
+    """Return the share of the variance of `q` (N,) explained by one sine of frequency `f` [Hz] and a constant."""
     thin = max(1, int(rate / (20 * f)), len(q) // MAX_STATES)
     y, angle = q[::thin] - q[::thin].mean(), 2 * np.pi * f * np.arange(0, len(q), thin) / rate
     basis = np.stack([np.ones(len(y)), np.sin(angle), np.cos(angle)], axis=1)

@@ -1,10 +1,10 @@
-"""A log on an even grid: samples dated, short gaps bridged, long ones left open, all of it counted.
+"""Recordings resampled to an even grid: samples are dated, short gaps bridged, long gaps kept, all of it reported.
 
-When were the samples of a log taken? Not always when their stamps say.
+Stamps do not always state when a sample was taken.
 
 A controller samples evenly; a program that logs it wakes up unevenly, misses samples and reads some twice. Stamps put
 on by the logger then move every sample by v·δt, which two derivatives make into false accelerations, and a joint that
-seems noisy is only badly dated. Three clocks are tried, and the one under which the positions are smoothest is taken:
+seems noisy is only badly dated. Three clocks are tried; the one with the smoothest positions is used:
 
 ``stamps``  the stamps as recorded;
 ``even``    one step, samples lost where a stamp is late by whole steps, a slow drift followed;
@@ -36,7 +36,7 @@ APART = 0.01  # share by which the rates of stamps and velocities may differ
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """When the samples of a recording were taken.
+    """Times at which the samples of a recording were taken.
 
     Attributes:
         kind: one of `CLOCKS`.
@@ -56,10 +56,10 @@ class Clock:
 
 
 def find_clock(recording: Recording, kind: str = "auto") -> Clock:
-    """Return the clock `kind`; with ``auto`` the one under which the positions are smoothest.
+    """Return the clock `kind`; with ``auto`` the clock with the smoothest positions.
 
     Raises:
-        UsageError: for a clock that is none, or that this recording does not have.
+        UsageError: for an unknown clock, or one that this recording does not allow.
     """
     require(kind in ("auto", *CLOCKS), f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'", UsageError)
     clocks = {"stamps": (recording.t, np.ones(len(recording), dtype=bool), _step(recording.t))}
@@ -69,7 +69,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     if (counted := _counted_times(recording, kind == "counted")) is not None:
         clocks["counted"], times = counted[:3], counted[3]
     if kind != "auto" and kind not in clocks:
-        raise UsageError(f"clock '{kind}': the samples of {recording.file or 'this recording'} cannot be dated so")
+        raise UsageError(f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}")
     steps = {name: _roughness(recording.q, *clock) for name, clock in clocks.items()}
     rough = {name: value / max(steps["stamps"], 1e-300) for name, value in steps.items()}
     best = min(rough, key=lambda name: rough[name])
@@ -80,7 +80,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
 
 
 def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return even times (N,), all kept, and their step [s]: k T + drift, k counting lost samples; None if not even.
+    """Return even times (N,) k T + drift (k counts lost samples), a mask that keeps all, and T [s]; None if uneven.
 
     `drift_samples`: samples over which a drift of the stamps is followed.
     """
@@ -95,7 +95,7 @@ def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, np
 
 
 def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """Return counted times (N,), the mask of samples not read twice, the step [s], and that by the velocities over that
+    """Return counted times (N,), the mask of samples not read twice, the step [s], and the step by velocities over that
     by the stamps; None if steps are not whole.
 
     Where the robot is too slow to count, a repeated row counts zero, any other one; a wrong count there does little,
@@ -134,7 +134,7 @@ def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.nd
 
 
 def _lost(t: np.ndarray, step: float, late_samples: int = 15) -> np.ndarray:
-    """Return (N - 1,) how many samples are missing in each step: whole steps by which the stamps stay late after it.
+    """Return (N - 1,) how many samples are missing in each step: whole steps by which later stamps stay late.
 
     `late_samples`: samples over which it is judged whether the stamps stay late.
     """
@@ -146,7 +146,7 @@ def _lost(t: np.ndarray, step: float, late_samples: int = 15) -> np.ndarray:
 
 
 def _step(t: np.ndarray) -> float:
-    """Return the step of stamps (N,) [s]: their median, or, where they differ by rounding alone, their mean.
+    """Return the step of stamps (N,) [s]: the median of steps, or their mean if they differ only by rounding.
 
     Rounding errors of a median add up along a grid: a thousandth of a step in half an hour at 1 kHz.
     """
@@ -174,10 +174,10 @@ def _roughness(q: np.ndarray, t: np.ndarray, keep: np.ndarray, period: float, ma
 
 @dataclass(frozen=True)
 class SamplingReport:
-    """What the time stamps of a recording were like.
+    """Quality of a recording's time stamps.
 
     Attributes:
-        clock: which dating was used (`calib.data.signals.resampling`), roughness: what spoke for it.
+        clock: the clock used (`calib.data.signals.resampling`), roughness: relative roughness with each clock.
         rate: of the even grid [Hz].
         jitter: rms and largest distance of the stamps' steps from whole numbers of periods [s].
         repeated: samples read twice, left out.
@@ -198,28 +198,28 @@ class SamplingReport:
     times: float = np.nan
 
     def lines(self) -> list[str]:
-        """Return notes for the user, one finding per line."""
-        lines = [f"{self.rate:.6g} Hz; the stamps' steps jitter by {self.jitter[0] * 1e3:.3g} ms rms"]
+        """Return notes on the sampling for the user, one finding per line."""
+        lines = [f"{self.rate:.6g} Hz; jitter of the stamps: {self.jitter[0] * 1e3:.3g} ms rms"]
         lines[0] += f", {self.jitter[1] * 1e3:.3g} ms at most"
         if self.clock != "stamps":
             share = self.roughness[self.clock]
-            lines.append(f"samples dated {self.clock}, not by their stamps: positions {1 / share:.3g} times smoother")
+            lines.append(f"samples dated {self.clock}, not by stamps: positions {1 / share:.3g} times smoother")
         if self.clock == "counted" and abs(self.times - 1.0) > APART:
-            lines.append(f"a step is {self.times:.4g} times as long by the measured velocities as by the stamps")
+            lines.append(f"step from measured velocities / step from stamps: {self.times:.4g}")
         if self.repeated:
-            lines.append(f"{self.repeated} samples were read twice; the second is left out")
+            lines.append(f"{self.repeated} samples were read twice; the second one is not used")
         if self.lost:
-            lines.append(f"{self.lost} samples are missing one by one or a few at a time; interpolated, with weight 0")
-        lines += [f"gap of {length:.3g} s at {start:.6g} s: split there" for start, length in self.gaps]
+            lines.append(f"{self.lost} samples are missing in short gaps; interpolated with weight 0")
+        lines += [f"gap of {length:.3g} s at {start:.6g} s: recording split" for start, length in self.gaps]
         lines += [
-            f"{length:.3g} s at {start:.6g} s between gaps are too short; left out" for start, length in self.dropped
+            f"{length:.3g} s at {start:.6g} s between gaps: too short, not used" for start, length in self.dropped
         ]
         return lines
 
 
 @dataclass(frozen=True, eq=False)
 class Resampled:
-    """A recording on an even grid.
+    """A recording resampled to an even grid.
 
     Attributes:
         t: (N,) [s]; within a segment in steps of 1/rate.
@@ -258,7 +258,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     min_samples = 50  # samples of a segment that is kept
     used = [(a, b) for a, b in spans if b - a > min_samples and (t[b - 1] - t[a]) / period > min_samples]
     if not used:
-        message = f"falls into {len(spans)} parts by gaps in time, none longer than {min_samples} samples"
+        message = f"has gaps: none of its {len(spans)} parts is longer than {min_samples} samples"
         refuse_data(recording.file, message)
     grids = [t[a] + period * np.arange(int((t[b - 1] - t[a]) / period + 1e-6) + 1) for a, b in used]
     weight = [_weight(t[a:b], grid, found.period) for (a, b), grid in zip(used, grids)]
@@ -290,7 +290,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
 
 
 def _interpolate(values: np.ndarray, t: np.ndarray, used: list[tuple[int, int]], grids: list[np.ndarray]) -> np.ndarray:
-    """Return `values` (N, n) on the grids; joint by joint, so that an hour at 1 kHz needs 0.2 GB beside the result."""
+    """Return `values` (N, n) interpolated on the grids, joint by joint (1 h at 1 kHz: 0.2 GB besides the result)."""
     on_grid = [_on_grid(t[a:b], grid) for (a, b), grid in zip(used, grids)]
     if used == [(0, len(values))] and on_grid[0]:
         return settled(values)
@@ -308,12 +308,12 @@ def _interpolate(values: np.ndarray, t: np.ndarray, used: list[tuple[int, int]],
 
 
 def _on_grid(t: np.ndarray, grid: np.ndarray) -> bool:
-    """Return whether the samples lie on the grid as they are."""
+    """Return whether the sample times equal the grid."""
     return len(t) == len(grid) and bool(np.abs(grid - t).max() < 1e-6 * (grid[1] - grid[0]))
 
 
 def _weight(t: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
-    """Return 1 where a sample lies within 0.75 periods of the grid's time, else 0."""
+    """Return the weight of each grid time: 1 if a sample is within 0.75 periods, else 0."""
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     distance = np.minimum(np.abs(grid - t[after - 1]), np.abs(t[after] - grid))
     return (distance < 0.75 * period).astype(float)

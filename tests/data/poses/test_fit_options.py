@@ -51,7 +51,7 @@ def test_a_files_table_adds_to_what_holds_for_every_file():
     assert options.for_file("/data/a/day3.csv").tool == "T" and options.for_file("/data/day3.csv").tool == "tool"
     assert options.for_file("/data/day1.csv").kind == "position"
     check_files(options, ["/data/day2.csv", "a/day3.csv"])
-    with pytest.raises(UsageError, match=r'files."day2.csv" is none of the files given .did you mean .day_2.csv'):
+    with pytest.raises(UsageError, match=r'files."day2.csv" is not among the files given .did you mean .day_2.csv'):
         check_files(options, ["day_2.csv", "a/day3.csv"])
 
 
@@ -74,8 +74,8 @@ def test_a_files_table_adds_to_what_holds_for_every_file():
         ({"socket_pairs": ["0", "1"]}, "pairs of socket labels"),
         ({"check_limits": 0}, "check_limits: expected true or false, found 0"),
         ({"fix": "theta1"}, "fix: expected a list of names"),
-        ({"fix": ["d3"], "free": ["d3"]}, "'d3' stands in fix and in free"),
-        ({"free": []}, "free: names no parameter; leave the key out to free all"),
+        ({"fix": ["d3"], "free": ["d3"]}, "'d3' is in fix and in free"),
+        ({"free": []}, "free: the list is empty; remove the key to free all parameters"),
         ({"prior": {"d3": 1e-300}}, "prior.d3: expected a number, at least 1e-12"),
         ({"prior": {"d3": 0}}, "prior.d3: expected a number above 0"),
         ({"where": {"day": True}}, "where.day: expected a text or a number"),

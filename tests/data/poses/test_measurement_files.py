@@ -78,7 +78,7 @@ def test_measured_columns_with_a_suffix_are_taken_and_said(write, good, suffix):
 @pytest.mark.parametrize("names", [("x", "y", "z"), ("x_meas", "y_meas", "z_meas")])
 def test_commanded_beside_measured_positions_are_refused_until_the_options_say_which(write, good, names):
     path = write("q1,q2,q3,x,y,z,x_meas,y_meas,z_meas", [[*row[:6], 9, 9, 9] for row in good])
-    with pytest.raises(MeasurementError, match=r'which of them.*\[columns\] x = "x_meas"'):
+    with pytest.raises(MeasurementError, match=r'map the columns.*\[columns\] x = "x_meas"'):
         read(path)
     block = read(path, FileOptions(columns=dict(zip("xyz", names))))
     expected = np.array(good, dtype=float)[:, 3:6] if names[0] == "x" else np.full((len(good), 3), 9.0)
@@ -107,7 +107,7 @@ def test_a_plain_orientation_beside_measured_positions_is_refused_until_it_is_ma
     turned = [[*row[6:]] if "r11" not in names else [*matrix] for row, matrix in zip(good, matrices)]
     count = len(names) - len(turned[0])
     path = write(f"q1,q2,q3,{header}", [[*row[:6], *row[3:6]][: 3 + count] + turn for row, turn in zip(good, turned)])
-    with pytest.raises(MeasurementError, match=f'what was commanded.*{plain[0]} = "{plain[0]}"') as told:
+    with pytest.raises(MeasurementError, match=f'measured or commanded.*{plain[0]} = "{plain[0]}"') as told:
         read(path, FileOptions(columns=mapped))
     assert ('kind = "position"' in str(told.value)) == (plain != POSITIONS)
     block = read(path, FileOptions(columns={**mapped, **{name: name for name in plain}}))
@@ -124,11 +124,11 @@ def test_a_map_of_some_columns_is_completed_by_those_that_go_with_them(write, go
 @pytest.mark.parametrize(
     "header, columns, said",
     [
-        ("x_meas,y_meas,z_meas", {"x": "z_meas"}, "is read twice"),
+        ("x_meas,y_meas,z_meas", {"x": "z_meas"}, "is read as two different columns"),
         ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be it"),
-        ("a,b,height", {"x": "a", "y": "b"}, "map it, too"),
-        ("x,y,z,qx_meas", {"qx": "qx_meas"}, "map it, too"),
-        ("x,y,z,std", {"sigma_distance": "std"}, "nothing reads it in a file of kind 'position'"),
+        ("a,b,height", {"x": "a", "y": "b"}, "map this one"),
+        ("x,y,z,qx_meas", {"qx": "qx_meas"}, "map this one"),
+        ("x,y,z,std", {"sigma_distance": "std"}, "not read in a file of kind 'position'"),
     ],
 )
 def test_a_map_that_cannot_be_followed_is_refused(write, good, header, columns, said):
@@ -272,7 +272,7 @@ def test_a_little_beyond_a_limit_is_a_note(write, good):
 
 def test_radians_under_a_degree_header_are_noted(write, good):
     block = read(write(POSE.replace("q1,q2,q3", "q1 [deg],q2 [deg],q3 [deg]"), good))
-    assert any("really degrees" in note for note in block.notes)
+    assert any("radians instead of degrees" in note for note in block.notes)
 
 
 def test_a_multi_turn_joint_passes_within_its_limits(write, good):

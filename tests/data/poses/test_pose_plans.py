@@ -66,14 +66,14 @@ def test_several_targets_of_one_row_count_once(plan):
     [
         (lambda q: np.rad2deg(q), "the values are degrees", "q1"),
         (lambda q: np.deg2rad(q), "the values are radians converted from degrees", "q1"),
-        (lambda q: q[:, [0, 2, 1, 3]], "columns are swapped .q3 holds joint 2, q2 holds joint 3.", "q3"),
+        (lambda q: q[:, [0, 2, 1, 3]], "columns are swapped .q3 contains joint 2, q2 contains joint 3.", "q3"),
         (lambda q: q * [1, 1, -1, 1], "the sign is reversed .q3.", "q1"),
         (lambda q: np.rad2deg(q[:, [0, 2, 1, 3]]), "the values are degrees and columns are swapped", "q3"),
     ],
 )
 def test_the_cause_is_found(plan, spoil, words, column):
     partly = plan[np.random.default_rng(1).permutation(40)[:33]]
-    with pytest.raises(MeasurementError, match=f"fit the plan if.*{words}") as error:
+    with pytest.raises(MeasurementError, match=f"agree with the plan if.*{words}") as error:
         check_against(plan, measured(spoil(partly)))
     assert error.value.file == "m.csv" and error.value.column == column
 

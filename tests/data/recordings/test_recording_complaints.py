@@ -51,12 +51,12 @@ def test_a_unit_that_a_joint_does_not_have_is_refused(tmp_path):
 def test_a_file_that_is_no_recording_is_told_why(tmp_path):
     series = falling(True)
     np.savez(tmp_path / "log.npz", **{key: value[::-1] for key, value in series.items() if key != "t"}, t=-series["t"])
-    with pytest.raises(MeasurementError, match="backwards in every row: turn the rows around"):
+    with pytest.raises(MeasurementError, match="backwards in every row: reverse the order"):
         read_recording(tmp_path / "log.npz")
     (tmp_path / "text.npz").write_text("hello\n")
-    with pytest.raises(MeasurementError, match="no NumPy archive, whatever its name says"):
+    with pytest.raises(MeasurementError, match="not a NumPy archive despite its name"):
         read_recording(tmp_path / "text.npz")
-    with pytest.raises(MeasurementError, match=r"a cut is written log\.npz@0:9\.4"):
+    with pytest.raises(MeasurementError, match=r"write a cut as log\.npz@0:9\.4"):
         read_recording(tmp_path / "log.npz@abc")
 
 

@@ -232,7 +232,7 @@ def test_joint_limits_are_kept(cell, fitted, here, calib):
         ("x,y,z\n500,200,300\n", "name the column 'x [mm]'"),
         ("x,y\n0.5,0.2\n", "column 'z'"),
         ("a,b,c\n1,2,3\n", "no targets found"),
-        ("qx,qy,qz,qw\n0,0,0,1\n", "an orientation alone"),
+        ("qx,qy,qz,qw\n0,0,0,1\n", "a target needs a position"),
         ("x,y,z,qx,qy,qz,qw\n0.4,0.1,0.3,0,0,0,2\n", "norm 2"),
         ("q1,q2,q3,q4,q5\n0,0,0,0,0\n", "column 'q6'"),
     ],
