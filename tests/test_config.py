@@ -167,7 +167,7 @@ def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
         ({"gains": [10, 1111111111111111111111111]}, None),
         ({"gains": [10, 0]}, "gains: expected finite numbers other than zero"),
         ({"filter": {"order": 2.0}}, "filter.order: expected a whole number from 1 to 12, found 2.0"),
-        ({"recording": {"names": {"torqe": "x"}}}, "names: 'torqe' is none of our names .did you mean 'torque'"),
+        ({"recording": {"names": {"torqe": "x"}}}, "names: 'torqe' is not a known name .did you mean 'torque'"),
         ({"recording": {"rows": "both"}}, "recording: there is no key 'rows'"),
         ({"term": [{"name": "x", "shape": "sine"}]}, r"\[\[term\]\] number 1: there is no 'joint'; needed are name"),
         ({"term": {"name": "x"}}, r"expected a list of tables, \[\[term\]\]"),

@@ -1,4 +1,4 @@
-"""The calibrated robot as it travels from the geometric fit to the dynamics, and its tables in the folder of a fit.
+"""Calibrated robot: the result of a geometric fit as used by all later steps, and its files in the fit's folder.
 
 ``robot.toml`` holds the chain (`calib.robot.description`) and beside it::
 
@@ -15,10 +15,10 @@
     order = 2                        # k of sin and cos; axis of a lever (0 x, 1 y, 2 z)
     coefficient = 1.2e-5
 
-``chain_covariance.csv`` beside it: the covariance [m, rad] of the element values of the best geometry without
-corrections (``provenance.rigid``, where there are any), by name; elements that are not in it were not fitted.
+``chain_covariance.csv`` next to it: the covariance [m, rad] of the element values of the best geometry without
+corrections (``provenance.rigid``, if present), by name; elements that are not in it were not fitted.
 
-Deflections, what the joint angles do not say: compliance under gravity, coupled axes, encoder and gear errors.
+Deflections are effects beyond the joint angles: compliance under gravity, coupled axes, encoder and gear errors.
 
 Every effect is linear in its coefficients and adds to the displacement of one element of the chain:
 
@@ -54,7 +54,7 @@ BASES = ("torque", "lever", "joint", "cos", "sin")
 
 @dataclass(frozen=True)
 class Term:
-    """One effect: element name it moves, basis, joint or link it comes from (index), order k (or axis of a lever)."""
+    """One deflection effect: name of the moved element, basis, index of the source joint or link, order k (or axis)."""
 
     element: str
     basis: str
@@ -67,7 +67,7 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
-    """Terms with their coefficients (E,); ``torque`` (m, n) comes with the poses where a term needs it.
+    """Deflection terms with their coefficients (E,); gravity torques (m, n) are given with the poses if needed.
 
     Attributes:
         terms: the E effects.
@@ -100,7 +100,7 @@ def _name(term: Term, chain: Chain) -> str:
 
 
 def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
-    """Return the bases b of every term at joint values q (m, n): (E, m).
+    """Return the bases b (E, m) of all terms at joint values q (m, n).
 
     Args:
         deflection: the terms, with their reference chain.
@@ -115,7 +115,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     for e, term in enumerate(deflection.terms):
         if term.basis == "torque":
             if torque is None:
-                raise CalibError("a compliance needs gravity torques: give the robot masses, or ask for fitted ones")
+                raise CalibError("a compliance needs gravity torques: state the robot's masses, or have them fitted")
             result[e] = torque[:, term.source]
         elif term.basis == "joint":
             result[e] = q[:, term.source]
@@ -134,7 +134,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
 def extra_displacements(
     chain: Chain, deflection: Deflection, q: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray | None:
-    """Return what the deflection adds to each element's displacement, (K, m); None without terms."""
+    """Return the displacement (K, m) that the deflection adds to each element; None without terms."""
     if not deflection.terms:
         return None
     bases = evaluate(deflection, q) if bases is None else bases
@@ -146,7 +146,7 @@ def extra_displacements(
 
 
 def target_elements(chain: Chain, deflection: Deflection) -> np.ndarray:
-    """Return the index of the element each term moves, (E,)."""
+    """Return the indices (E,) of the elements moved by the terms."""
     table = {name: k for k, name in enumerate(chain.names)}
     return np.array([table[term.element] for term in deflection.terms], dtype=int)
 
@@ -156,7 +156,7 @@ ROBOT, COVARIANCE = "robot.toml", "chain_covariance.csv"
 
 @dataclass(frozen=True, eq=False)
 class CorrectedChain:
-    """A geometry with the joint corrections that belong to it; without them it is worse than the best rigid one.
+    """Geometry fitted together with joint corrections; without them it is worse than the best rigid geometry.
 
     Attributes:
         chain: the geometry.
@@ -169,17 +169,17 @@ class CorrectedChain:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibratedChain:
-    """A robot as the geometric fit leaves it, and as identification, excitation, export and compensation take it.
+    """Robot resulting from a geometric fit: input of identification, excitation, export and compensation.
 
-    ``print`` shows its joints and how they are limited.
+    ``print`` shows its joints and their limits.
 
     Attributes:
-        chain: the best geometry that does without joint corrections: what a URDF holds and dynamics are identified on.
-        nominal: the arm before calibration; None where nothing says which that was.
-        covariance: (K, K) of the chain's element values [m, rad], zero where an element was not fitted; None where no
-            fit has left one.
-        corrections: the geometry that joint corrections belong to, and those; None without any.
-        source: the description that was calibrated, as its user named it; empty where unknown.
+        chain: the best geometry without joint corrections, for URDF export and identification of dynamics.
+        nominal: the arm before calibration; None if unknown.
+        covariance: (K, K) of the chain's element values [m, rad], zero if an element was not fitted; None without a
+            fit.
+        corrections: joint corrections and the geometry fitted with them; None without any.
+        source: the calibrated robot description, as named by the user; empty if unknown.
     """
 
     chain: Chain
@@ -196,12 +196,12 @@ class CalibratedChain:
 
     @property
     def complete(self) -> Chain:
-        """The geometry that predicts best: with corrections the one they belong to, otherwise `chain`."""
+        """Geometry with the best prediction: the one fitted with the corrections if any, otherwise `chain`."""
         return self.chain if self.corrections is None else self.corrections.chain
 
     @property
     def deflection(self) -> Deflection:
-        """The joint corrections, without terms where there are none."""
+        """Joint corrections of the robot; without terms if it has none."""
         return Deflection() if self.corrections is None else self.corrections.deflection
 
     def __repr__(self) -> str:
@@ -224,13 +224,13 @@ class CalibratedChain:
 
     @property
     def moved(self) -> bool:
-        """Whether calibration changed an element's value of a nominal arm that is known."""
+        """Whether the nominal arm is known and calibration changed one of its elements."""
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
 
     def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> np.ndarray:
         """Return the tip's poses (m, 4, 4) [m] in the base frame at joint values q (m, n) [rad or m].
 
-        With joint corrections the geometry is the one they belong to, and they act.
+        With joint corrections, the geometry fitted with them is used and they are applied.
 
         Args:
             q: joint values, those of one pose (n,) as well.
@@ -253,12 +253,12 @@ class CalibratedChain:
         return tip_jacobian(self.complete, values)
 
     def without_corrections(self) -> CalibratedChain:
-        """Return the robot without its joint corrections, of which torques know nothing and which no URDF holds."""
+        """Return the robot without its joint corrections, which torques and URDFs ignore."""
         return replace(self, corrections=None)
 
 
 def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:
-    """Return a calibrated robot as it is, and a plain chain as a robot without covariance and nominal geometry."""
+    """Return a calibrated robot unchanged, and a plain chain as a robot without covariance and nominal geometry."""
     return robot if isinstance(robot, CalibratedChain) else CalibratedChain(robot)
 
 
@@ -272,7 +272,7 @@ def read(path: str | Path) -> CalibratedChain:
 
 
 def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
-    """Return what `read` does, and the tables beside the robot (`calib.robot.description.EXTRA`)."""
+    """Return the calibrated robot, as `read`, and the extra tables of its file (`calib.robot.description.EXTRA`)."""
     path = Path(path) / ROBOT if Path(path).is_dir() else Path(path)
     complete, extra = description.read_whole(path)
     where = str(path)
@@ -299,7 +299,7 @@ def write(
     record: Mapping[str, Any] | None = None,
     comment: str = "",
 ) -> None:
-    """Write ``robot.toml`` and, where there is one, ``chain_covariance.csv``, so that `read` returns the same robot.
+    """Write ``robot.toml`` and the covariance (``chain_covariance.csv``), so that `read` returns the same robot.
 
     Args:
         folder: that exists.
@@ -324,20 +324,18 @@ def write(
 
 
 def nominal_of(robot: CalibratedChain) -> Chain:
-    """Return the arm before calibration.
+    """Return the nominal chain of a calibrated robot.
 
     Raises:
-        RobotError: where nothing says which that was.
+        RobotError: if it is unknown.
     """
     if robot.nominal is None:
-        raise RobotError(
-            f"robot '{robot.chain.name}' does not say which nominal robot it was calibrated from; fit again"
-        )
+        raise RobotError(f"the nominal robot of '{robot.chain.name}' is unknown; fit again")
     return robot.nominal
 
 
 def _covariance(path: Path, chain: Chain) -> np.ndarray | None:
-    """Return the covariance (K, K) of the element values in a table by name; None where there is none."""
+    """Return the covariance (K, K) of all element values from a table by name; None without that file."""
     if not path.is_file():
         return None
     names, values = read_covariance(path)
@@ -373,7 +371,7 @@ def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
         for key, known in (("element", chain.names), ("joint", chain.joint_names)):
             if entry.get(key) not in known:
-                refuse_robot(where, f"{key} {entry.get(key)!r} is none of the robot's")
+                refuse_robot(where, f"{key} {entry.get(key)!r} does not exist in the robot")
         source = chain.joint_names.index(entry["joint"])
         terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
         coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))

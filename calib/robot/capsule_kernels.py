@@ -1,6 +1,6 @@
-"""Which postures keep an arm of capsules clear, compiled (numba): one posture after the other, ended by the first pair.
+"""Collision test of an arm of capsules, compiled (numba): posture by posture, ended by the first pair in collision.
 
-A search for ways asks of a few postures at a time, thousands of times: there NumPy's calls cost more than the numbers.
+Path search tests a few postures at a time, thousands of times: NumPy's calls would cost more than the numbers.
 
     form      (K, 5): axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint (-1: it does not move)
     place     (K + 1, 12): rotation by rows and origin before each element; row K the tail
@@ -19,7 +19,7 @@ OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @njit(**OPTIONS)
 def clear(q, form, place, stand, targets, own, radii, faces, margin):
-    """Return (m,) whether all distances between `own` and to `faces` are above `margin` [m] at joint values q (m, n).
+    """Return the mask (m,) of joint values q (m, n) with all distances of `own` pairs and `faces` above `margin` [m].
 
     Args:
         stand: height of the foot of the base's capsule [m].
@@ -50,7 +50,7 @@ def clear(q, form, place, stand, targets, own, radii, faces, margin):
 
 @njit(**OPTIONS)
 def _lines(q, form, place, stand, targets, lines):
-    """Write the capsules' lines: of the base, of each moving body, of each target."""
+    """Write the lines of all capsules (base, moving bodies, targets) into `lines`."""
     r, x, turned = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
     r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     lines[0] = 0.0
@@ -97,14 +97,14 @@ def _lines(q, form, place, stand, targets, lines):
 
 @njit(**OPTIONS)
 def _put(x, lines, row, first):
-    """Write x (3,) into a row from column `first` on; numba takes seconds to compile an assignment to a slice."""
+    """Write x (3,) into a row of `lines`, starting at column `first` (numba compiles slices slowly)."""
     for a in range(3):
         lines[row, first + a] = x[a]
 
 
 @njit(**OPTIONS)
 def _apart(one, two):
-    """Return the distance of two lines (6,) from a point to another (Ericson 2005, 5.1.9)."""
+    """Return the distance of two line segments (6,), given by start and end (Ericson 2005, 5.1.9)."""
     uu = vv = uv = uw = vw = 0.0
     for a in range(3):
         u, v, w = one[3 + a] - one[a], two[3 + a] - two[a], one[a] - two[a]

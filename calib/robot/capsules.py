@@ -1,4 +1,4 @@
-"""Distances between the links of an arm as capsules, floor and obstacles: batches of poses, no loop over them.
+"""Distances between an arm of capsules, the floor and obstacles, in batches of poses without a loop.
 
 Each body is a capsule along the line from its joint's frame to the next one, the last one's to the tip, and each target
 that it carries a thin one from the tip to the target: coarse where links bend away from these lines. Distances between
@@ -31,11 +31,11 @@ _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """A fixed thing in the arm's base frame.
+    """Fixed obstacle in the arm's base frame: box, sphere or cylinder.
 
     Attributes:
         kind: "box" (size: three edges), "sphere" (radius) or "cylinder" (radius, length along its z) [m].
-        placement: (4, 4), where its middle is.
+        placement: (4, 4), pose of its centre.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         if self.kind not in SIZES:
-            refuse_robot(f"obstacle '{self.name}'", f"kind '{self.kind}' is none of {', '.join(SIZES)}")
+            refuse_robot(f"obstacle '{self.name}'", f"kind '{self.kind}' is not one of {', '.join(SIZES)}")
         count = SIZES[self.kind]
         if len(self.size) != count or min(self.size) <= 0:
             refuse_robot(f"obstacle '{self.name}'", f"a {self.kind} has {count} positive sizes, not {tuple(self.size)}")
@@ -53,7 +53,7 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A half-space: what the arm keeps normal · x ≥ offset of, normal (3,) a unit vector in its base frame."""
+    """Half-space allowed for the arm: normal · x ≥ offset, with a unit normal (3,) in the base frame."""
 
     name: str
     normal: np.ndarray
@@ -88,7 +88,7 @@ def _seen_from(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
 
 
 def _beyond(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
-    """Return how far points (..., 3) in its own frame are beyond the faces (..., k) of a box or a cylinder."""
+    """Return the signed distances (..., k) of points (..., 3) in the obstacle's frame from its faces."""
     if obstacle.kind == "box":
         return np.abs(local) - np.array(obstacle.size) / 2
     across = np.linalg.norm(local[..., :2], axis=-1)
@@ -96,7 +96,7 @@ def _beyond(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
 
 
 def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
-    """Return `signed_distance` without its normals, in a third of the time."""
+    """Return the signed distances (...) [m] without normals, in a third of the time."""
     local = _seen_from(obstacle, points)
     if obstacle.kind == "sphere":
         return np.linalg.norm(local, axis=-1) - obstacle.size[0]
@@ -106,7 +106,7 @@ def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
 
 
 def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return where (...), from 0 to 1, the lines from start to end (..., 3) are nearest to an obstacle."""
+    """Return the positions (...) from 0 to 1 on lines from start to end (..., 3) that are nearest to an obstacle."""
     low, high = np.zeros(start.shape[:-1]), np.ones(start.shape[:-1])
     along = end - start
 
@@ -127,7 +127,7 @@ def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> 
 
 
 def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: float = 0.0) -> np.ndarray:
-    """Return (pairs,) which shapes touch in nearly every posture, by their distances (N, pairs) [m] in random ones.
+    """Return the mask (pairs,) of pairs that touch in nearly every posture, from distances (N, pairs) [m] in N.
 
     Parts of an arm: those nearer than `margin` in at least 95 % of the postures (MoveIt's setup assistant: that touch),
     or never further apart than margin + slack: neighbours, whose shapes overlap by construction. Against what stands
@@ -148,7 +148,7 @@ def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: 
 def check_reachable(
     pairs: Sequence[tuple[str, str]], distances: np.ndarray, fixed: np.ndarray, slack: float = 0.0
 ) -> None:
-    """Refuse a floor or an obstacle that a link never leaves: a size or a place is wrong, no pose would be found.
+    """Refuse a floor or obstacle in permanent collision with a link (wrong size or place).
 
     A link at a distance that no joint changes, the turret of an arm, may touch what it stands on: by as much as shapes
     this coarse cannot tell.
@@ -169,16 +169,16 @@ def check_reachable(
         return
     shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)
     raise RobotError(
-        f"in each of {len(distances)} random postures there is {shown}: nothing keeps clear of that. Sizes and "
-        "places are in m (or say \"20 mm\"), in the arm's base frame, which may lie above the floor; an obstacle's xyz "
-        "is its middle; where capsules stand for the links, [collision] radius may be too large"
+        f"in all of {len(distances)} random postures {shown} collide: no pose is free of collision. Sizes and "
+        "places are in m (or write \"20 mm\"), in the arm's base frame, maybe above the floor; an obstacle's xyz "
+        "is its centre; if links are modelled by capsules, [collision] radius may be too large"
     )
 
 
 MIN_RADIUS, RADIUS_SHARE = 0.05, 0.05
-"""Radius of a capsule where none is stated: this share of the stretched arm, and no less than [m]. Our choice."""
+"""Default radius of capsules: at least [m], and this share of the stretched arm's length. Our choice."""
 TARGET_RADIUS = 0.02
-"""Radius of a target and its stem [m]: a reflector of 1.5 inch is 0.019. Our choice."""
+"""Radius of a target and its stem [m]; a 1.5 inch reflector has 0.019. Our choice."""
 
 
 def usual_radius(chain: Chain) -> float:
@@ -188,7 +188,7 @@ def usual_radius(chain: Chain) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """The middle lines of the capsules in m poses.
+    """Centre lines of the capsules in m poses.
 
     Attributes:
         start, end: (m, C, 3) [m].
@@ -203,17 +203,17 @@ class _Lines:
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """An arm of capsules and what it is held against; the same methods as `calib.robot.collision.Collision`.
+    """Arm of capsules with walls and obstacles; same methods as `calib.robot.collision.Collision`.
 
     Attributes:
         chain: the arm.
         names: (C,) of the capsules.
-        bodies: (C,) how many moving elements stand before each: 0 is the fixed base.
+        bodies: (C,) number of moving elements before each; 0 is the fixed base.
         radii: (C,) [m].
-        solid: (S,) which of the capsules have a length; the others are no bodies.
+        solid: (S,) capsules with a length; the others are ignored.
         targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
-        own: (P, 2) which capsules are compared with each other.
-        world: (W, 2) which capsules with which of walls and obstacles, walls first.
+        own: (P, 2) pairs of capsules to compare.
+        world: (W, 2) pairs of capsule and wall or obstacle (walls first) to compare.
         walls: the floor among them.
         obstacles: in the base frame.
         excluded: pairs that are not compared, since they touch in nearly every posture.
@@ -234,13 +234,13 @@ class Capsules:
 
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of what is compared, in the order of the columns of `distances`."""
+        """Names of the compared pairs, in the order of the columns of `distances`."""
         things = [one.name for one in (*self.walls, *self.obstacles)]
         own = [(self.names[i], self.names[j]) for i, j in self.own]
         return (*own, *((self.names[i], things[k]) for i, k in self.world))
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, pairs) [m] at joint values q (m, n); negative is the depth of a penetration."""
+        """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
         return self._measured(self._lines(q))[0]
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
@@ -254,7 +254,7 @@ class Capsules:
         return slope
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Return (m,) whether all distances are larger than `margin` [m] at joint values q (m, n)."""
+        """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
         from calib.robot.capsule_kernels import clear  # numba
 
         q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
@@ -270,7 +270,7 @@ class Capsules:
 
     @cached_property
     def _compiled(self) -> tuple[Any, Any, float, Any, Any, Any, Any]:
-        """What `calib.robot.capsule_kernels.clear` takes between the joint values and the margin."""
+        """Arguments of `calib.robot.capsule_kernels.clear` between q and margin."""
         form = [
             (AXES.index(e.axis), e.sign, e.value, e.ratio, -1.0 if e.joint is None else e.joint)
             for e in self.chain.elements
@@ -289,17 +289,17 @@ class Capsules:
 
     @cached_property
     def _beside(self) -> Capsules | None:
-        """The comparison with the obstacles alone; None where there are none."""
+        """The same arm compared with the obstacles only; None without obstacles."""
         world = self.world[self.world[:, 1] >= len(self.walls)]
         return replace(self, own=self.own[:0], world=world) if len(world) else None
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the links' distances from lines of sight to a target on the last body.
+        """Return the links' distances from lines of sight to a target on the last body, with their derivatives.
 
         Args:
             q: (m, n).
-            start: (m, 3) where the target is [m], and slope: (m, 3, n) its velocity per joint's.
-            end: (3,) where the instrument stands [m], in the base frame; or (m, 3).
+            start: (m, 3) position of the target [m], and slope: (m, 3, n) its derivative by the joint values.
+            end: (3,) or (m, 3), position of the instrument in the base frame [m].
 
         Returns:
             Distances (m, L) [m] of the L capsules of all other bodies, and their derivatives (m, L, n).
@@ -358,7 +358,7 @@ class Capsules:
 def closing(
     chain: Chain, axes: np.ndarray, places: np.ndarray, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray
 ) -> np.ndarray:
-    """Return normal · velocity (m, P, n) of points (m, P, 3) on bodies (P,), per unit of each joint.
+    """Return the speed along the normals (m, P, n) of points (m, P, 3) on bodies (P,), per unit of each joint.
 
     Args:
         axes, places: (m, K, 3) of the K moving elements: direction, and where they stand.
@@ -383,7 +383,7 @@ def from_chain(
     within: bool = True,
     seed: int = 0,
 ) -> Capsules:
-    """Build the comparison from capsules along the lines from each joint frame to the next.
+    """Return the collision model of an arm with capsules from each joint frame to the next.
 
     Bodies whose frame and the next one coincide (in a spherical wrist) have no capsule.
 
@@ -431,7 +431,7 @@ def from_chain(
 
 
 def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray) -> _Lines:
-    """Return the lines of base (from what it stands on), moving bodies and targets."""
+    """Return the centre lines of base (from its foot), moving bodies and targets at joint values q (m, n)."""
     walked = sweep(chain, q)
     axes, places = (part[chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
     begins = places.copy()
@@ -446,7 +446,7 @@ def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray) -> _Lines:
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where (...), from 0 to 1, the lines a to b and c to d (..., 3) are nearest to each other."""
+    """Return the nearest positions (...), from 0 to 1, on the lines a to b and c to d (..., 3)."""
     u, v, w = b - a, d - c, a - c
     uu, vv, uv = (np.maximum((x * y).sum(-1), least) for x, y, least in ((u, u, 1e-18), (v, v, 1e-18), (u, v, -np.inf)))
     uw, vw = (u * w).sum(-1), (v * w).sum(-1)

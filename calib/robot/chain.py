@@ -1,4 +1,4 @@
-"""What a robot is to this toolkit: a chain of elementary transforms, the same for an MDH table and for a URDF.
+"""Robot model of this toolkit: a chain of elementary transforms, from an MDH table or a URDF.
 
     T(q) = Π_k  placement_k · exp(sign_k · axis_k · (value_k + ratio_k · q_{joint_k})) · tail
 
@@ -23,14 +23,14 @@ MIN_LIMIT = 1e-6  # of a speed or effort that a description states [SI]; less is
 
 
 def check_gravity(gravity: np.ndarray, place: str = "") -> None:
-    """Refuse a gravity vector (3,) [m/s²] that no robot stands under; `place` begins the message.
+    """Refuse a gravity vector (3,) [m/s²] that is not plausible; `place` begins the message.
 
     Raises:
         RobotError: for one beyond `max_gravity`, or not finite.
     """
     max_gravity = 100.0  # [m/s²] (our choice)
     if not math.hypot(*gravity) < max_gravity:
-        raise RobotError(f"{place}gravity {gravity.tolist()} is none: expected m/s², some 9.81 in all")
+        raise RobotError(f"{place}gravity {gravity.tolist()} is not plausible: expected about 9.81 m/s²")
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Joint:
             refuse_robot(f"joint '{self.name}'", f"lower limit {self.lower:g} is not below the upper {self.upper:g}")
         for what in ("velocity", "effort"):
             if not getattr(self, what) >= 0.0:
-                refuse_robot(f"joint '{self.name}'", f"{what} {getattr(self, what):g} is no limit: expected 0 or more")
+                refuse_robot(f"joint '{self.name}'", f"{what} {getattr(self, what):g} is wrong: expected 0 or more")
             if getattr(self, what) < MIN_LIMIT:
                 object.__setattr__(self, "unstated", (*self.unstated, f"{what} {getattr(self, what):g}"))
                 object.__setattr__(self, what, np.inf)
@@ -66,7 +66,7 @@ class Joint:
 
     @property
     def unlimited(self) -> bool:
-        """Whether it turns without end."""
+        """Whether the joint is revolute without limits."""
         return self.kind == "revolute" and not np.isfinite([self.lower, self.upper]).any()
 
 
@@ -96,7 +96,7 @@ class Element:
 
     def __post_init__(self) -> None:
         if self.axis not in AXES:
-            refuse_robot(f"element '{self.name}'", f"axis '{self.axis}' is none of {', '.join(AXES)}")
+            refuse_robot(f"element '{self.name}'", f"axis '{self.axis}' is not one of {', '.join(AXES)}")
         require(np.isfinite(self.value), f"element '{self.name}': value {self.value} is not finite", RobotError)
         if self.placement is not None:
             object.__setattr__(self, "placement", frozen(self.placement))
@@ -108,18 +108,18 @@ class Element:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A serial arm from ``base`` to ``tip``, without the instrument and without the tool.
+    """Serial arm from ``base`` to ``tip``, without instrument and tool.
 
     Attributes:
         joints: the n actuated joints, in the order of q.
         elements: the K elementary transforms, base to tip.
-        tail: (4, 4), what follows the last element.
-        inertias: (n, 10) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M of the body behind each joint, about the
+        tail: (4, 4), constant transform after the last element.
+        inertias: (n, 10) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M of the body after each joint, about the
             frame right after the joint's moving element [kg m², kg m, kg]; None where unknown.
         gravity: (3,) in the base frame [m/s²].
-        links: names of the n links behind the joints (URDF), for messages and export.
-        floor: height of what the arm stands on, in the base frame [m]: nothing of it goes below where nobody says more.
-        remarks: what its description says that looks wrong, by the reader.
+        links: names of the n links after the joints (URDF), for messages and export.
+        floor: height of the floor under the arm, in the base frame [m]; the default for collision tests.
+        remarks: suspicious values in its description, found by the reader.
     """
 
     name: str
@@ -141,7 +141,7 @@ class Chain:
         max_number = 1e12  # of masses, moments and lengths [SI] (our choice)
         for what in ("tail", "inertias"):
             if (value := getattr(self, what)) is not None and not (np.abs(value) < max_number).all():
-                raise RobotError(f"'{self.name}': {what}: found a number that is not finite, or beyond {max_number:g}")
+                raise RobotError(f"'{self.name}': {what} contains a number that is not finite or beyond {max_number:g}")
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
         for what, names in (("joint", self.joint_names), ("element", self.names)):
@@ -150,7 +150,7 @@ class Chain:
                 refuse_robot(f"robot '{self.name}'", f"{what} name '{sorted(doubled)[0]}' occurs twice")
         driven = {element.joint for element in self.elements if element.joint is not None}
         if driven != set(range(len(self.joints))):
-            refuse_robot(f"robot '{self.name}'", "every joint has to move at least one element")
+            refuse_robot(f"robot '{self.name}'", "every joint must move at least one element")
 
     @property
     def n(self) -> int:
@@ -171,7 +171,7 @@ class Chain:
 
     @property
     def values(self) -> np.ndarray:
-        """The K values [m or rad]."""
+        """Values of the K elements [m or rad]."""
         return np.array([element.value for element in self.elements])
 
     @property
@@ -184,25 +184,25 @@ class Chain:
 
     @cached_property
     def driven(self) -> np.ndarray:
-        """Index of each element that a joint moves, followers of mimic joints included."""
+        """Indices of the elements moved by joints, including followers of mimic joints."""
         return np.array([k for k, element in enumerate(self.elements) if element.joint is not None], dtype=int)
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """(n,) index of the element that each joint moves first (a mimic joint's follower comes later)."""
+        """(n,) indices of the first element moved by each joint (followers of mimic joints come later)."""
         first = {self.elements[k].joint: k for k in reversed(self.driven.tolist())}
         return np.array([first[joint] for joint in range(self.n)], dtype=int)
 
     @cached_property
     def rates(self) -> np.ndarray:
-        """How far each of the elements `driven` goes per unit of each joint (driven, n)."""
+        """Displacements of the elements `driven` per unit of each joint, (driven, n)."""
         rates = np.zeros((len(self.driven), self.n))
         for row, k in zip(rates, self.driven):
             row[self.elements[k].joint] = self.elements[k].ratio
         return rates
 
     def with_values(self, values: np.ndarray | Mapping[str, float]) -> Chain:
-        """Return the same chain with other element values: all K of them, or some by name."""
+        """Return the chain with new element values: all K of them, or some by name."""
         if isinstance(values, Mapping):
             unknown = set(values) - set(self.names)
             if unknown:
@@ -226,13 +226,13 @@ class Chain:
             raise RobotError(f"robot '{self.name}' has no element {error}; it has {', '.join(self.names)}") from None
 
     def stretched_length(self) -> float:
-        """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
+        """Return the largest length of the stretched arm [m]: the sum of its constant offsets."""
         total = sum(abs(e.value) for e in self.elements if e.axis[0] == "t" and e.joint is None)
         placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in self.elements if e.placement is not None)
         return max(total + placed + float(np.linalg.norm(self.tail[:3, 3])), 0.1)
 
     def sampling_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return finite lower and upper joint limits (n,), ±π or ±1 m standing in where a joint has none."""
+        """Return finite lower and upper joint limits (n,); ±π or ±1 m for joints without limits."""
         reach = np.array([np.pi if joint.kind == "revolute" else 1.0 for joint in self.joints])
         return np.where(np.isfinite(self.lower), self.lower, -reach), np.where(
             np.isfinite(self.upper), self.upper, reach
@@ -240,13 +240,13 @@ class Chain:
 
 
 def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
-    """Draw (count, n) joint values, uniform within the limits [rad or m]."""
+    """Return random joint values (count, n), uniform within the limits [rad or m]."""
     lower, upper = chain.sampling_limits()
     return np.random.default_rng(seed).uniform(lower, upper, (count, chain.n))
 
 
 def element_length(chain: Chain, k: int) -> float:
-    """Return the constant displacement along translation k [m], with what its joint's placement holds along it.
+    """Return the constant displacement along translation k [m], including the part in its joint's placement.
 
     A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths stand in the placement.
     Zero for rotations and for what a joint moves.
@@ -265,5 +265,5 @@ def element_length(chain: Chain, k: int) -> float:
 
 
 def joint_kinds(chain: Chain) -> list[str]:
-    """Return URDF's names of the joints' kinds: a revolute joint of a URDF without limits is continuous there."""
+    """Return the URDF types of the joints; a revolute joint of a URDF without limits is continuous."""
     return ["continuous" if chain.links and joint.unlimited else joint.kind for joint in chain.joints]

@@ -1,4 +1,4 @@
-"""Distances between the parts of an arm, the floor and obstacles, by Pinocchio and coal.
+"""Distances between the links of an arm, the floor and obstacles, computed by Pinocchio and coal.
 
 Shapes come from the URDF's ``<collision>``: boxes, spheres, cylinders, capsules, and meshes by their convex hull (our
 choice: faster and on the safe side). A robot without shapes is made of capsules (`calib.robot.capsules`).
@@ -30,12 +30,12 @@ from calib.transforms import pose
 
 @dataclass(frozen=True, eq=False)
 class Collision:
-    """Pairs of shapes and what it takes to measure between them.
+    """Collision model of a URDF: pairs of shapes whose distances are computed by coal.
 
     Attributes:
         pairs: names of the shapes compared, in the order of the columns of `distances`.
         excluded: pairs that are not compared, since they touch in nearly every posture.
-        missing: meshes of the URDF that were not found or not readable; their shapes are left out.
+        missing: meshes of the URDF that were not found or not readable; their shapes are ignored.
     """
 
     pairs: tuple[tuple[str, str], ...]
@@ -47,7 +47,7 @@ class Collision:
     _links: int
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, pairs) [m] at joint values q (m, n); negative is the depth of a penetration."""
+        """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
         found = [[one.min_distance for one in measured] for measured in self._measured(q)]
         return np.array(found).reshape(len(q), len(self.pairs))
 
@@ -92,7 +92,7 @@ class Collision:
         return distances, self._closing(q, normals, points, links) - (1.0 - shares)[..., None] * (normals @ slope)
 
     def _measured(self, q: np.ndarray) -> Iterator[Any]:
-        """Yield what coal finds for all pairs at each of the joint values q (m, n)."""
+        """Yield coal's distance results of all pairs, for each row of joint values q (m, n)."""
         pin, _ = _libraries()
         data, measured = self._model.createData(), self._geometry.createData()
         q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
@@ -101,25 +101,25 @@ class Collision:
             yield measured.distanceResults
 
     def _closing(self, q: np.ndarray, normal: np.ndarray, point: np.ndarray, shapes: list[int]) -> np.ndarray:
-        """Return normal · velocity (m, P, n) of points (m, P, 3) on shapes (P,), all in the base frame."""
+        """Return the speed along normals (m, P, n) of points (m, P, 3) on shapes (P,), per unit of each joint."""
         walked = sweep(self._chain, q)
         axes, places = (part[self._chain.driven].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
         return closing(self._chain, axes, places, normal, point, self._bodies[shapes])
 
     @cached_property
     def _stand(self) -> Any:
-        """Where the base is in Pinocchio's world."""
+        """Pose of the base in Pinocchio's world."""
         return _stand(self._model, self._chain.base)
 
     @cached_property
     def _bodies(self) -> np.ndarray:
-        """How many of the chain's moving elements stand before each shape."""
+        """Number of the chain's moving elements before each shape."""
         driven = {joint.id for joint in driven_joints(self._model, self._chain)}
         carriers = [self._model.supports[shape.parentJoint] for shape in self._geometry.geometryObjects]
         return np.array([sum(joint in driven for joint in above) for above in carriers], dtype=int)
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Return (m,) whether all distances are larger than `margin` [m] at joint values q (m, n)."""
+        """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
         return np.all(self.distances(q) > margin, axis=1)
 
 
@@ -137,7 +137,7 @@ def from_urdf(
     within: bool = True,
     seed: int = 0,
 ) -> Collision:
-    """Build the comparison from a URDF's collision shapes; joints off the chain stay at zero.
+    """Return the collision model of a URDF's collision shapes; joints outside the chain stay at zero.
 
     Args:
         path: the URDF.
@@ -185,7 +185,7 @@ def from_urdf(
 
 
 def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]) -> None:
-    """Hang what is measured on the tip's frame."""
+    """Attach targets (T, 3) [m] to the tip's frame, as thin capsules."""
     _, coal = _libraries()
     for number, place in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
         if (length := float(np.linalg.norm(place))) > 1e-6:
@@ -195,7 +195,7 @@ def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | 
 
 
 def _without_inseparable(found: Collision, margin: float, seed: int) -> Collision:
-    """Drop the pairs that touch in nearly every posture."""
+    """Return the collision model without the pairs that touch in nearly every posture."""
     geometry = found._geometry
     fixed = np.array([pair.second >= found._links for pair in geometry.collisionPairs])
     distances = found.distances(random_joints(found._chain, SAMPLES, seed))
@@ -213,7 +213,7 @@ def _names(geometry: Any) -> tuple[tuple[str, str], ...]:
 
 
 def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray, shape: Any) -> None:
-    """Hang a shape on a link's frame."""
+    """Add a shape to `geometry`, attached to a link's frame."""
     pin, _ = _libraries()
     index = model.getFrameId(link)
     frame = model.frames[index]
@@ -222,7 +222,7 @@ def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray,
 
 
 def _surround(model: Any, geometry: Any, base: str, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
-    """Add walls and obstacles to the fixed world, which is where the base is at zero joints."""
+    """Add walls and obstacles to `geometry`, fixed relative to the base."""
     pin, coal = _libraries()
     stand = _stand(model, base)
     things: list[Any] = [(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4)) for wall in walls]
@@ -239,7 +239,7 @@ def _solid(kind: str, sizes: Sequence[float]) -> Any:
 
 
 def _stand(model: Any, base: str) -> Any:
-    """Return where the base is in Pinocchio's world, at zero joints."""
+    """Return the pose of the base in Pinocchio's world, at zero joints."""
     pin, _ = _libraries()
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
@@ -247,7 +247,7 @@ def _stand(model: Any, base: str) -> Any:
 
 
 def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
-    """Return the coal shape of a <geometry>; None, with an entry in `missing`, for a mesh that cannot be had."""
+    """Return the coal shape of a <geometry>; None, with an entry in `missing`, for an unreadable mesh."""
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
         refuse_robot(place, "<collision> without a shape")
@@ -256,13 +256,13 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], place
     if kind.tag == "box":
         return _solid(kind.tag, numbers(kind, "size", place).tolist())
     if kind.tag not in ("sphere", "cylinder", "capsule"):
-        refuse_robot(place, f"<{kind.tag}> is none of box, sphere, cylinder, capsule, mesh")
+        refuse_robot(place, f"<{kind.tag}> is not one of box, sphere, cylinder, capsule, mesh")
     keys = ("radius",) if kind.tag == "sphere" else ("radius", "length")
     return _solid(kind.tag, [numbers(kind, key, place, count=1)[0] for key in keys])
 
 
 def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -> Any | None:
-    """Return the convex hull of a mesh file, scaled."""
+    """Return the scaled convex hull of a mesh file; None, with an entry in `missing`, if unreadable."""
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
     path = find_mesh(name, folders)
@@ -280,7 +280,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
 
 
 def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
-    """Return the file a mesh name means: ``package://`` is tried with and without the package's own folder."""
+    """Return the path of a mesh name; ``package://`` is tried with and without the package's folder."""
     if name.startswith("file://"):
         name = name.removeprefix("file://")
     variants = [name]
@@ -292,7 +292,7 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
 
 
 def meshes_beside(path: Path) -> dict[str, Path | str]:
-    """Return the meshes of a URDF's collision shapes by where they go beside a copy of it, in ``1-robot``.
+    """Return the meshes of a URDF's collision shapes by their paths next to a copy of it (folder ``1-robot``).
 
     Names from the root, or that lead out of their folder, are left out: a copy of the URDF finds them, or nothing does.
     """
@@ -314,7 +314,7 @@ def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
 
 
 def _libraries() -> tuple[Any, Any]:
-    """Import Pinocchio and coal where they are needed: only collisions need them here."""
+    """Return the modules pinocchio and coal, imported only when collisions are computed."""
     import coal
     import pinocchio
 

@@ -28,9 +28,9 @@ other chain is written element by element::
     xyz = [0, 0, 0]
     rpy = [0, 0, 0]
 
-Tables `station`, `tool` and `deflection` (and `truth`) may stand beside them: they belong to the callers.
+Tables `station`, `tool` and `deflection` (and `truth`) may follow: they belong to the callers.
 
-What a robot's description says that cannot be: limits that are none, bodies that cannot exist.
+Implausible values of a description are reported: invalid limits, impossible bodies.
 """
 
 from collections.abc import Mapping
@@ -48,10 +48,10 @@ from calib.words import listing
 
 
 def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
-    """Return in words what a chain's description holds that looks wrong, by joint; nothing of a sound one.
+    """Return remarks on suspicious values in a chain's description, by joint; () if there are none.
 
     Args:
-        bodies: with those that cannot exist.
+        bodies: whether to include impossible bodies.
     """
     found = list(chain.remarks)
     unstated: dict[str, list[str]] = {}
@@ -59,7 +59,7 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
         for what in joint.unstated:
             unstated.setdefault(what, []).append(joint.name)
     found += [
-        f"{', '.join(names)}: {what} in the robot's description is no limit; taken as not stated"
+        f"{', '.join(names)}: {what} in the robot's description is not a limit; ignored"
         for what, names in unstated.items()
     ]
     wide = {joint.name: max(-joint.lower, joint.upper) for joint in chain.joints if joint.unit != "m"}
@@ -68,12 +68,12 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
         found.append(f"{listing(wide, 4)}: limits up to {furthest:g} rad in the robot's description; degrees?")
     masses = () if chain.inertias is None else chain.inertias
     if bare := [joint.name for joint, body in zip(chain.joints, masses) if not body.any()]:
-        found.append(f"body behind {listing(bare, 4)}: its mass is not stated, and counts as zero")
+        found.append(f"body after {listing(bare, 4)}: mass not stated, taken as zero")
     return (*found, *(impossible_bodies(chain) if bodies else ()))
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
-    """Return in words, by joint, the bodies that cannot exist; nothing where masses are not known.
+    """Return descriptions of physically impossible bodies, by joint; () without masses.
 
     A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
     others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass
@@ -90,16 +90,16 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
     same: dict[str, list[str]] = {}
     for name, words in found.items():
         same.setdefault(words.partition(" (")[0], []).append(name)
-    lines = [f"body behind {listing(names, 4)}: {found[names[0]]}" for names in same.values()]
+    lines = [f"body after {listing(names, 4)}: {found[names[0]]}" for names in same.values()]
     # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
     max_density = 1000.0
     if total > max_density * length**3:
-        lines.append(f"its bodies weigh {total:.4g} kg in all where the stretched arm is {length:.3g} m long: grams?")
+        lines.append(f"its bodies weigh {total:.4g} kg, the stretched arm is {length:.3g} m long: grams?")
     return tuple(lines)
 
 
 def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_excess: float = 1.0) -> str:
-    """Return why a body (10,) cannot exist, in words; nothing where it can.
+    """Return the reason why a body (10,) is physically impossible; "" if it is possible.
 
     `rounding`: of M L²: moments below are rounding.
 
@@ -115,11 +115,11 @@ def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_exc
     moments = np.linalg.eigvalsh(about - (first @ first * np.eye(3) - np.outer(first, first)) / mass)
     if moments[2] > mass * length**2:
         reach = np.sqrt(moments[2] / mass)
-        return f"an inertia of a body far larger than the arm (radius of gyration {reach:.3g} m: kg mm²?)"
+        return f"an inertia too large for the arm (radius of gyration {reach:.3g} m: kg mm²?)"
     if moments[0] < -rounding * mass * length**2:
         return f"a negative moment of inertia ({moments[0]:.3g} kg m² about its centre of mass)"
     if moments[2] > (1.0 + max_excess) * (moments[0] + moments[1]) + rounding * mass * length**2:
-        return f"an inertia that no body has (a moment beyond the sum of the others: {moments[2]:.3g} kg m²)"
+        return f"an impossible inertia (one moment exceeds the sum of the others: {moments[2]:.3g} kg m²)"
     return ""
 
 
@@ -131,7 +131,7 @@ _ELEMENT = tuple(field.name for field in fields(Element))
 
 
 def read(path: str | Path, propose_beta: bool = True) -> Chain:
-    """Read a robot from TOML: an MDH table, or elements.
+    """Return the robot of a TOML file: an MDH table, or elements.
 
     Args:
         path: the file.
@@ -144,12 +144,12 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
 
 
 def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict[str, Any]]:
-    """Return what `read` and `read_extra` do, the file parsed once."""
+    """Return the robot and the extra tables of a file, as `read` and `read_extra`."""
     table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
-            f"{path} is a parallel robot (legs and a platform), and this is for serial arms yet; calib "
-            "fit, excite, identify and plan take it"
+            f"{path} is a parallel robot (legs and a platform), only serial arms are supported here; calib "
+            "fit, excite, identify and plan support it"
         )
     robot = {key: value for key, value in table.items() if key not in EXTRA}
     if "element" not in robot:
@@ -160,7 +160,7 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
 
 
 def read_extra(path: str | Path) -> dict[str, Any]:
-    """Return the tables beside the robot (`EXTRA`) as plain dictionaries."""
+    """Return the extra tables of a robot file (`EXTRA`) as plain dictionaries."""
     return _beside(tables.load(path))
 
 
@@ -169,7 +169,7 @@ def _beside(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> Path:
-    """Write a chain, so that `read` returns the same one to the last bit.
+    """Write a chain to a file from which `read` returns exactly the same chain.
 
     Args:
         path: the file.
@@ -197,7 +197,7 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
         inertias.append(tables.vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
         links.append(tables.word(entry, "link", place) if "link" in entry else None)
     if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
-        refuse_robot(where, "some joints have an inertia and some have none")
+        refuse_robot(where, "some joints have an inertia, others have none")
     elements = enumerate(_tables(table, "element", where), 1)
     return Chain(
         joints=tuple(joints),
@@ -215,7 +215,7 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
     for key, most in (("owner", n), ("joint", n - 1)):
         value = entry.get(key, 0)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-            refuse_robot(where, f"{key} {value!r} is not a whole number from 0 to {most}")
+            refuse_robot(where, f"{key} {value!r} is not an integer from 0 to {most}")
     axis = tables.word(entry, "axis", where)
     sign = tables.number(entry.get("sign", 1.0), f"{where}, sign")
     require(abs(sign) == 1.0, f"{where}: sign {sign:g} is neither 1 nor -1", RobotError)

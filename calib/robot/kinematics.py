@@ -16,11 +16,11 @@ from calib.transforms import pose
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """One pass along the chain for m poses.
+    """Result of one pass along the chain for m poses.
 
     Attributes:
         directions: (K, 3, m) unit vector of each element's motion, in the reference frame, sign included.
-        origins: (K, 3, m) where each element's frame stands [m].
+        origins: (K, 3, m) origin of each element's frame [m].
         rotation: (3, 3, m), ``rotation[c]`` being column c of the flange's rotation.
         position: (3, m) of the flange [m].
     """
@@ -38,7 +38,7 @@ class Sweep:
 def _walk(
     chain: Chain, q: np.ndarray, start: tuple[np.ndarray, np.ndarray], extra: np.ndarray | None = None
 ) -> Iterator[tuple[Element, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield each element, where its frame stands (3, m) [m], and the rotation and the position behind it.
+    """Yield each element, the origin of its frame (3, m) [m], and the rotation and position after it.
 
     Args:
         start: rotation and position of the base (`_start`).
@@ -64,7 +64,7 @@ def _walk(
 
 
 def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np.ndarray | None = None) -> Sweep:
-    """Walk the chain once for all poses.
+    """Return axes and origins of all elements and the flange poses, in one pass for all poses.
 
     Args:
         chain: the arm.
@@ -89,7 +89,7 @@ def forward(chain: Chain, q: np.ndarray, extra: np.ndarray | None = None) -> np.
 
 
 def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
-    """Return the derivative of `point`, carried by the flange, with respect to the elements' values.
+    """Return the Jacobian (K, 6, m) of `point`, fixed to the flange, with respect to the elements' values.
 
     For a rotation about z through o: [z × (point - o); z]; for a translation along z: [z; 0].
 
@@ -124,7 +124,7 @@ def jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def jacobian_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return Σ G[i] · ∂J[i]/∂q (m, n) of the observation Jacobian J = `jacobian` (m, 6, K), G of its shape."""
+    """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, 6, K) of the observation Jacobian J = `jacobian`."""
     walked = sweep(chain, q)
     columns = element_jacobian(chain, walked, walked.position)
     return twist_product(chain, columns, columns, np.arange(len(columns)), G.transpose(2, 1, 0)).T
@@ -133,7 +133,7 @@ def jacobian_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
 def twist_product(
     chain: Chain, elements: np.ndarray, columns: np.ndarray, places: np.ndarray, G: np.ndarray
 ) -> np.ndarray:
-    """Return Σ_k G_k · ∂J_k/∂q of columns J_k = [v; ω] that sit on the chain: the arm's Hessian times G.
+    """Return Σ_k G_k · ∂J_k/∂q (n, m) of columns J_k = [v; ω] on the chain: the arm's Hessian times G.
 
     A joint e turns every column behind it as a whole, and moves the point for every column before it (and its own):
 
@@ -166,7 +166,7 @@ def twist_product(
 
 
 def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int | None = None) -> np.ndarray:
-    """Return the derivative of `point` with respect to the joints, mimic followers included.
+    """Return the Jacobian (m, 6, n) of `point` with respect to the joints, including mimic followers.
 
     Args:
         walked: what `sweep` returned.
@@ -183,13 +183,13 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
 
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (m, 6, n) of the tip with respect to the joints at joint values q (m, n): [v; ω]."""
+    """Return the tip's Jacobian (m, 6, n) [v; ω] with respect to the joints, at joint values q (m, n)."""
     walked = sweep(chain, q)
     return joint_jacobian(chain, walked, walked.position)
 
 
 def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames behind every element that a joint moves, followers included: (moving, m, 4, 4)."""
+    """Return the frames (moving, m, 4, 4) after all moving elements, including mimic followers."""
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
     frames = np.zeros((len(chain.driven), len(q), 4, 4))
     frames[..., 3, 3] = 1.0
@@ -200,7 +200,7 @@ def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames right after each joint's moving element, (n, m, 4, 4): where `Chain.inertias` are given."""
+    """Return the frames (n, m, 4, 4) right after each joint's moving element, as used by `Chain.inertias`."""
     frames = moving_frames(chain, q)
     return frames if np.array_equal(chain.driven, chain.moving) else frames[np.searchsorted(chain.driven, chain.moving)]
 
@@ -224,7 +224,7 @@ def _start(base: np.ndarray | None, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Multiply frames by a fixed placement from the right."""
+    """Return frames multiplied by a fixed placement from the right."""
     flat = rotation.reshape(3, -1)
     position = position + (placement[:3, 3] @ flat).reshape(position.shape)
     if not np.array_equal(placement[:3, :3], np.eye(3)):
@@ -233,7 +233,7 @@ def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) ->
 
 
 def _rotate(rotation: np.ndarray, axis: int, angle: np.ndarray | float) -> np.ndarray:
-    """Multiply frames by a rotation about their own axis from the right: two columns mix, the third stays."""
+    """Return frames rotated about one of their own axes (two columns change)."""
     cosine, sine = np.cos(angle), np.sin(angle)
     one, two = (axis + 1) % 3, (axis + 2) % 3
     result = np.empty_like(rotation)

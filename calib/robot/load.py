@@ -1,4 +1,4 @@
-"""Find a robot by what a person types: a library name, a file, or a folder with a ``robot.toml``."""
+"""Find a robot by user input: a library name, a file, or a folder with a ``robot.toml``."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from calib.robot.formats import urdf
 def load(
     robot: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> Chain:
-    """Return the chain that `robot` names.
+    """Return the chain of a robot given by name or path.
 
     Args:
         robot: a library name, the path of a ``.urdf`` or ``.toml`` file, or a folder that holds ``robot.toml``.
@@ -32,12 +32,12 @@ def load(
 def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
     for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
         if wanted is not None and wanted != found:
-            refuse_robot(path, f"its {option} is '{found}', not '{wanted}'; base and tip choose links of a URDF")
+            refuse_robot(path, f"its {option} is '{found}', not '{wanted}'; only a URDF allows to choose base and tip")
     return chain
 
 
 def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
-    """Return the robot that `robot` names with a fit's covariance and corrections; arguments as of `load`."""
+    """Return the calibrated robot of a name or path, with covariance and corrections; arguments as in `load`."""
     path = resolve(robot)
     if path.suffix == ".urdf":
         return CalibratedChain(load(path, base, tip), source=str(robot))
@@ -47,14 +47,14 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
 
 
 def resolve(robot: str | Path) -> Path:
-    """Return the file that `robot` names; a file in the working folder goes before the library."""
+    """Return the file of a robot given by name or path; the working folder takes precedence over the library."""
     path, names = Path(robot), library.names()
-    require(str(robot).strip(), f"an empty text names no robot; the library has {', '.join(names)}", RobotError)
+    require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(names)}", RobotError)
     known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(names)}"
     if path.is_dir():
         if (path / calibrated.ROBOT).is_file():
             return path / calibrated.ROBOT
-        require(str(robot) in names, f"folder {path} holds no robot.toml; give {known}", RobotError)
+        require(str(robot) in names, f"folder {path} has no robot.toml; give {known}", RobotError)
     elif path.is_file():
         if path.suffix in (".urdf", ".toml"):
             return path

@@ -1,4 +1,4 @@
-"""Modified Denavit-Hartenberg tables (Khalil and Kleinfinger, 1986), to and from a `Chain`.
+"""Modified Denavit-Hartenberg tables (Khalil and Kleinfinger, 1986), converted to and from a `Chain`.
 
     row of a revolute joint:   Rot_x(alpha) Trans_x(d) [Rot_y(beta)] Trans_z(r) Rot_z(theta + q)
     row of a prismatic joint:  Rot_x(alpha) Trans_x(d) [Rot_y(beta)] Rot_z(theta) Trans_z(r + q)
@@ -60,7 +60,7 @@ _ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table; `beta` None where the row has no such element, `inertia` (10,) or None."""
+    """Row of an MDH table; `beta` is None without that element, `inertia` is (10,) or None."""
 
     name: str
     index: int
@@ -84,7 +84,7 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
     """Return the chain of a parsed table; `where` names it in messages."""
     tables.check_keys(table, TOP, where)
     if not isinstance(proposed := table.get("propose_beta", True), bool):
-        refuse_robot(where, f"propose_beta has to be true or false, found {proposed!r}")
+        refuse_robot(where, f"propose_beta must be true or false, found {proposed!r}")
     rows: list[Row] = []
     if not isinstance(table.get("joint"), list) or not table["joint"]:
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
@@ -119,17 +119,17 @@ def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **more: Any
 
 
 def rows(chain: Chain) -> tuple[Row, ...]:
-    """Return the MDH rows of a chain that has that form.
+    """Return the MDH rows of a chain that has the form of an MDH table.
 
     Raises:
-        RobotError: where an element is none of an MDH table, or stands elsewhere than its row demands.
+        RobotError: if an element does not belong to an MDH table, or is in the wrong place.
     """
     groups: dict[int, list[Element]] = {}
     for element in chain.elements:
         found = _ELEMENT.fullmatch(element.name)
         plain = element.placement is None and element.sign == 1.0 and element.ratio == 1.0
         if not found or not plain or AXES[found[1]] != element.axis:
-            raise RobotError(f"robot '{chain.name}' is no MDH table: element '{element.name}' does not belong to one")
+            raise RobotError(f"robot '{chain.name}' is not an MDH table: element '{element.name}' does not fit")
         groups.setdefault(int(found[2]), []).append(element)
     result = tuple(_regroup(chain, index, group) for index, group in groups.items())
     owner, expected = 0, []
@@ -137,7 +137,7 @@ def rows(chain: Chain) -> tuple[Row, ...]:
         expected += _elements(row, row.beta, owner)
         owner += row.kind != "fixed"
     if tuple(expected) != chain.elements:
-        raise RobotError(f"robot '{chain.name}' is no MDH table: its elements are not complete rows in order")
+        raise RobotError(f"robot '{chain.name}' is not an MDH table: its elements are not complete rows in order")
     return result
 
 
@@ -168,7 +168,7 @@ def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
 
 
 def _parallel(rows: Iterable[Row], max_sine: float = 0.05) -> set[int]:
-    """Return the indices of moving rows whose axis is nearly parallel to the moving one before, at zero joints."""
+    """Return the indices of moving rows with an axis nearly parallel to the previous moving axis, at zero joints."""
     found: set[int] = set()
     turned: np.ndarray | None = None
     for row in rows:
@@ -198,7 +198,7 @@ def _row(entry: Any, index: int, where: str) -> Row:
         refuse_robot(where, f"expected a table, found {entry!r}")
     index = entry.get("index", index)
     if isinstance(index, bool) or not isinstance(index, int) or index < 0:
-        refuse_robot(where, f"index {index!r} is not a whole number from 0 on")
+        refuse_robot(where, f"index {index!r} is not an integer of 0 or more")
     name = tables.word(entry, "name", where, f"joint{index}")
     where = f"{where} ('{name}')"
     tables.check_keys(entry, _ROW, where)
@@ -208,14 +208,14 @@ def _row(entry: Any, index: int, where: str) -> Row:
     if kind == "prismatic":
         quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
     if kind == "fixed" and (extra := [key for key in (*tables.LIMITS, "inertia") if key in entry]):
-        refuse_robot(where, f"a fixed row has no '{extra[0]}'")
+        refuse_robot(where, f"a fixed row cannot have '{extra[0]}'")
     numbers = {key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
     inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
     return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)
 
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
-    """Return the row that a group of elements with one number makes; the caller checks order and completeness."""
+    """Return the MDH row of a group of elements with one number; the caller checks order and completeness."""
     values: dict[str, Any] = {element.name.removesuffix(str(index)): element.value for element in group}
     moved = [element for element in group if element.joint is not None]
     if not moved:
@@ -228,7 +228,7 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
 
 
 def _entry(row: Row, expected: int) -> dict[str, Any]:
-    """Return the [[joint]] table of a row; what is default there is left out, except the four parameters."""
+    """Return the [[joint]] table of a row, without default values (the four parameters are always written)."""
     entry: dict[str, Any] = {"name": row.name}
     if row.kind != "revolute":
         entry["kind"] = row.kind

@@ -37,7 +37,7 @@ def word(table: Mapping[str, Any], key: str, where: str, default: str | None = N
     if value is None:
         refuse_robot(where, f"'{key}' is missing")
     if not isinstance(value, str) or not value:
-        refuse_robot(where, f"'{key}' has to be text, found {shown(value)}")
+        refuse_robot(where, f"'{key}' must be text, found {shown(value)}")
     return value
 
 
@@ -62,7 +62,7 @@ def placement(table: Any, where: str) -> np.ndarray:
     result[: len(rows)] = [vector(row, 4, f"{where}, matrix") for row in rows]
     error = np.abs(result[:3, :3].T @ result[:3, :3] - np.eye(3)).max()
     if not error < 1e-6 or np.linalg.det(result[:3, :3]) < 0:
-        refuse_robot(where, f"the rotation in matrix is no rotation (R'R - 1 = {error:.2g})")
+        refuse_robot(where, f"the rotation in matrix is not a rotation (R'R - 1 = {error:.2g})")
     return result
 
 
@@ -76,12 +76,12 @@ def placement_table(transform: np.ndarray) -> dict[str, list]:
 
 
 def spelled(angle: float) -> float | str:
-    """Return pi and pi/2 as a person writes them, and any other number as it is."""
+    """Return an angle as text if it is ±pi or ±pi/2, else unchanged."""
     return _PI.get(angle, angle)
 
 
 def chain_head(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return what of a `Chain` a robot's table states beside its joints: name, ends, tail, gravity, floor."""
+    """Return the fields of a `Chain` in a robot's table besides joints: name, ends, tail, gravity, floor."""
     head: dict[str, Any] = {"name": word(table, "name", where)}
     head |= {key: word(table, key, where) for key in ("base", "tip") if key in table}
     if "tail" in table:
@@ -99,12 +99,12 @@ def chain_table(chain: Chain, **rows: Any) -> dict[str, Any]:
 
 
 def finite_limits(joint: Any) -> dict[str, float]:
-    """Return the limits of a joint, or of its row, that are known, by their names."""
+    """Return the known (finite) limits of a joint or MDH row, by name."""
     return {key: value for key in LIMITS if np.isfinite(value := getattr(joint, key))}
 
 
 def _plain(value: Any) -> Any:
-    """Return `value` with arrays, tuples and numpy numbers as lists and Python numbers, Nones left out of tables."""
+    """Return `value` with arrays and tuples as lists, numpy numbers as Python numbers, tables without None."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
     if isinstance(value, np.ndarray):
@@ -115,5 +115,5 @@ def _plain(value: Any) -> Any:
 
 
 def dumps(table: Mapping[str, Any]) -> str:
-    """Return TOML text; floats in full (repr), so that reading them back is exact."""
+    """Return a table as TOML text, with floats in full precision (repr)."""
     return tomlkit.dumps(_plain(table))

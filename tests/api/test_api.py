@@ -90,7 +90,7 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.SelectionSettings(method="detmx"), "method: expected one of detmax"),
         (lambda: calib.ExcitationSettings(goals=("foo=3",)), "goal 'foo=3': 'foo' is unknown; use raw"),
         (lambda: calib.ExcitationSettings(hard=("logdet",)), "goal 'logdet': expected NAME=NUMBER"),
-        (lambda: calib.load(""), "an empty text names no robot"),
+        (lambda: calib.load(""), "the robot's name is empty"),
     ],
 )
 def test_an_argument_of_another_type_is_refused_by_its_name(call, words):

@@ -123,7 +123,7 @@ def test_pairs_that_always_touch_are_left_out_and_listed(tmp_path):
 def test_surroundings_that_a_link_never_leaves_are_refused(balls, surroundings, named):
     with pytest.raises(RobotError, match=named):
         collision.from_urdf(balls, **surroundings)
-    with pytest.raises(RobotError, match="nothing keeps clear of that"):
+    with pytest.raises(RobotError, match="no pose is free of collision"):
         capsules.from_chain(load("ur5"), **surroundings)
 
 
@@ -257,7 +257,7 @@ def test_continuous_and_mimic_joints_move_the_shapes(tmp_path):
         ("", r"no usable <collision> shape; give mesh_folders, or use capsules"),
         (shape('<mesh filename="absent.stl"/>'), r"no usable .* \(1 meshes were not found, e\.g\. absent\.stl\)"),
         (shape('<box size="1 1"/>'), r"link 'one': size=\"1 1\" of <box> in line \d+ is not 3 finite numbers"),
-        (shape('<torus radius="1"/>'), r"<torus> is none of box, sphere"),
+        (shape('<torus radius="1"/>'), r"<torus> is not one of box, sphere"),
         (shape(""), r"<collision> without a shape"),
     ],
 )
@@ -269,7 +269,7 @@ def test_bad_shapes(inner, message, tmp_path):
 
 def test_bad_obstacles(balls):
     for kind, size, message in (
-        ("cone", (1.0,), "kind 'cone' is none of"),
+        ("cone", (1.0,), "kind 'cone' is not one of"),
         ("box", (1.0, 2.0), "a box has 3 positive"),
     ):
         with pytest.raises(RobotError, match=message):

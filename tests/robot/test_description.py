@@ -85,12 +85,12 @@ ELEMENT = {"name": "a.offset", "axis": "rz", "joint": 0}
     "element, message",
     [
         ({"axes": "rz"}, r"number 1: there is no key 'axes' .did you mean 'axis'"),
-        ({"axis": "rw"}, r"axis 'rw' is none of tx, ty"),
-        ({"joint": 1}, r"joint 1 is not a whole number from 0 to 0"),
-        ({"owner": -1}, r"owner -1 is not a whole number from 0 to 1"),
+        ({"axis": "rw"}, r"axis 'rw' is not one of tx, ty"),
+        ({"joint": 1}, r"joint 1 is not an integer from 0 to 0"),
+        ({"owner": -1}, r"owner -1 is not an integer from 0 to 1"),
         ({"sign": 0.5}, r"sign 0.5 is neither 1 nor -1"),
         ({"value": "1 mm"}, r"value: cannot read '1 mm'"),
-        ({"placement": {"matrix": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]]}}, r"is no rotation"),
+        ({"placement": {"matrix": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]]}}, r"is not a rotation"),
         ({"placement": {"matrix": [[1, 0, 0, 0]]}}, r"matrix needs three or four rows"),
         ({"placement": [1, 2, 3]}, r"placement: expected xyz and rpy, or matrix"),
     ],
@@ -111,9 +111,9 @@ A, E = '[[joint]]\nname="a"\n', '[[element]]\nname="e"\naxis="rz"\n'
     "text, message",
     [
         (f"{A}{E}joint=0", r"'name' is missing"),
-        (f'name="x"\nbase=5\n{A}{E}joint=0', r"'base' has to be text, found 5"),
+        (f'name="x"\nbase=5\n{A}{E}joint=0', r"'base' must be text, found 5"),
         (f'name="x"\n{E}joint=0', r"no \[\[joint\]\] tables found"),
-        (f'name="x"\n{A}{E}', r"every joint has to move"),
+        (f'name="x"\n{A}{E}', r"every joint must move"),
         (f'name="x"\n{A}kinds=1\n{E}', r"there is no key 'kinds' .did you mean 'kind'"),
     ],
 )
@@ -214,7 +214,7 @@ def test_loading(tmp_path, monkeypatch):
     [
         ("ur5x", r"no robot 'ur5x' \(did you mean 'ur5'\?\); give a path .* iiwa14, lwr4plus"),
         ("absent.urdf", r"no file absent\.urdf; give a path of a \.urdf"),
-        ("empty", r"folder empty holds no robot\.toml; give .*one of the library"),
+        ("empty", r"folder empty has no robot\.toml; give .*one of the library"),
         ("arm.urdf.xacro", r"neither \.urdf nor \.toml; expand it first"),
         ("arm.step", r"arm\.step is neither \.urdf nor \.toml; give"),
     ],
@@ -230,5 +230,5 @@ def test_what_is_no_robot(robot, message, tmp_path, monkeypatch):
 
 def test_base_and_tip_of_a_table_cannot_be_chosen():
     assert load("ur5", "base", "tool0").name == "ur5"
-    with pytest.raises(RobotError, match="its tip is 'tool0', not 'flange'; base and tip choose links of a URDF"):
+    with pytest.raises(RobotError, match="its tip is 'tool0', not 'flange'; only a URDF allows to choose"):
         load("ur5", tip="flange")

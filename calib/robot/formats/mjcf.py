@@ -1,4 +1,4 @@
-"""A `Chain` with masses and drives as MJCF, which MuJoCo reads: motor inertia is its ``armature``.
+"""MJCF export (MuJoCo) of a `Chain` with masses and drives; motor inertia becomes ``armature``.
 
 The world is the chain's base. Bodies stand where the chain's frames are, one behind each moving element; a mimic
 joint's follower is tied to its leader by an equality, which MuJoCo keeps softly. The tip is a site.
@@ -17,10 +17,10 @@ from calib.transforms import invert
 
 
 def text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: np.ndarray, friction: np.ndarray) -> str:
-    """Return the MJCF of a chain.
+    """Return the MJCF text of a chain with its bodies and drives.
 
     Args:
-        bodies: (B, 10) standard parameters behind each moving element.
+        bodies: (B, 10) standard parameters of the body after each moving element.
         armature, damping, friction: (n,) of each joint [kg m², N m s/rad, N m, or kg, N s/m, N].
     """
     lines = [
@@ -58,7 +58,7 @@ def text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: np.nda
 
 
 def joint_name(chain: Chain, k: int) -> str:
-    """Return the name of the joint of moving element k: the chain's, or a follower's own."""
+    """Return the MJCF joint name of moving element k: the chain joint's name, or the name of a mimic follower."""
     element = chain.elements[k]
     main = k in chain.moving.tolist()
     return chain.joints[element.joint or 0].name if main else element.name.removesuffix(".offset")

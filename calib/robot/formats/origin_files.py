@@ -25,7 +25,7 @@ _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML
 
 
 def block(value: Mapping[str, Any], indent: str = "") -> str:
-    """Return the lines of a mapping from texts to mappings, texts and finite floats."""
+    """Return the YAML lines of a mapping from texts to mappings, texts and finite floats."""
     lines = []
     for key, item in value.items():
         head = f"{indent}{_text(key)}:"
@@ -58,13 +58,13 @@ HEAD = """\
 
 
 def kinematics(nominal: Chain, calibrated: Chain) -> str:
-    """Return the kinematics YAML of ur_description: x y z roll pitch yaw of the six joints' origins [m, rad].
+    """Return the kinematics YAML for ur_description: x y z roll pitch yaw of the six joint origins [m, rad].
 
     The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
     so that only the calibrated part of the numbers is new.
 
     Raises:
-        RobotError: for an arm that has not UR's axes.
+        RobotError: for an arm without UR's axes.
     """
     edited = read(urdf_write.edit(_template(nominal), nominal, calibrated, "UR frames"), "UR frames")
     places = {link: to_xyz_rpy(edited.joints[link].origin) for link in LINKS}
@@ -74,7 +74,7 @@ def kinematics(nominal: Chain, calibrated: Chain) -> str:
 
 
 def wrist_offset(nominal: Chain) -> float:
-    """Return how far the last joint's frame is from axis 5 at q = 0 [m]: UR's d6, or nothing in URDFs of old."""
+    """Return the distance of the last joint's frame from axis 5 at q = 0 [m]: UR's d6, or 0 in old URDFs."""
     frames = joint_frames(nominal, np.zeros((1, nominal.n)))[:, 0]
     across = _axis(nominal, frames[1], int(nominal.moving[1]))
     return abs(float(across @ (frames[5, :3, 3] - frames[4, :3, 3])))
@@ -88,7 +88,7 @@ def _template(nominal: Chain) -> str:
     (URDFs of the years before ur_description hold d6 in the fixed joint to tool0).
     """
     if nominal.n != 6 or any(joint.kind != "revolute" for joint in nominal.joints):
-        raise RobotError(f"it has {nominal.n} joints, not six revolute ones")
+        raise RobotError(f"it has {nominal.n} joints; expected six revolute joints")
     zero = np.zeros((1, 6))
     frames = joint_frames(nominal, zero)[:, 0]
     axis = np.array([_axis(nominal, frames[j], k) for j, k in enumerate(nominal.moving)])
@@ -140,7 +140,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
         where: names them in messages.
 
     Raises:
-        RobotError: for an origin that is no rotation.
+        RobotError: for an origin that is not a rotation.
     """
     before, after = read(source, where), read(edited, where)
     moved = {}
@@ -150,7 +150,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
         if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
-            refuse_robot(where, f"the origin of joint '{name}' is no rotation")
+            refuse_robot(where, f"the origin of joint '{name}' is not a rotation")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),
             "orientation": dict(zip("xyzw", turn.tolist())),

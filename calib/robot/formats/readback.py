@@ -1,4 +1,4 @@
-"""URDFs as Pinocchio reads them: what was written is held against an independent reader."""
+"""Exported URDFs and MJCFs as read by Pinocchio and yourdfpy, for comparison with what was written."""
 
 import io
 import tempfile
@@ -15,7 +15,7 @@ from calib.robot.formats.mjcf import joint_name
 
 
 def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return where Pinocchio puts the tip of a chain read from the URDF text `source`, in its base (m, 4, 4).
+    """Return Pinocchio's tip poses (m, 4, 4) in the base, for a chain read from the URDF text `source`.
 
     Args:
         source: URDF text.
@@ -40,12 +40,12 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def driven_joints(model: Any, chain: Chain) -> list[Any]:
-    """Return Pinocchio's joints of the elements that a chain's joints move, followers included."""
+    """Return Pinocchio's joints of a chain's moving elements, including mimic followers."""
     return [model.joints[model.getJointId(joint_name(chain, k))] for k in chain.driven.tolist()]
 
 
 def configurations(model: Any, chain: Chain, q: np.ndarray, from_zero: bool = False) -> np.ndarray:
-    """Return Pinocchio's configurations (m, nq) at joint values q (m, n): a continuous joint has cosine and sine there.
+    """Return Pinocchio's configurations (m, nq) at joint values q (m, n): cosine and sine for continuous joints.
 
     Args:
         from_zero: whether the model's frames at zero hold the chain's constant values.
@@ -65,7 +65,7 @@ def configurations(model: Any, chain: Chain, q: np.ndarray, from_zero: bool = Fa
 def motion_torques(
     source: str, chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray, mjcf: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what Pinocchio makes of a robot's masses and drives.
+    """Return Pinocchio's torques, body frames, damping and friction of a robot with masses and drives.
 
     Args:
         source: URDF or MJCF text.
@@ -102,7 +102,7 @@ def motion_torques(
 
 
 def _from_mjcf(pin: Any, source: str) -> Any:
-    """Return the model of an MJCF text; Pinocchio reads that from a file only."""
+    """Return Pinocchio's model of an MJCF text, by way of a temporary file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.xml"
         path.write_text(source, encoding="utf-8")
@@ -110,7 +110,7 @@ def _from_mjcf(pin: Any, source: str) -> Any:
 
 
 def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[str], q: np.ndarray) -> np.ndarray:
-    """Return where yourdfpy puts links of the URDF text `source`, in the link `base` (links, m, 4, 4).
+    """Return yourdfpy's poses (links, m, 4, 4) in the link `base` of the links of a URDF text.
 
     Args:
         source: URDF text; meshes are not looked for.

@@ -1,4 +1,4 @@
-"""URDF files to a `Chain`.
+"""URDF files converted to a `Chain`.
 
 A joint origin is a fixed placement followed by six elementary motions of the joint frame, zero at first; the one about
 (revolute) or along (prismatic) the joint axis stands last and moves with q:
@@ -31,7 +31,7 @@ _SUFFIX = {"tx": "x", "ty": "y", "tz": "z", "rx": "rx", "ry": "ry", "rz": "rz"}
 def read(
     path: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> Chain:
-    """Read the chain from `base` to `tip` of a URDF file.
+    """Return the chain from `base` to `tip` of a URDF file.
 
     Args:
         path: the file.
@@ -52,7 +52,7 @@ def parse(
     tip: str | None = None,
     joint_names: Sequence[str] | None = None,
 ) -> Chain:
-    """Read the chain from `base` to `tip` of a URDF text; `where` names it in messages."""
+    """Return the chain from `base` to `tip` of a URDF text; `where` names it in messages."""
     tree = read_tree(source, where)
     return build(tree, *ends(tree, base, tip, joint_names))
 
@@ -60,7 +60,7 @@ def parse(
 def ends(
     tree: UrdfTree, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> tuple[str, str]:
-    """Choose the links between which the chain runs.
+    """Return the base and tip links of the chain, by default chosen from the tree.
 
     The base defaults to the root. The tip defaults to the end of the chain that holds the joints named, or else of
     the one with most actuated joints, where a last joint that others mimic in another branch (a gripper's) does not
@@ -114,7 +114,7 @@ def build(tree: UrdfTree, base: str, tip: str) -> Chain:
 
 
 def align(axis: np.ndarray) -> np.ndarray:
-    """Return the turn (4, 4) after which a unit axis is an elementary one: the identity for ±x ±y ±z, else z.
+    """Return the rotation (4, 4) that aligns an elementary axis with a unit axis: identity for ±x ±y ±z, else z.
 
     The columns x and y are any two that complete z (our choice: from the coordinate axis farthest from it).
     """
@@ -142,7 +142,7 @@ def _elements(
 
 
 def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
-    """Return the actuated joint that moves `joint`, the ratio and the offset; followers of followers are resolved."""
+    """Return the actuated joint that moves `joint`, the ratio and the offset, through chains of mimic joints."""
     ratio, offset, name = 1.0, 0.0, joint.name
     seen = {name}
     mimic: Mimic | None = joint.mimic
@@ -151,7 +151,7 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
         ratio *= mimic.multiplier
         name = mimic.leader
         if name in seen or name not in tree.joints:
-            what = "a circle" if name in seen else f"'{name}', which is no joint{suggestion(name, tree.joints)}"
+            what = "a circle" if name in seen else f"'{name}', which is not a joint{suggestion(name, tree.joints)}"
             refuse_robot(f"{tree.where}, line {joint.node.line}, joint '{joint.name}'", f"it mimics {what}")
         seen.add(name)
         mimic = tree.joints[name].mimic
@@ -159,7 +159,7 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
 
 
 def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint_names: Sequence[str] | None) -> None:
-    """Refuse paths that are no serial arm, or not the arm the measurements were taken with."""
+    """Refuse a path that is not a serial arm, or whose joints differ from the measured ones."""
     actuated = [joint.name for joint in path if joint.actuated]
     if not actuated:
         refuse_robot(tree.where, f"no actuated joint between '{base}' and '{tip}'; choose another base or tip")
@@ -167,7 +167,7 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
     for joint in path:
         place = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
         if joint.kind in ("floating", "planar"):
-            refuse_robot(place, f"type '{joint.kind}' cannot be part of an arm; choose a base behind it (--base)")
+            refuse_robot(place, f"type '{joint.kind}' cannot be part of an arm; choose a base after it (--base)")
         passed.add(joint.name)
         if not joint.moves or joint.actuated:
             continue
@@ -176,11 +176,11 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
             side = "comes after it" if leader in actuated else f"is not between '{base}' and '{tip}'"
             refuse_robot(place, f"the joint it mimics, '{leader}', {side}; choose another base or tip")
         if ratio == 0.0 or tree.joints[leader].kind == "fixed":
-            refuse_robot(place, f"it mimics '{leader}' but can never move; make it fixed")
+            refuse_robot(place, f"it mimics '{leader}' but cannot move; make it fixed")
     if joint_names and (extra := [name for name in actuated if name not in joint_names]):
         refuse_robot(
             tree.where,
-            f"between '{base}' and '{tip}' there are joints the measurements do not name: "
+            f"between '{base}' and '{tip}' some joints are not in the measurements: "
             f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value",
         )
     if joint_names and (absent := [name for name in joint_names if name not in actuated]):
@@ -193,7 +193,7 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
 
 
 def _longest(tree: UrdfTree, base: str) -> str:
-    """Return the last moving link of the chain with most actuated joints."""
+    """Return the last moving link of the chain with the most actuated joints."""
     if not any(joint.actuated for joint in tree.joints.values()):
         refuse_robot(tree.where, "no actuated joint (revolute, continuous or prismatic) found")
     grippers = _gripper_joints(tree)
@@ -208,7 +208,7 @@ def _longest(tree: UrdfTree, base: str) -> str:
             if joint.name not in grippers
         ]
     most = max(best.values())
-    require(most != 0, f"{tree.where}: no actuated joint hangs on '{base}'; choose another base (--base)", RobotError)
+    require(most != 0, f"{tree.where}: no actuated joint follows '{base}'; choose another base (--base)", RobotError)
     found = [link for link, count in best.items() if count == most]
     found = [link for link in found if not any(_hangs(tree, other, link) for other in found if other != link)]
     if len(found) > 1:
@@ -221,7 +221,7 @@ def _longest(tree: UrdfTree, base: str) -> str:
 
 
 def _gripper_joints(tree: UrdfTree) -> set[str]:
-    """Return mimic joints whose leader is in another branch, and such leaders where no actuated joint hangs on them."""
+    """Return mimic joints with a leader in another branch, and those leaders if no actuated joint follows them."""
     found: set[str] = set()
     for joint in tree.joints.values():
         leader = tree.joints.get(joint.mimic.leader) if joint.mimic else None
@@ -247,7 +247,7 @@ def _last_named(tree: UrdfTree, base: str, joint_names: Sequence[str]) -> str:
 
 
 def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
-    """Return (n, 10) about the frames behind the moving elements; None without masses.
+    """Return standard parameters (n, 10) about the frames after the moving elements; None without masses.
 
     Also None where the body behind a mimic follower has mass: it would need a row of its own.
     """

@@ -1,4 +1,4 @@
-"""What a URDF says, checked: links and joints as a tree, with the line of each for messages.
+"""Checked contents of a URDF: a tree of links and joints, with their line numbers for messages.
 
 Reads what the kinematics and the inertias need and nothing else; pictures, transmissions and simulator tags stay in the
 text, where `calib.robot.formats.urdf_write` leaves them untouched.
@@ -32,7 +32,7 @@ _BLANK = re.compile(rb"\s*")
 
 @dataclass(frozen=True)
 class Node:
-    """One element: tag, attributes, line (from 1), byte position of its ``<`` in the UTF-8 text, children."""
+    """XML element: tag, attributes, line (from 1), byte position of its ``<`` in the UTF-8 text, children."""
 
     tag: str
     attributes: dict[str, str]
@@ -50,7 +50,7 @@ class Node:
 
 
 def text(path: str | Path) -> tuple[str, str]:
-    """Return a file's text, line ends as they are, and its encoding as declared (UTF-8 otherwise).
+    """Return a file's text with unchanged line ends, and its declared encoding (default UTF-8).
 
     Raises:
         RobotError: where it cannot be read or decoded.
@@ -92,7 +92,7 @@ def parse(source: str, where: str) -> Node:
 
 
 def edited(source: str, changes: Iterable[tuple[int, int, str]]) -> str:
-    """Return the text with byte ranges (start, end, replacement) of its UTF-8 form replaced; they may not overlap."""
+    """Return the text with byte ranges (start, end, replacement) of its UTF-8 form replaced, without overlaps."""
     data = source.encode("utf-8")
     for start, end, replacement in sorted(changes, reverse=True):
         data = data[:start] + replacement.encode("utf-8") + data[end:]
@@ -100,7 +100,7 @@ def edited(source: str, changes: Iterable[tuple[int, int, str]]) -> str:
 
 
 def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tuple[int, int, str]]:
-    """Return the changes (for `edited`) that give a node's attributes new values, in place or behind the last one."""
+    """Return the changes (for `edited`) that set a node's attributes, in place or after the last one."""
     data = source.encode("utf-8")
     found = {match[1].decode(): match for match in _attributes(data, node)}
     end = max([match.end() for match in found.values()], default=node.start + 1 + len(node.tag.encode()))
@@ -110,7 +110,7 @@ def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tupl
 
 
 def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, str]]:
-    """Return the change that puts a new first child into a node (an empty one is opened), indented as what follows."""
+    """Return the change that inserts a first child into a node, with the indentation of the next child."""
     data = source.encode("utf-8")
     last = max([match.end() for match in _attributes(data, node)], default=node.start)
     place = data.index(b">", last) + 1
@@ -121,7 +121,7 @@ def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, st
 
 
 def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
-    """Yield the attributes of a node's start tag: name and quoted value."""
+    """Yield the matches (name, quoted value) of a node's attributes."""
     place = node.start + 1 + len(node.tag.encode())
     while match := _ATTRIBUTE.match(data, place):
         yield match
@@ -129,7 +129,7 @@ def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
 
 
 def with_comment(content: bytes, words: str) -> bytes:
-    """Return an XML file with a comment at its head, behind the declaration; ASCII, as any 8-bit encoding reads it.
+    """Return an XML file with an ASCII comment inserted after its declaration.
 
     A file in UTF-16 is returned as it is.
     """
@@ -152,7 +152,7 @@ XACRO = "expand it first: xacro file.xacro > robot.urdf"
 
 @dataclass(frozen=True)
 class Mimic:
-    """q = multiplier · q_leader + offset [rad or m]."""
+    """Mimic joint: q = multiplier · q_leader + offset [rad or m]."""
 
     leader: str
     multiplier: float
@@ -161,7 +161,7 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class JointTag:
-    """One <joint>: origin (4, 4) in its parent link, unit axis (3,) in its own frame; limits as of `_limits`."""
+    """Joint of a URDF: origin (4, 4) in its parent link, unit axis (3,) in its frame, limits as in `_limits`."""
 
     name: str
     kind: str
@@ -182,7 +182,7 @@ class JointTag:
         return self.moves and self.mimic is None
 
     def as_joint(self) -> Joint:
-        """Return what the chain keeps of it."""
+        """Return the `Joint` of a chain for this joint."""
         return Joint(self.name, "prismatic" if self.kind == "prismatic" else "revolute", *self.limits)
 
 
@@ -194,9 +194,9 @@ class UrdfTree:
         bodies: link name to (10,) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the link frame; None where
             the link has no inertial.
         joints: by name, in the order of the file.
-        above: link name to the joint that carries it.
-        below: link name to the joints it carries.
-        remarks: what looks wrong in it.
+        above: link name to its parent joint.
+        below: link name to its child joints.
+        remarks: suspicious values.
     """
 
     name: str
@@ -212,10 +212,10 @@ class UrdfTree:
         return [link for link in self.bodies if link not in self.above]
 
     def link(self, name: str, role: str) -> str:
-        """Return `name` where such a link exists.
+        """Return `name`; refuse a link that does not exist.
 
         Raises:
-            RobotError: naming the nearest link that does.
+            RobotError: naming the most similar link name.
         """
         if name not in self.bodies:
             known = ", ".join(self.bodies)
@@ -234,16 +234,16 @@ class UrdfTree:
         """Return the joints from `base` down to `tip`.
 
         Raises:
-            RobotError: where `tip` does not hang on `base`.
+            RobotError: if `tip` is not after `base`.
         """
         joints = self.ancestry(tip)
         links = [*(joint.parent for joint in joints), tip]
         if base not in links:
-            refuse_robot(self.where, f"link '{tip}' does not hang on '{base}'; choose another base or tip")
+            refuse_robot(self.where, f"link '{tip}' does not follow '{base}'; choose another base or tip")
         return joints[links.index(base) :]
 
     def rigid(self, link: str) -> list[tuple[str, np.ndarray]]:
-        """Return the links fixed to `link`, itself first, each with its pose (4, 4) in the frame of `link`."""
+        """Return the links fixed to `link` (itself first), each with its pose (4, 4) in the frame of `link`."""
         result, todo = [], [(link, np.eye(4))]
         while todo:
             name, pose = todo.pop(0)
@@ -253,7 +253,7 @@ class UrdfTree:
 
 
 def read(source: str, where: str) -> UrdfTree:
-    """Read the text of a URDF; `where` names it in messages.
+    """Return the checked tree of a URDF text; `where` names it in messages.
 
     Raises:
         RobotError: with the line, for broken XML, xacro, unknown kinds, missing parts, loops, second parents, and
@@ -278,7 +278,7 @@ def read(source: str, where: str) -> UrdfTree:
         if joint.child in above:
             both = f"'{above[joint.child].name}' and '{joint.name}'"
             place = f"{where}, line {joint.node.line}"
-            refuse_robot(place, f"link '{joint.child}' has two parents, joints {both}; a URDF is a tree")
+            refuse_robot(place, f"link '{joint.child}' has two parents, joints {both}; a URDF must be a tree")
         above[joint.child] = joint
         below[joint.parent].append(joint)
     name, remarks = root.attributes.get("name", "robot"), _large_angles(joints, where)
@@ -288,7 +288,7 @@ def read(source: str, where: str) -> UrdfTree:
 
 
 def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
-    """Return in words a joint whose origin is turned by more than a full turn; several of them are degrees.
+    """Return a remark on a joint origin rotated by more than a full turn; refuse several (degrees).
 
     Raises:
         RobotError: for several joints.
@@ -306,7 +306,7 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
 
 
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return standard parameters (10,) about the frame in which the body's frame has this pose (4, 4).
+    """Return standard parameters (10,) transformed to the frame in which the body's frame has this pose (4, 4).
 
     With R, p of the pose and mc = (MX, MY, MZ): mc' = R mc + M p, and
     I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M S(p)'S(p)  (Khalil and Dombre, 2002, eq. 9.25, signs of the matrix).
@@ -325,12 +325,12 @@ def _skew(v: np.ndarray) -> np.ndarray:
 
 
 def _is_macro(node: Node) -> bool:
-    """Return whether a node is a xacro call or include; properties and arguments that xacro leaves are harmless."""
+    """Return whether a node is a xacro call or include (leftover properties and arguments are accepted)."""
     return node.tag.startswith("xacro:") and node.tag not in ("xacro:property", "xacro:arg")
 
 
 def _fresh(node: Node, known: Iterable[str], where: str) -> str:
-    """Return the name of a link or joint, which has to be there and new."""
+    """Return the name of a link or joint; refuse a missing or duplicate name."""
     name = node.attributes.get("name", "")
     require(name, f"{where}, line {node.line}: a <{node.tag}> without a name", RobotError)
     require(name not in known, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
@@ -341,7 +341,7 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     name, kind = node.attributes["name"], node.attributes.get("type", "")
     place = f"{where}, line {node.line}, joint '{name}'"
     if kind not in KINDS:
-        refuse_robot(place, f"type '{kind}' is none of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
+        refuse_robot(place, f"type '{kind}' is not one of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
     ends = [_end(node, role, links, place) for role in ("parent", "child")]
     return JointTag(
         name=name,
@@ -357,17 +357,17 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
 
 
 def _end(node: Node, role: str, links: Iterable[str], place: str) -> str:
-    """Return the parent or child link of a joint."""
+    """Return the name of a joint's parent or child link."""
     child = node.first(role)
     if child is None or not (link := child.attributes.get("link")):
         refuse_robot(place, f"no <{role} link=.../>")
     if link not in links:
-        refuse_robot(place, f"its {role} '{link}' is no link of this file{suggestion(link, list(links))}")
+        refuse_robot(place, f"its {role} '{link}' is not a link of this file{suggestion(link, list(links))}")
     return link
 
 
 def origin(node: Node, place: str) -> np.ndarray:
-    """Return the (4, 4) of a node's first <origin>; the identity where it has none."""
+    """Return the transform (4, 4) of a node's first <origin>; the identity if absent."""
     found = node.first("origin")
     if found is None:
         return np.eye(4)
@@ -394,7 +394,7 @@ def _mimic(node: Node, place: str) -> Mimic | None:
 
 
 def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float, tuple[str, ...]]:
-    """Return lower, upper, velocity, effort, and which of the last two are below `MIN_LIMIT`, as written.
+    """Return the limits lower, upper, velocity, effort, and the last two as text if below `MIN_LIMIT`.
 
     Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF demands velocity and effort, so 0
     is what people write who do not know them, and 1e9 is what we write.
@@ -417,7 +417,7 @@ def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, flo
 
 
 def _body(node: Node, where: str) -> np.ndarray | None:
-    """Return the standard parameters (10,) of a link about its frame; None where it has no mass."""
+    """Return the standard parameters (10,) of a link about its frame; None without mass."""
     place = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
     inertial = node.first("inertial")
     if inertial is None:
@@ -433,7 +433,7 @@ def _body(node: Node, where: str) -> np.ndarray | None:
 
 
 def numbers(node: Node, key: str, place: str, default: str = "", count: int = 3, infinite: bool = False) -> np.ndarray:
-    """Return the numbers (count,) of an attribute, finite unless they may be `infinite`; `default` where absent."""
+    """Return the numbers (count,) of an attribute, `default` if absent; only finite ones unless `infinite`."""
     found = node.attributes.get(key)
     try:
         values = np.array([float(word) for word in (default if found is None else found).split()])
@@ -451,7 +451,7 @@ def _number(node: Node, key: str, default: float, place: str) -> float:
 
 
 def _check_loops(tree: UrdfTree) -> None:
-    """Refuse links that hang on themselves."""
+    """Refuse a tree with loops of links."""
     reached: set[str] = set()
     todo = tree.roots
     while todo:
@@ -459,5 +459,5 @@ def _check_loops(tree: UrdfTree) -> None:
         reached.add(link)
         todo += [joint.child for joint in tree.below[link]]
     if lost := [link for link in tree.bodies if link not in reached]:
-        refuse_robot(tree.where, f"links {', '.join(lost)} hang on each other in a loop; a URDF is a tree")
+        refuse_robot(tree.where, f"links {', '.join(lost)} form a loop; a URDF must be a tree")
     require(tree.bodies, f"{tree.where}: no <link> found", RobotError)

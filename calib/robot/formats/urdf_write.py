@@ -1,4 +1,4 @@
-"""A `Chain` to URDF: a new file, or the calibrated geometry put into the file one has.
+"""URDF export of a `Chain`: a new file, or an existing file with the calibrated geometry.
 
 `edit` changes the attributes of ``<origin>`` in the text and nothing else, byte for byte: comments, transmissions,
 simulator tags, meshes, order and blanks stay. With F_k(q) the nominal chain's frame behind its k-th moving element and
@@ -48,7 +48,7 @@ ZERO = "0 0 0"
 def put(
     source: str, where: str, bodies: Mapping[str, np.ndarray], friction: Mapping[str, tuple[float, float]] | None = None
 ) -> str:
-    """Return the text with new inertials of some links and new ``<dynamics>`` of some joints.
+    """Return the URDF text with new inertials of some links and new ``<dynamics>`` of some joints.
 
     Args:
         source: the text of a URDF.
@@ -68,7 +68,7 @@ def put(
 
 
 def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return what moves with a link of a path: links fixed to it, and links on other joints that stand at zero.
+    """Return the links that move with a link of a path: links fixed to it, and links after other joints (at zero).
 
     Each by name with its pose (4, 4) in the frame of `link`, which is among the first.
     """
@@ -112,7 +112,7 @@ def _inertial(source: str, link: Node, body: np.ndarray) -> list[tuple[int, int,
 
 
 def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tuple[int, int, str]]:
-    """Return the changes that give a node's first child of this tag these attributes; the child is made if need be."""
+    """Return the changes that set attributes of a node's first child with this tag; a missing child is inserted."""
     found = node.first(tag)
     if found is not None:
         return set_attributes(source, found, values)
@@ -165,7 +165,7 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
 
 
 def write_new(chain: Chain) -> str:
-    """Return a URDF of any chain, with a link frame behind each moving element.
+    """Return the URDF text of any chain, with a link frame after each moving element.
 
     Constant elements are folded into the joint origins. Limits are kept; where velocity or effort is not known 1e9
     stands, since URDF demands a number. A body of unknown inertia has none. Pinocchio reads the same kinematics.
@@ -184,7 +184,7 @@ def write_new(chain: Chain) -> str:
             continue
         main = k in first
         if main and element.ratio != 1.0:
-            refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q itself, not by {element.ratio:g} q")
+            refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q, not by {element.ratio:g} q")
         child = _link_name(chain, k, element.joint, main)
         lines += _link_lines(child, chain.inertias[element.joint] if main and chain.inertias is not None else None)
         lines += _joint_lines(chain, element, chain.joints[element.joint], main, parent, child, before)
@@ -199,7 +199,7 @@ def write_new(chain: Chain) -> str:
 
 
 def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames of the links behind the moving joints of a path, (moving, m, 4, 4), in the path's first link.
+    """Return the frames (moving, m, 4, 4) of the links after a path's moving joints, in the path's first link.
 
     Args:
         path: joints base to tip.
@@ -224,13 +224,13 @@ def _screw(axis: np.ndarray, amount: np.ndarray, slides: bool) -> np.ndarray:
 
 
 def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
-    """Return exp(sign · axis · amount), (4, 4) or (m, 4, 4)."""
+    """Return the motion exp(sign · axis · amount) of an element, (4, 4) or (m, 4, 4)."""
     axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
     return _screw(axis, np.asarray(amount, dtype=float), element.axis[0] == "t")
 
 
 def _check_pair(nominal: Chain, calibrated: Chain) -> None:
-    """Refuse a calibrated chain that is not the nominal one with other values."""
+    """Refuse a calibrated chain that differs from the nominal one in more than values."""
     one, two = (
         [(element.axis, element.joint, element.ratio) for element in chain.elements if element.joint is not None]
         for chain in (nominal, calibrated)
@@ -238,12 +238,12 @@ def _check_pair(nominal: Chain, calibrated: Chain) -> None:
     if nominal.joint_names != calibrated.joint_names or one != two:
         raise RobotError(
             f"the calibrated chain '{calibrated.name}' (joints {', '.join(calibrated.joint_names)}) does not move as "
-            f"the nominal '{nominal.name}' (joints {', '.join(nominal.joint_names)}); give the one it was fitted from"
+            f"the nominal '{nominal.name}' (joints {', '.join(nominal.joint_names)}); give its own nominal robot"
         )
 
 
 def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
-    """Return the URDF's joints from the one link before the first moving joint to the tip, matching the chain's.
+    """Return the URDF's joints from the first moving one to the tip; refuse joints unlike the chain's.
 
     Joints are matched by name, or, where the URDF has none of the names, in the order of its longest chain.
     """
@@ -270,7 +270,7 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
 def _base_offset(
     tree: UrdfTree, path: list[JointTag], nominal: Chain, frames: np.ndarray, links: np.ndarray
 ) -> np.ndarray:
-    """Return the pose (4, 4) of the path's first link in the chain's base, checking that the robots are the same.
+    """Return the pose (4, 4) of the path's first link in the chain's base; refuse a URDF of another robot.
 
     The chain's base is the link of that name where there is one; else whichever link fixed to the foot fits best.
     """
@@ -301,7 +301,7 @@ def _base_offset(
 
 
 def _origins(tree: UrdfTree, path: list[JointTag], wanted: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the new origins (4, 4) by joint name; `wanted` (moving, 4, 4) are the links' frames at q = 0."""
+    """Return the new origins (4, 4) by joint name; `wanted` (moving, 4, 4): link frames at q = 0."""
     frame, origins, k = np.eye(4), {}, 0
     for joint in path:
         if not joint.moves:
@@ -317,7 +317,7 @@ def _origins(tree: UrdfTree, path: list[JointTag], wanted: np.ndarray) -> dict[s
 def _tip_origin(
     tree: UrdfTree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, wanted: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the new origin of the first fixed joint behind the last moving one, where the chain changed there.
+    """Return the new origin of the first fixed joint after the last moving one, if the chain changed there.
 
     Args:
         last, wanted: (4, 4), the last moving link at q = 0 in the chain's base, before and after.
@@ -330,8 +330,8 @@ def _tip_origin(
     if place == len(path):
         refuse_robot(
             tree.where,
-            "the calibrated chain differs behind the last joint, where the URDF has no fixed joint to "
-            f"'{nominal.tip}' that could take it; add one, or leave the elements of the tool to the tool",
+            "the calibrated chain differs after the last joint, but the URDF has no fixed joint to "
+            f"'{nominal.tip}' for the difference; add one, or calibrate without elements of the tool",
         )
     rest = np.eye(4)
     for joint in path[place + 1 :]:
@@ -342,7 +342,7 @@ def _tip_origin(
 
 
 def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int, int, str]]:
-    """Return the changes that write a new origin; what is the same to 1e-12 stays as it is written."""
+    """Return the changes that write a joint's new origin; values equal to 1e-12 stay as written."""
     xyz, rpy = to_xyz_rpy(origin)
     values = {}
     if np.abs(xyz - joint.origin[:3, 3]).max() > UNCHANGED:
@@ -358,12 +358,12 @@ def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int,
 
 
 def _numbers(values: np.ndarray) -> str:
-    """Return numbers in full (repr), what is below 1e-15 as 0."""
+    """Return numbers as text in full precision (repr), values below 1e-15 as 0."""
     return " ".join("0" if abs(value) < 1e-15 else repr(value) for value in values.tolist())
 
 
 def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
-    """Return the name of the link behind element k, moved by `joint`: the chain's, if base and tip leave it.
+    """Return the name of the link after element k, moved by `joint`: the chain's, unless base or tip has it.
 
     The tip's name may go to the last link where nothing follows it.
     """
@@ -385,7 +385,7 @@ def _placed(parent: str, child: str, origin: np.ndarray) -> list[str]:
 def _joint_lines(
     chain: Chain, element: Element, joint: Joint, main: bool, parent: str, child: str, origin: np.ndarray
 ) -> list[str]:
-    """Return one moving <joint>; a second element of a joint becomes a mimic joint."""
+    """Return the lines of a moving <joint>; a second element of a joint becomes a mimic joint."""
     free = not np.isfinite([joint.lower, joint.upper]).any()
     kind = "prismatic" if element.axis[0] == "t" else "continuous" if free else "revolute"
     axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
@@ -403,7 +403,7 @@ def _limit(value: float) -> str:
 
 
 def _link_lines(name: str, body: np.ndarray | None) -> list[str]:
-    """Return one <link>, with its inertia about the centre of mass where it is known."""
+    """Return the lines of a <link>, with its inertia about the centre of mass if known."""
     if body is None or not body.any():
         return [f"  <link name={quoteattr(name)}/>"]
     mass, centre, about = centred(body)

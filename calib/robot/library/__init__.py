@@ -1,4 +1,4 @@
-"""Robots as data: one TOML table each, with the source of its numbers."""
+"""Library of robots: one TOML file each, with the source of its numbers."""
 
 from importlib import resources
 from pathlib import Path
@@ -13,5 +13,5 @@ def names() -> tuple[str, ...]:
 
 
 def path(name: str) -> Path:
-    """Return the file of a robot, or of a robot's simulated truth (``lwr4plus_truth``)."""
+    """Return the path of the file of a library robot, or of its simulated truth (``lwr4plus_truth``)."""
     return Path(str(resources.files(__name__).joinpath(f"{name}.toml")))

@@ -230,7 +230,7 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"M": -2.0}, "body behind A4: a negative mass"),
+        ({"M": -2.0}, "body after A4: a negative mass"),
         ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is no limit)"),
         ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is no limit)"),
         ({"velocity": np.inf}, "no limit for the speed of A4; without it"),

@@ -150,7 +150,7 @@ def test_joint_names_choose_the_chain():
     "options, message",
     [
         ({}, r"several chains with 3 actuated joints, to the links left2, right2; choose one as tip"),
-        ({"joint_names": ["l1", "l2"]}, r"joints the measurements do not name: torso; choose base and tip"),
+        ({"joint_names": ["l1", "l2"]}, r"some joints are not in the measurements: torso; choose base and tip"),
         ({"joint_names": ["torso", "l1", "r1"]}, r"joint '[lr]1' is not between 'base' and '(left|right)1'"),
         (
             {"joint_names": ["torso", "l11"]},
@@ -158,9 +158,9 @@ def test_joint_names_choose_the_chain():
         ),
         ({"tip": "left_2"}, r"no link 'left_2' for the tip .did you mean 'left2'"),
         ({"base": "bass", "tip": "left2"}, r"no link 'bass' for the base .did you mean 'base'"),
-        ({"base": "left1", "tip": "right2"}, r"link 'right2' does not hang on 'left1'"),
+        ({"base": "left1", "tip": "right2"}, r"link 'right2' does not follow 'left1'"),
         ({"base": "left2", "tip": "left2"}, r"no actuated joint between 'left2' and 'left2'"),
-        ({"base": "left2"}, r"no actuated joint hangs on 'left2'"),
+        ({"base": "left2"}, r"no actuated joint follows 'left2'"),
     ],
 )
 def test_wrong_choices(options, message):
@@ -184,18 +184,15 @@ def three(*joints: str) -> str:
         ("<robot name='x'><link name='a'/><link name='a'/></robot>", r"line 1: a second link named 'a'"),
         ("<robot name='x'><link/></robot>", r"line 1: a <link> without a name"),
         ("<robot name='x'><link name='a'/><joint type='fixed'/></robot>", r"line 1: a <joint> without a name"),
-        (three(joint("j", "revolut", "a", "b")), r"line 2, joint 'j': type 'revolut' is none of .*'revolute'"),
-        (three(joint("j", "revolute", "a", "bb")), r"its child 'bb' is no link of this file"),
+        (three(joint("j", "revolut", "a", "b")), r"line 2, joint 'j': type 'revolut' is not one of .*'revolute'"),
+        (three(joint("j", "revolute", "a", "bb")), r"its child 'bb' is not a link of this file"),
         (three('<joint name="j" type="fixed"><child link="b"/></joint>'), r"joint 'j': no <parent link"),
         (three(joint("j", "fixed", "a", "b") * 2), r"line 3: a second joint named 'j'"),
         (
             three(joint("j", "fixed", "a", "c"), joint("k", "fixed", "b", "c")),
-            r"line 3: link 'c' has two parents, joints 'j' and 'k'; a URDF is a tree",
+            r"line 3: link 'c' has two parents, joints 'j' and 'k'; a URDF must be a tree",
         ),
-        (
-            three(joint("j", "fixed", "b", "c"), joint("k", "fixed", "c", "b")),
-            r"links b, c hang on each other in a loop",
-        ),
+        (three(joint("j", "fixed", "b", "c"), joint("k", "fixed", "c", "b")), r"links b, c form a loop"),
         (three(joint("j", "revolute", "a", "b", axis("0 0 0"))), r"joint 'j': its axis is zero"),
         (
             three(joint("j", "revolute", "a", "b", axis("0 0 nan"))),
@@ -228,7 +225,7 @@ def test_bad_files(source, message):
     [
         (("revolute", "b"), ("revolute", ""), ("fixed", ""), r"joint 'a': the joint it mimics, 'b', comes after it"),
         (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': it mimics a circle"),
-        (("revolute", ""), ("revolute", "aa"), ("revolute", ""), r"joint 'b': it mimics 'aa', which is no joint"),
+        (("revolute", ""), ("revolute", "aa"), ("revolute", ""), r"joint 'b': it mimics 'aa', which is not a joint"),
         (("revolute", ""), ("floating", ""), ("revolute", ""), r"joint 'b': type 'floating' cannot be part of an arm"),
     ],
 )

@@ -168,7 +168,7 @@ def test_what_changed_behind_the_last_joint_goes_to_the_first_fixed_joint():
     q = random_joints(nominal, 5)
     assert np.abs(pinocchio_poses(edited, calibrated, q) - forward(calibrated, q)).max() < 1e-12
     bare = re.sub(r'\s*<link name="tip"/>\s*<joint name="tip_fixed".*?</joint>', "", source, flags=re.S)
-    with pytest.raises(RobotError, match=r"differs behind the last joint, where the URDF has no fixed joint to 'tip'"):
+    with pytest.raises(RobotError, match=r"differs after the last joint, but the URDF has no fixed joint to 'tip'"):
         urdf_write.edit(bare, nominal, calibrated)
 
 
@@ -224,7 +224,7 @@ def test_new_urdf_of_any_chain():
 def test_a_second_ratio_cannot_be_written():
     chain = urdf.parse(robot(joint("a", "revolute", "base", "one", axis("0 0 1")), links="base one"))
     elements = (*chain.elements[:-1], urdf.Element("a.offset", "rz", 0.0, 0, 0, ratio=2.0))
-    with pytest.raises(RobotError, match=r"'a.offset': a URDF joint moves by q itself, not by 2 q"):
+    with pytest.raises(RobotError, match=r"'a.offset': a URDF joint moves by q, not by 2 q"):
         urdf_write.write_new(Chain("x", chain.joints, elements))
 
 
