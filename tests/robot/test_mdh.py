@@ -173,7 +173,7 @@ def row(**entry) -> dict:
             {"name": "bad", "joint": [{}], "tail": {"xyz": [0, 0, 1], "rotation": 1}},
             r"\[tail\]: there is no key 'rotation'",
         ),
-        ({"name": "bad", "joint": [{}], "propose_beta": "no"}, r"propose_beta has to be true or false"),
+        ({"name": "bad", "joint": [{}], "propose_beta": "no"}, r"propose_beta must be true or false"),
         ({"name": "bad", "joints": [{}]}, r"there is no key 'joints' .did you mean 'joint'"),
     ],
 )
