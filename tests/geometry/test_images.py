@@ -219,9 +219,9 @@ def test_a_gross_corner_and_images_that_contradict_all_others_are_left_out_and_n
     pixel[[5, 6]] = np.array(block.size) - 1.0 - pixel[[5, 6]]
     q[[20, 30]] = q[[30, 20]]
     said = complete_camera(cell.cell.nominal, replace(block, pixel=pixel)).notes
-    assert "2 images are left out" in said[0] and "turned by 180°" in said[0]
+    assert "2 images are excluded" in said[0] and "turned by 180°" in said[0]
     assert said[0].endswith("(0006.png, 0007.png)")
-    assert said[1].startswith("1 of ") and said[1].endswith("left out: corner 10 of 0004.png")
+    assert said[1].startswith("1 of ") and said[1].endswith("excluded: corner 10 of 0004.png")
     done, _, _ = started(cell, replace(block, pixel=pixel, q=q, lens=cell.lens))
     assert set(done.rows) == set(block.rows) - {6, 7, 21, 31}
 
@@ -263,14 +263,14 @@ def test_rows_shifted_by_one_are_said_to_be():
     with pytest.raises(MeasurementError, match=r"shifted by 1 row: .* further down"):
         complete_camera(cell.cell.nominal, shifted)
     mixed = replace(block, q=block.q[np.random.default_rng(0).permutation(40)])
-    with pytest.raises(MeasurementError, match="do not belong together"):
+    with pytest.raises(MeasurementError, match="images and joint values do not match"):
         complete_camera(cell.cell.nominal, mixed)
 
 
 def test_a_board_of_another_square_is_refused_with_its_size():
     cell, block = study()
     wrong = replace(block, board=replace(block.board, square=0.025, marker=0.0175))
-    with pytest.raises(MeasurementError, match=r"square of the board is (29\.\d|30\.\d).* board.toml says 25.00"):
+    with pytest.raises(MeasurementError, match=r"square of the board is (29\.\d|30\.\d).* 25.00 in board.toml"):
         complete_camera(cell.cell.nominal, wrong)
 
 

@@ -73,5 +73,5 @@ def test_a_calibrated_robot_reads_back_as_it_was_written(tmp_path):
 
 def test_a_geometry_good_only_with_its_corrections_is_not_taken_for_a_robot():
     found = geometry("harmonics").selection.fit
-    with pytest.raises(UsageError, match="needs the best fit without them"):
+    with pytest.raises(UsageError, match="needs the best fit without corrections"):
         calibrated_chain(found)

@@ -80,7 +80,7 @@ def compare(
     tip: str | None = None,
     seed: Seed = 0,
 ) -> None:
-    """Rank identification methods on recordings of your robot by their prediction of other motion.
+    """Rank identification methods on recordings of your robot.
 
     The recommended method gets the verdict of calib identify; if it is fail, none is recommended: exit code 1.
 

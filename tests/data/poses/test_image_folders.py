@@ -77,7 +77,7 @@ def test_useless_images_are_left_out_and_said_to_be(folder):
     notes = " | ".join(block.notes)
     assert "1 of 7 rows have no image: 0006.png" in notes and "no row in joints.csv: extra.png" not in notes
     assert "(cannot be read as an image" in notes and "was it copied whole?): 0002.png" in notes
-    assert "360 x 480 pixels, where most are 480 x 360; was it turned by a program?): 0004.png" in notes
+    assert "360 x 480 pixels, where most are 480 x 360; did a program rotate it?): 0004.png" in notes
     assert "(no board found: out of view, hidden, blurred or in glare): 0005.png" in notes
 
 
@@ -97,7 +97,7 @@ def test_too_few_usable_images_are_refused_with_the_reasons(folder):
         (lambda f: [p.unlink() for p in f.glob("*.png")], "none of the images named in joints.csv exists"),
         (
             lambda f: write_lens(Lens(LENS.model, LENS.values, (640, 480)), f / "camera.yaml"),
-            "is about images of 640 x 480 pixels, those beside it have 480 x 360",
+            "is for images of 640 x 480 pixels, the images here have 480 x 360",
         ),
     ],
 )

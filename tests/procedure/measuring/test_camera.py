@@ -105,7 +105,7 @@ def test_images_without_a_board_are_an_error(tmp_path, capsys):
     for k in range(2):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((200, 300), 128, np.uint8))
     assert run(["images", str(tmp_path)]) == 2
-    assert "none of 2 images is of use (ChArUco" in capsys.readouterr().err
+    assert "none of 2 images is usable (ChArUco" in capsys.readouterr().err
 
 
 def test_a_board_that_was_measured_is_kept(tmp_path):
@@ -130,7 +130,7 @@ def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):
         (["--paper", "b5"], "--paper b5: expected one of a4"),
         (["--dictionary", "5x5"], "dictionary: expected one of"),
         (["--square", "0.03"], "--square counts in mm"),
-        (["--columns", "3", "--rows", "3"], "has 4 corners; an image counts from 8 on"),
+        (["--columns", "3", "--rows", "3"], "has 4 corners, an image needs 8"),
     ):
         assert run(["board", "--out", str(tmp_path), *wrong]) == 2
         assert words in capsys.readouterr().err
