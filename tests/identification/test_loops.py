@@ -110,7 +110,8 @@ def test_didim_is_a_method_of_its_own(robot, tmp_path):
     _, stated = identify(robot, tmp_path, train, GAINS + "instruments = 'didim'\n", "iv")
     found = json.loads((named / "metrics.json").read_text())
     assert (
-        found["method"] == found["loop"]["instruments"] == "didim" and "no measured position" in found["method_assumes"]
+        found["method"] == found["loop"]["instruments"] == "didim"
+        and "measured positions are not used" in found["method_assumes"]
     )
     assert (named / "estimate.csv").read_text() == (stated / "estimate.csv").read_text()
     assert friction_error(named) < 0.15
