@@ -1,7 +1,7 @@
 """The exceptions of the toolkit, and findings: one base class, and subclasses with the data a caller needs.
 
 Every message says what was found, where, and what to try. ``poses`` and ``trajectories`` import nothing from here and
-raise their own subclasses of `ValueError`.
+raise their own subclasses of `ValueError`. Also the small texts that messages share: lists, counts, commands.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -203,6 +203,17 @@ def suggestion(word: str, words: Collection[str]) -> str:
     lower = {str(other).lower(): other for other in words}
     close = difflib.get_close_matches(word.lower(), lower, 1, 0.6)
     return f" (did you mean '{lower[close[0]]}'?)" if close else ""
+
+
+def listing(names: Iterable[object], most: int = 12) -> str:
+    """Return the first `most` names separated by commas, and the number of further ones."""
+    words = [str(name) for name in names]
+    return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return a count with its noun, as ``1 pose`` or ``3 poses``; `plural` if it is not noun + s."""
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 @contextmanager

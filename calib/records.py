@@ -5,7 +5,8 @@ JSON holds, field by field under the fields' names; `read_record` turns that int
 field: nothing else has to be written. What a record computes and readers of the file want is a `stored` property.
 
 JSON has no NaN: arrays annotated `Array`, and numbers annotated `Number`, hold it as null; in any other field a number
-that is not finite is a mistake, which `calib.files.write_json`, the writer of all records, refuses.
+that is not finite is a mistake, which `calib.files.write_json`, the writer of all records, refuses. Arrays of records
+are read-only (`Frozen`).
 """
 
 import csv
@@ -19,9 +20,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from calib.arrays import frozen
-from calib.errors import UsageError
+from calib.errors import CalibError, UsageError
 
 T = TypeVar("T")
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")  # what a spreadsheet's formula begins with, and our own mark
@@ -193,3 +194,36 @@ def _adapter(kind: Any) -> Any:
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
+
+
+def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
+    """Return a read-only, C-contiguous copy of `values`."""
+    array = np.array(values, dtype=dtype, order="C")
+    array.flags.writeable = False
+    return array
+
+
+class Frozen:
+    """Base of dataclasses whose fields annotated ``np.ndarray`` become read-only copies (floats or booleans)."""
+
+    def __post_init__(self) -> None:
+        for one in fields(self):  # type: ignore[arg-type]
+            if one.type in (np.ndarray, "np.ndarray"):
+                value = np.asarray(getattr(self, one.name))
+                object.__setattr__(self, one.name, frozen(value, bool if value.dtype == bool else float))
+
+
+def shaped(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """Return `values` as a finite float array of `shape` (None: any length).
+
+    Raises:
+        CalibError: with the expected and the found shape, or the index of the first value that is not finite.
+    """
+    array = np.asarray(values, dtype=float)
+    if array.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, array.shape)):
+        expected = "(" + ", ".join("any" if want is None else str(want) for want in shape) + ")"
+        raise CalibError(f"{name}: expected an array of shape {expected}, found {array.shape}")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise CalibError(f"{name}: value at index {where} is not finite ({array[where]})")
+    return array

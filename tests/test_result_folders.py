@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import estimate_files, files
+from calib import files, folders
 from calib.errors import CalibError, RobotError, UsageError
 from calib.folders import METRICS, check_target, write_staged
 
@@ -71,13 +71,13 @@ def test_links_that_lead_nowhere_are_no_targets(tmp_path: Path) -> None:
 def test_a_covariance_comes_back_by_names_of_any_kind(tmp_path: Path) -> None:
     names = ("plain", 'day1, "left"\nof it', "ü")
     matrix = np.diag([1.0, 2.0, 3.0])
-    path = tmp_path / estimate_files.COVARIANCE
-    estimate_files.write_covariance(path, names, matrix)
-    found = estimate_files.read_covariance(tmp_path)
+    path = tmp_path / folders.COVARIANCE
+    folders.write_covariance(path, names, matrix)
+    found = folders.read_covariance(tmp_path)
     assert found[0] == names and np.array_equal(found[1], matrix)
     path.write_text(path.read_text().replace("ü,", "u,", 1))
     with pytest.raises(RobotError, match="parameter names of rows and columns differ"):
-        estimate_files.read_covariance(tmp_path)
+        folders.read_covariance(tmp_path)
 
 
 def test_files_written_together_appear_together(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from calib import files
 from calib.api.rendering import Judged, data_frame, listed, optional, progress_shown, saved
 from calib.arguments import checked
-from calib.arrays import shaped
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
@@ -27,7 +26,7 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSetti
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import plain
+from calib.records import plain, shaped
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import joint_kinds
 from calib.workers.threads import one_blas_thread

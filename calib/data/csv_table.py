@@ -21,10 +21,9 @@ from typing import IO, NoReturn
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.files import check_regular
-from calib.records import plain_text
+from calib.records import frozen, plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.dynamics.idim import IdentificationModel, friction_states
 from calib.dynamics.regressor_model import Loads, RegressorModel, States
 from calib.errors import CalibError
 from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.triangles import retriangulate
+from calib.records import frozen, shaped
 
 SAMPLES = 500
 MIN_COEFFICIENT = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small

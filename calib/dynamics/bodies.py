@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.errors import RobotError
+from calib.records import frozen, shaped
 from calib.robot.chain import AXES, Chain, Element, check_gravity
 from calib.transforms import pose
 

@@ -7,7 +7,6 @@ first.
 import numpy as np
 from numba import njit
 
-from calib.arrays import frozen
 from calib.dynamics.kernels import (
     COORDINATE,
     DEPTH,
@@ -22,6 +21,7 @@ from calib.dynamics.kernels import (
     carry,
     place,
 )
+from calib.records import frozen
 
 
 @njit(**OPTIONS)

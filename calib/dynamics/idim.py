@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import FIXED, PRISMATIC, Bodies, bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -21,6 +20,7 @@ from calib.dynamics.regressor_model import Loads, RegressorModel, States
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import BODIES, MOTOR, TorqueRows
 from calib.errors import CalibError
+from calib.records import shaped
 from calib.robot.chain import Chain
 
 KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}  # YY MZ M; XX to ZZ, in frames with axis z

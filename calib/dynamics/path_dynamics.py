@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
+from calib.records import frozen, shaped
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 

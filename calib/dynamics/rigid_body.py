@@ -7,9 +7,9 @@ A static arm's drives show +g(q). numba is imported at the first call, not befor
 
 import numpy as np
 
-from calib.arrays import shaped
 from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies, bodies_of, standard_parameters
 from calib.errors import refuse_robot
+from calib.records import shaped
 from calib.robot.chain import Chain
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import frozen
+from calib.records import frozen
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,9 @@ from itertools import count
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import frozen, shaped
 from calib.errors import CalibError, NotConverged, require
 from calib.estimation.triangles import require_rank
+from calib.records import frozen, shaped
 
 ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import Frozen
+from calib.records import Frozen
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
-from calib.arrays import shaped
 from calib.errors import Unidentifiable, require
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
@@ -29,7 +28,7 @@ from calib.estimation.triangles import (
     retriangulate,
     solve_triangle,
 )
-from calib.records import Number, stored
+from calib.records import Number, shaped, stored
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import Frozen, shaped
 from calib.errors import CalibError, NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
 from calib.estimation.triangles import Triangles, combine, retriangulate, solve_triangle
+from calib.records import Frozen, shaped
 
 
 @dataclass(frozen=True, eq=False)

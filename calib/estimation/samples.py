@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import frozen, shaped
 from calib.errors import CalibError, NotConverged
 from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit, leverage, wls
 from calib.estimation.triangles import Triangles, absorb, combine, empty, solve_triangle
+from calib.records import frozen, shaped
 
 CHUNK = 2000  # samples whitened at a time
 ROUNDS = 200

@@ -7,11 +7,11 @@ payload (Gautier & Briot 2014): [V -W] [g; χ] = y, y the torque of the payload.
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import shaped
 from calib.errors import CalibError, Unidentifiable
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
+from calib.records import shaped
 
 
 def tls(

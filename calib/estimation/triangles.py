@@ -16,9 +16,8 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg.lapack import dgeqrf  # type: ignore[attr-defined]
 
-from calib.arrays import frozen, shaped
-from calib.errors import CalibError, Unidentifiable, require
-from calib.words import listing
+from calib.errors import CalibError, Unidentifiable, listing, require
+from calib.records import frozen, shaped
 
 ADVICE = "choose base columns first (columns.split_columns), or add motion that distinguishes them"
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from calib.arrays import frozen, shaped
 from calib.errors import CalibError
-from calib.records import Array, Number
+from calib.records import Array, Number, frozen, shaped
 
 
 @dataclass(frozen=True, eq=False)

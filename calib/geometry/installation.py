@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import CalibError, RobotError, refused_as
 from calib.extensions import needed
-from calib.records import read_record
+from calib.records import frozen, read_record
 from calib.robot import calibrated
 from calib.robot.calibrated import Deflection, extra_displacements, nominal_of
 from calib.robot.chain import Chain

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.arrays import Frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.constrained import minimise
+from calib.records import Frozen
 
 
 @dataclass(frozen=True, eq=False)

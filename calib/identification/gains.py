@@ -21,11 +21,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.rows import pool
-from calib.records import Array
+from calib.records import Array, frozen
 
 LEFT = 1.6  # by which relative gains are further off than noise and blocks of time show: what the model leaves moves
 # them alike all along a recording. 13 gains of a UR10e, of four recordings, are rms 1.6 such sigmas from the maker's

@@ -45,7 +45,7 @@ from typing import Any
 
 import numpy as np
 
-from calib import estimate_files
+from calib import folders
 from calib.dynamics.base import Base, expressions
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -117,7 +117,7 @@ def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
     Raises:
         RobotError: where the file is damaged.
     """
-    return estimate_files.read_covariance(folder) if (folder / estimate_files.COVARIANCE).is_file() else None
+    return folders.read_covariance(folder) if (folder / folders.COVARIANCE).is_file() else None
 
 
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
             name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
             for name, row in zip(base.names, base.transform)
         },
-        "covariance": estimate_files.COVARIANCE,
+        "covariance": folders.COVARIANCE,
         "note": NOTE,
     }
 

@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.arrays import Frozen, frozen
 from calib.config import strict
 from calib.config_types import Checked, Expect, Flag, Real, Text, Whole
 from calib.dynamics import base as bases
@@ -28,7 +27,7 @@ from calib.estimation.constrained import Constrained, Definite, contradicting, r
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
 from calib.identification.body_cone import BodyCone, cone_of
-from calib.records import Number
+from calib.records import Frozen, Number, frozen
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 MIN_EIGENVALUE = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all

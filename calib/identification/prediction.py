@@ -8,10 +8,10 @@ from typing import Generic
 import numpy as np
 from typing_extensions import TypeVar
 
-from calib.arrays import Frozen
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
 from calib.identification.rows import BLOCK, Case, segmented_states
+from calib.records import Frozen
 
 Model = TypeVar("Model", bound=RegressorModel, default=IdentificationModel, covariant=True)
 

@@ -37,7 +37,6 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from calib.arrays import frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
@@ -48,6 +47,7 @@ from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
 from calib.identification.time_folds import CrossValidation, Regimes
+from calib.records import frozen
 from calib.robot.chain import Chain
 
 RADIUS = 0.1  # [m] of the balls that rods are made of

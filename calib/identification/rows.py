@@ -12,7 +12,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import Decimator, decimate, decimate_blocks, kept, slope
 from calib.data.signals.motion import Motion, moving
 from calib.dynamics import drives
@@ -21,6 +20,7 @@ from calib.dynamics.regressor_model import RegressorModel
 from calib.dynamics.torque_rows import MOTOR, POWER, TorqueRows
 from calib.errors import UsageError, refuse_data
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
+from calib.records import frozen
 
 
 @dataclass(frozen=True, eq=False)

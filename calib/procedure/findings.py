@@ -22,9 +22,8 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
-from calib.errors import Finding, UsageError, suggestion
+from calib.errors import Finding, UsageError, listing, suggestion
 from calib.units import DEG
-from calib.words import listing
 
 RANKS = ("", "note", "marginal", "fail")
 UNITS = {"mm": 1e3, "µm": 1e6, "mrad": 1e3, "°": 1 / DEG, "%": 100.0, "ms": 1e3}  # SI -> as printed; others as they are

@@ -41,9 +41,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.arrays import frozen, shaped
 from calib.errors import CalibError, RobotError, one_of, refuse_robot
-from calib.estimate_files import read_covariance, write_covariance
+from calib.folders import read_covariance, write_covariance
+from calib.records import frozen, shaped
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames, sweep, tip_jacobian

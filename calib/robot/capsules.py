@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import shaped
-from calib.errors import RobotError, refuse_robot
+from calib.errors import RobotError, listing, refuse_robot
+from calib.records import shaped
 from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.kinematics import sweep
-from calib.words import listing
 
 ALWAYS = 0.95
 SAMPLES = 200

@@ -14,8 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.errors import RobotError, refuse_robot, require
+from calib.records import frozen
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import shaped
 from calib.errors import refuse_robot
+from calib.records import shaped
 from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, check_reachable, closing, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf

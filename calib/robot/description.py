@@ -41,10 +41,9 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import RobotError, refuse_robot, require
+from calib.errors import RobotError, listing, refuse_robot, require
 from calib.robot import mdh, tables
 from calib.robot.chain import Chain, Element, Joint
-from calib.words import listing
 
 
 def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:

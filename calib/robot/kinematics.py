@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import shaped
+from calib.records import shaped
 from calib.robot.chain import AXES, Chain, Element
 from calib.transforms import pose
 

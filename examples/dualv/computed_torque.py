@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import run_kernels
 
-from calib.arrays import frozen
 from calib.dynamics import rigid_body
 from calib.dynamics.drives import added_inertia
 from calib.errors import CannotSimulate, UsageError
+from calib.records import frozen
 from calib.rooms.parallel.mechanism.leg_links import compiled
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, wrench_regressor
 from calib.rooms.parallel.mechanism.platform_motion import along

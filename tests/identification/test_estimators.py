@@ -10,8 +10,8 @@ import planted_motion as planted
 import pytest
 from without_figures import run
 
-from calib.estimate_files import read_estimate
 from calib.estimation.triangles import collect
+from calib.folders import read_estimate
 from calib.identification.identify import identify as fit
 from calib.identification.methods.least_squares import scaled_tls
 from calib.identification.methods.registry import METHODS

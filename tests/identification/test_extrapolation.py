@@ -6,7 +6,6 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import design_decimator
 from calib.dynamics import drives
 from calib.dynamics.shapes import Joined
@@ -17,6 +16,7 @@ from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.identification.time_folds import regimes
+from calib.records import frozen
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 COUPLED = drives.coupled(1, 2, label="2.3")

@@ -6,10 +6,10 @@ import numpy as np
 import planted_motion
 import pytest
 
-from calib.arrays import frozen
 from calib.dynamics.shapes import Joined
 from calib.identification.friction import ripple
 from calib.identification.friction.ripple import GearTravel
+from calib.records import frozen
 
 RATE, TURNS = 500.0, 100
 

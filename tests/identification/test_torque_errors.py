@@ -6,7 +6,6 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
-from calib.arrays import frozen
 from calib.identification.identify import Identification, identify
 from calib.identification.prediction import predict
 from calib.identification.rows import Case
@@ -18,6 +17,7 @@ from calib.identification.uncertainty.torque_errors import (
     learn_torque_errors,
     parameter_variances,
 )
+from calib.records import frozen
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 

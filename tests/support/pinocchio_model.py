@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import shaped
 from calib.dynamics.bodies import PRISMATIC, Bodies, bodies_of
 from calib.errors import RobotError
+from calib.records import shaped
 from calib.robot.chain import Chain
 
 # Pinocchio's dynamic parameters are M MX MY MZ XX XY YY XZ YZ ZZ; ours in their order:

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.arrays import frozen
 from calib.errors import MeasurementError, require
+from calib.records import frozen
 
 
 @dataclass(frozen=True, eq=False)

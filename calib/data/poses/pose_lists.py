@@ -47,7 +47,6 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from calib import files
-from calib.arrays import frozen, shaped
 from calib.column_changes import assigned
 from calib.data.csv_table import read_table
 from calib.data.poses import plausible
@@ -56,9 +55,9 @@ from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plausible import Limits
 from calib.data.schema import BOUNDS
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, listing
+from calib.records import frozen, shaped
 from calib.units import ANGLES, LENGTHS
-from calib.words import listing
 
 MAX_JOINT_DIFFERENCE = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
 

@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.data.csv_table import Table, read_header, read_table, row_width
 from calib.data.poses.fit_options import FileOptions
 from calib.errors import MeasurementError, refuse_data, require
+from calib.records import frozen
 from calib.units import DEG
 
 _POSE_MARKS = ("w", "rx", "r", "a")

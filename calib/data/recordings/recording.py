@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.arrays import frozen
 from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option
+from calib.records import frozen
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")

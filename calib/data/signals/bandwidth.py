@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import factor_for, hann
 from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
+from calib.records import frozen
 
 SHARE = 0.95  # of the acceleration power that is the motion
 LOWEST = 2.0  # [Hz]; friction turns faster than slow trajectories do

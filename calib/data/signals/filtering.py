@@ -17,8 +17,8 @@ import numpy as np
 from scipy.linalg.lapack import dtbtrs  # type: ignore[attr-defined]
 from scipy.special import i0
 
-from calib.arrays import frozen
 from calib.errors import MeasurementError, require
+from calib.records import frozen
 
 KINDS = ("chebyshev", "kaiser")
 SHARE = 0.8  # of the new Nyquist frequency that is kept

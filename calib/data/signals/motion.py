@@ -14,7 +14,6 @@ from typing import Annotated
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calib.arrays import frozen
 from calib.config import strict
 from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.archives import read_archived_positions
@@ -26,6 +25,7 @@ from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_
 from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample
 from calib.errors import MeasurementError, UsageError, refuse_data, refused_as
 from calib.files import check_regular
+from calib.records import frozen
 
 # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
 STANDSTILL_SHARE = 0.01

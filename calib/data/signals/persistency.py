@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from calib.data.signals.filtering import hann
 from calib.data.signals.motion import Motion
-from calib.words import listing
+from calib.errors import listing
 
 SINE = 0.98  # of the variance: a joint that moves as one sine
 MIN_TRAVEL = 1e-3  # a joint that goes less far has not moved [rad or m]

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
-from calib.arrays import frozen
 from calib.data.recordings.recording import SERIES, Recording, settled
 from calib.errors import UsageError, refuse_data, require
+from calib.records import frozen
 
 GAP = 0.05  # the longest time without a sample that is bridged [s]; our choice
 CLOCKS = ("stamps", "even", "counted")

@@ -26,13 +26,13 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
+from calib.errors import counted
 from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare
 from calib.records import stored
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.words import counted
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import low_pass
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import Joined
 from calib.identification.rows import Case, segments
+from calib.records import frozen
 
 COARSE, FINE = (10.0, 40.0), (10.0, 20.0, 30.0, 45.0, 65.0)  # nodes of the gains [Hz]
 MIN_ORDER, MAX_ORDER = 16, 800  # orders per turn

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.data.signals.filtering import border, low_pass
 from calib.errors import MeasurementError
+from calib.records import frozen, shaped
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calib.arrays import frozen
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import Decimator, border, curvature, low_pass, slope
 from calib.data.signals.motion import ROWS, Motion
@@ -20,6 +19,7 @@ from calib.errors import CalibError, NotConverged, UsageError, refuse_data
 from calib.identification.loop.controller import IdentifiedController, identify_controller
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.rows import Case, segments
+from calib.records import frozen
 from calib.simulation.loop.closed_loop import Plant, SimulatedRun, feed_forward
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import Decimator, low_pass, slope
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
@@ -34,6 +33,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
 from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, hold, make_constraints
 from calib.identification.rows import Case, ObservationRows, observe, pool, triangulate
+from calib.records import frozen
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual

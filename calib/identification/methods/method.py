@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.data.signals.filtering import Decimator
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
@@ -28,6 +27,7 @@ from calib.identification.methods.instrumental import Instrumental
 from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.prior import Prior
 from calib.identification.rows import Case, ObservationRows, pool, triangulate
+from calib.records import frozen
 
 
 class EstimateStatus(Enum):

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib import files
-from calib.arrays import Frozen
 from calib.errors import RobotError, refused_as, require
-from calib.estimate_files import read_covariance, read_estimate
 from calib.estimation.estimate import whitened
 from calib.estimation.triangles import combine, retriangulate
+from calib.folders import read_covariance, read_estimate
 from calib.identification.model_file import read_dynamics, read_table
 from calib.identification.prediction import Dynamics
+from calib.records import Frozen
 from calib.robot.chain import Chain
 
 if TYPE_CHECKING:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from calib.arrays import Frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import IdentificationModel
@@ -27,6 +26,7 @@ from calib.estimation.constrained import minimise
 from calib.estimation.triangles import retriangulate
 from calib.identification.possible.information import Information
 from calib.identification.prior import DRIVES, PAYLOAD, RADIUS, ROTOR, rods
+from calib.records import Frozen
 from calib.robot.chain import Chain
 
 THIN = 5e-3  # [m]: no body of a robot's arm has its mass within less, as a standard deviation (our choice)

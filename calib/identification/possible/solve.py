@@ -47,7 +47,6 @@ import numpy as np
 import scipy.linalg
 from scipy.special import multigammaln  # type: ignore[attr-defined]
 
-from calib.arrays import Frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import NotConverged, UsageError, one_of
@@ -62,6 +61,7 @@ from calib.identification.possible.problem import (
     nearest,
 )
 from calib.identification.prediction import Dynamics
+from calib.records import Frozen
 from calib.robot.chain import Chain
 
 if TYPE_CHECKING:

@@ -31,7 +31,6 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import Frozen, frozen
 from calib.data.signals.filtering import Decimator, decimate, kept, spread
 from calib.data.signals.motion import moving
 from calib.dynamics import rigid_body
@@ -41,6 +40,7 @@ from calib.estimation.triangles import retriangulate
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.rows import Case, ObservationRows, observe, segments, thinned
 from calib.identification.settings import make_model
+from calib.records import Frozen, frozen
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 

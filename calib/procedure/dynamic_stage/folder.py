@@ -12,8 +12,16 @@ import numpy as np
 from calib import files
 from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
-from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
-from calib.folders import METRICS, REPORT, check_target, write_staged
+from calib.folders import (
+    COVARIANCE,
+    ESTIMATE,
+    METRICS,
+    REPORT,
+    check_target,
+    write_covariance,
+    write_estimate,
+    write_staged,
+)
 from calib.identification.gains import GainRecord
 from calib.identification.methods.instrumental import Instrumental
 from calib.identification.model_file import MODEL, read_dynamics, to_table

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
+from calib.errors import counted
 from calib.folders import METRICS, check_target, write_staged
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
@@ -21,7 +22,6 @@ from calib.procedure.excitation.playback import Playback
 from calib.records import plain
 from calib.robot.tables import dumps
 from calib.units import motion_units
-from calib.words import counted
 from trajectories.design.verify import dense_motion
 from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints

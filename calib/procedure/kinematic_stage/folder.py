@@ -13,8 +13,17 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError
-from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
-from calib.folders import CERTIFICATE, METRICS, REPORT, check_target, write_staged
+from calib.folders import (
+    CERTIFICATE,
+    COVARIANCE,
+    ESTIMATE,
+    METRICS,
+    REPORT,
+    check_target,
+    write_covariance,
+    write_estimate,
+    write_staged,
+)
 from calib.geometry import installation
 from calib.geometry.installation import Installation
 from calib.geometry.uncertainty.error_model import ErrorModel

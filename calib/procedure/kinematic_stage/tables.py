@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import estimate_files, files
+from calib import files, folders
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.geometry.accuracy import NATURE
@@ -82,7 +82,7 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
         RobotError: where the file is missing or damaged.
         UsageError: where it belongs to another fit.
     """
-    names, table = estimate_files.read_covariance(folder)
+    names, table = folders.read_covariance(folder)
     parameters = layout(cell)
     place = {name: k for k, name in enumerate(parameters.names)}
     strange = [name for name in names if name not in place]

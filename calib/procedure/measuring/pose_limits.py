@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
-from calib.errors import RobotError, UsageError, require
+from calib.errors import RobotError, UsageError, listing, require
 from calib.extensions import needed
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
@@ -38,7 +38,6 @@ from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import text
 from calib.robot.tables import placement
-from calib.words import listing
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
 

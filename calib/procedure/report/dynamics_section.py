@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import UsageError
-from calib.estimate_files import read_estimate
+from calib.folders import read_estimate
 from calib.identification.loop.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay
 from calib.identification.methods.bias import MAX_SHIFT_SIGMAS
 from calib.identification.scores import Score, relative_error_sigma

@@ -19,10 +19,9 @@ from xml.parsers import expat
 
 import numpy as np
 
-from calib.errors import RobotError, refuse_robot, refused_as, require, suggestion
+from calib.errors import RobotError, listing, refuse_robot, refused_as, require, suggestion
 from calib.robot.chain import MIN_LIMIT, Joint
 from calib.transforms import from_xyz_rpy
-from calib.words import listing
 
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 

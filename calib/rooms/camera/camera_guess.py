@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.data.poses.choices import IN_HAND, TO_HAND
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
-from calib.errors import MeasurementError, refuse_data
+from calib.errors import MeasurementError, counted, listing, refuse_data
 from calib.geometry.first_guess import average_pose, guess, misfit
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -24,7 +24,6 @@ from calib.rooms.camera.optics import BoardShape, Optics
 from calib.rooms.camera.pixels import Pixels
 from calib.rooms.camera.robust_placement import Placement, place_robustly
 from calib.transforms import invert, pose, to_quaternion
-from calib.words import counted, listing
 
 ODD = 8.0  # robust deviations from which on a corner does not fit into its image, and is left out
 LOST = 0.2  # median misfit over the distance to the board beyond which nothing is placed

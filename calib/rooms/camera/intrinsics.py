@@ -9,11 +9,10 @@ from contextlib import suppress
 
 import numpy as np
 
-from calib.errors import CalibError, refuse_data
+from calib.errors import CalibError, counted, refuse_data
 from calib.rooms.camera.board import Board, corners
 from calib.rooms.camera.board_pose import board_poses
 from calib.rooms.camera.lens import Lens
-from calib.words import counted
 
 STARTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5, 2.2, 3.2)  # focal lengths tried first, in widths of the image (our choice)
 FITTED = 8  # of a lens's values: focal lengths, principal point, four of distortion

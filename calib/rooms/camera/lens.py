@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.errors import CalibError
+from calib.records import frozen
 
 NAMES = {
     "pinhole": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),

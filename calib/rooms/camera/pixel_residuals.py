@@ -23,12 +23,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.arrays import Frozen
 from calib.data.poses.choices import IN_HAND
 from calib.errors import refuse_data
 from calib.estimation import robust
 from calib.geometry.installation import Seen
 from calib.geometry.residuals import Part, parts
+from calib.records import Frozen
 from calib.rooms.camera.board import corners
 from calib.rooms.camera.optics import shape_slopes
 from calib.rooms.camera.pixels import Pixels

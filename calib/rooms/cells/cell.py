@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import shaped
 from calib.data.poses.measurements import Poses, Positions
 from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry.installation import Installation, see
+from calib.records import shaped
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain
 from calib.rooms.cells.unmodelled import PositionErrors, displacements, drooping

@@ -13,8 +13,7 @@ import numpy as np
 from calib import files
 from calib.data.poses.choices import IMAGES
 from calib.errors import SessionError, UsageError, command_line, require
-from calib.estimate_files import read_estimate
-from calib.folders import CERTIFICATE
+from calib.folders import CERTIFICATE, read_estimate
 from calib.geometry import installation
 from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF

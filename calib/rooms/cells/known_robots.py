@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.arrays import shaped
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.records import shaped
 from calib.robot import description, library
 from calib.simulation.loop.closed_loop import Plant
 from calib.simulation.loop.controllers import Controller, pd

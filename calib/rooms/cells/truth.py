@@ -10,7 +10,7 @@ from calib.dynamics import base as bases
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import gravity_torques, inverse_dynamics
-from calib.estimate_files import StoredEstimate
+from calib.folders import StoredEstimate
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames

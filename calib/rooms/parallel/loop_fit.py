@@ -26,9 +26,8 @@ from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, finding, refuse_option, suggestion
-from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.estimation.estimate import Estimate
-from calib.folders import METRICS, check_target, write_staged
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, check_target, write_covariance, write_estimate, write_staged
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread

@@ -47,7 +47,7 @@ class ParallelMechanism:
         """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.excite.read_model` reads it."""
         from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.shapes import V0
-        from calib.estimate_files import COVARIANCE
+        from calib.folders import COVARIANCE
 
         model = dynamics.model
         return {

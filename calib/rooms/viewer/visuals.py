@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.arrays import Frozen
+from calib.records import Frozen
 from calib.robot.collision import find_mesh, urdf_meshes
 from calib.robot.formats.urdf_tree import numbers, origin
 

@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_banded
 
-from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Bodies, upright_turn
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
+from calib.records import frozen, shaped
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 

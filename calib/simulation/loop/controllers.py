@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.errors import CalibError, require
-from calib.records import Array, Unbounded
+from calib.records import Array, Unbounded, frozen, shaped
 from calib.simulation.loop.references import Reference
 
 

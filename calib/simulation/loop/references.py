@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.errors import CalibError
+from calib.records import frozen, shaped
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from calib.data.poses.choices import BOARD, CORNERS, JOINTS
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.plausible import Limits
-from calib.errors import CalibError, MeasurementError, require
+from calib.errors import CalibError, MeasurementError, counted, listing, require
 from calib.rooms.camera import board as boards
 from calib.rooms.camera.board import Board
 from calib.rooms.camera.camera_info import LENS, read_lens
@@ -36,7 +36,6 @@ from calib.rooms.camera.lens import Lens
 from calib.rooms.camera.pictures import corner_file
 from calib.rooms.camera.pictures.corner_file import Found
 from calib.rooms.camera.pixels import Pixels
-from calib.words import counted, listing
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]

@@ -19,8 +19,8 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import frozen, shaped
 from calib.errors import NoPosture
+from calib.records import frozen, shaped
 from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links, pseudo_inverse, times
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 

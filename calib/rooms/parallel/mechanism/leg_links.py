@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib.arrays import frozen
 from calib.dynamics.bodies import Bodies, bodies_of, upright_turn
+from calib.records import frozen
 from calib.rooms.parallel.mechanism.parallel_robot import Leg, ParallelRobot
 
 

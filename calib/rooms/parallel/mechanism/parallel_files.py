@@ -34,9 +34,9 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.arrays import frozen
 from calib.config_types import shown
 from calib.errors import refuse_robot, suggestion
+from calib.records import frozen
 from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, spelled, vector, word

@@ -15,8 +15,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from calib.arrays import Frozen
 from calib.errors import refuse_robot
+from calib.records import Frozen
 from calib.robot.chain import GRAVITY, Chain, Joint
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")

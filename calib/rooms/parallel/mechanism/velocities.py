@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.arrays import shaped
+from calib.records import shaped
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, twists
 from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links
 

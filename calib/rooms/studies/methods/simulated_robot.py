@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.arrays import frozen, shaped
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, UsageError, refused_as, require
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case
+from calib.records import frozen, shaped
 from calib.simulation.loop.closed_loop import LOWER, Packed, Plant, body_rows, failure, layout_of, packed, sample_ticks
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
