@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from calib.data.signals.filtering import factor_for, hann
+from calib.data.signals.filtering import factor_for
 from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
 from calib.records import frozen
@@ -82,7 +82,7 @@ def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np
 
     Hann windows of `size` samples, half overlapping, each with its straight line subtracted.
     """
-    window = hann(size)
+    window = np.hanning(size + 1)[:-1]
     line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
     starts = range(0, len(values) - size + 1, max(1, size // 2))
     power = np.zeros((size // 2 + 1, values.shape[1]))

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg.lapack import dtbtrs  # type: ignore[attr-defined]
-from scipy.special import i0
 
 from calib.errors import MeasurementError, require
 from calib.records import frozen
@@ -146,13 +144,12 @@ def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.nda
 
 def _kaiser(factor: int) -> np.ndarray:
     place = np.arange(18 * factor + 1) - 9 * factor
-    window = i0(KAISER * np.sqrt(1.0 - (place / (9 * factor)) ** 2)) / i0(KAISER)
-    return np.sinc(place / factor) * window
+    return np.sinc(place / factor) * np.kaiser(len(place), KAISER)
 
 
 def _chebyshev(factor: int, ripple: float = 0.05) -> np.ndarray:
     # ripple: of one pass of the Chebyshev filter [dB]
-    from scipy.signal import cheby1, sosfreqz  # slow to load, and seldom needed
+    from scipy.signal import cheby1, sosfreqz  # slow to load
 
     sos = cheby1(8, ripple, SHARE / factor, output="sos")
     size = 1 << int(np.ceil(np.log2(400 * factor)))
@@ -196,54 +193,15 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
     if not 0 < cutoff < rate / 2:
         message = f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency {rate / 2:g} Hz: lower it"
         raise MeasurementError(message + " below 0.8 of that, or sample faster")
-    sections = _butterworth(order, cutoff / rate)
+    from scipy.signal import butter, sosfiltfilt  # slow to load
+
     pad = min(len(values) - 1, int(3 * rate / cutoff) + 1)
-    x = values.reshape(len(values), -1)
-    x = np.concatenate([2.0 * x[0] - x[pad:0:-1], x, 2.0 * x[-1] - x[-2 : -2 - pad : -1]])
-    for _ in range(2):
-        x = _filtered(sections, x)[::-1]
-    return x[pad : len(x) - pad].reshape(values.shape)
-
-
-def _butterworth(order: int, share: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the sections b, a (3,) of a Butterworth low-pass filter by the bilinear transform, each of DC gain 1.
-
-    Args:
-        share: cut-off as a share of the sampling rate, below one half.
-    """
-    k, found = np.tan(np.pi * share), []
-    for i in range(order // 2):
-        damped = 2.0 * np.sin(np.pi * (2 * i + 1) / (2 * order)) * k
-        denominator = np.array([1.0 + damped + k**2, 2.0 * (k**2 - 1.0), 1.0 - damped + k**2])
-        found.append((k**2 * np.array([1.0, 2.0, 1.0]) / denominator[0], denominator / denominator[0]))
-    if order % 2:
-        found.append((np.array([k, k, 0.0]) / (1.0 + k), np.array([1.0, (k - 1.0) / (k + 1.0), 0.0])))
-    return found
-
-
-def _filtered(sections: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray) -> np.ndarray:
-    """Return x (N, k) filtered by all sections; initially they are in steady state at its first value.
-
-    The recursion a_0 y_k + a_1 y_{k-1} + a_2 y_{k-2} = … is a triangular system with a band of three: LAPACK's, since
-    scipy.signal takes longer to load than a long log to filter.
-    """
-    y = x - x[0]
-    for b, a in sections:
-        right = b[0] * y
-        right[1:] += b[1] * y[:-1]
-        right[2:] += b[2] * y[:-2]
-        y, _ = dtbtrs(np.repeat(a[:, None], len(y), axis=1), right, uplo="L", diag="U")
-    return y + x[0]
+    return sosfiltfilt(butter(order, 2.0 * cutoff / rate, output="sos"), values, axis=0, padlen=pad)
 
 
 def border(rate: float, cutoff: float) -> int:
     """Return the number of samples at each end affected by `low_pass`: 2 rate/f_c, our choice (0.8 % remain)."""
     return int(np.ceil(2 * rate / cutoff))
-
-
-def hann(size: int) -> np.ndarray:
-    """Return the periodic Hann window (size,) for a spectrum."""
-    return 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, size + 1)[:-1])
 
 
 def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
@@ -262,20 +220,6 @@ def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}); relative error (ωΔ)²/12 for width 1.
     """
     return _differences(values, CURVATURE[width], rate**2, 1.0)
-
-
-def moving_cubics(values: np.ndarray, width: int, order: int = 0) -> np.ndarray:
-    """Return `values` (N, n), or a derivative per sample, from cubics fitted to `width` samples on either side.
-
-    Savitzky and Golay (1964); the first and last `width` rows are on the cubics of the outermost windows.
-    """
-    reach = np.arange(-width, width + 1.0)
-    fit = np.linalg.pinv(np.vander(reach, 4, increasing=True))  # coefficients of 1, k, k², k³
-    factorial, powers = np.array([[1, 1, 1, 1], [0, 1, 2, 3], [0, 0, 2, 6]])[order], np.arange(4) - order
-    at = np.where(powers >= 0, factorial * reach[:, None] ** np.maximum(powers, 0), 0.0) @ fit  # of every place in it
-    inner = sum(at[width, k] * values[k : len(values) - 2 * width + k] for k in range(2 * width + 1))
-    size = 2 * width + 1
-    return np.concatenate([at[:width] @ values[:size], inner, at[width + 1 :] @ values[len(values) - size :]])
 
 
 def _differences(values: np.ndarray, coefficients: tuple[float, ...], scale: float, sign: float) -> np.ndarray:

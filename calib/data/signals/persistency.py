@@ -7,7 +7,6 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.spatial import KDTree
 
-from calib.data.signals.filtering import hann
 from calib.data.signals.motion import Motion
 from calib.errors import listing
 
@@ -99,7 +98,7 @@ def repeats(training: Motion, other: Motion) -> float:
 
 def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
     """Return the share of the variance of a series (N,) explained by its best sine, and the frequency [Hz]."""
-    window, size = hann(len(q)), int(next_fast_len(4 * len(q), real=True) or 0)
+    window, size = np.hanning(len(q) + 1)[:-1], int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
     eighths = int(np.argmax(power)) + np.arange(-16, 17) / 8  # of a step of the transform, about its strongest line
     return max((_one_sine(q, f, rate), f) for f in (eighths[eighths > 0.5] * rate / size).tolist())

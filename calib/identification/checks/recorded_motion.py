@@ -13,7 +13,6 @@ import numpy as np
 
 from calib.column_changes import Change, assigned, best_changes, coupling, couplings
 from calib.data.recordings.recording import Recording
-from calib.data.signals.filtering import moving_cubics
 from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics, regressor
 from calib.identification.rows import Case, segments
@@ -212,7 +211,10 @@ def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndar
 
     `half_width`: half width of the window for derivatives, in steps of the coarse grid.
     """
-    return moving_cubics(values, min(half_width, (len(values) - 1) // 2), order) / STEP**order
+    from scipy.signal import savgol_filter  # slow to load
+
+    size = 2 * min(half_width, (len(values) - 1) // 2) + 1
+    return savgol_filter(values, size, min(3, size - 1), order, STEP, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
