@@ -15,7 +15,7 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 
 # heavy dependency -> the only modules that may import it (a trailing dot: all of that package)
 HOMES = {
-    "pinocchio": ["calib.robot.collision", "calib.robot.formats.readback"],
+    "pinocchio": ["calib.robot.collision", "calib.robot.formats.simulators"],
     "coal": ["calib.robot.collision"],
     "numba": [
         "calib.dynamics.gradient_kernels",
@@ -26,7 +26,7 @@ HOMES = {
         "calib.simulation.loop.loop_kernels",
         "calib.rooms.studies.methods.tangent_kernels",
     ],
-    "yourdfpy": ["calib.robot.formats.readback"],
+    "yourdfpy": ["calib.robot.formats.simulators"],
     "cv2": [
         "calib.rooms.camera.pictures.detection",
         "calib.rooms.camera.pictures.images",

@@ -31,7 +31,7 @@ from calib.procedure.session.folder import Session, read_state
 from calib.procedure.session.settings import read_settings
 from calib.robot import description
 from calib.robot.formats import urdf_write
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.robot.tables import dumps
 from calib.rooms.camera.board import Board, read_board, write_board
 from calib.rooms.camera.camera_info import read_lens, write_lens

@@ -19,7 +19,7 @@ from calib.procedure.export.identified import is_identified
 from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
 from calib.procedure.robot_kinds import MechanismResult, stage_of
-from calib.robot.load import resolve
+from calib.robot.library import resolve
 
 
 @overload

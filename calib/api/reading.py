@@ -13,7 +13,7 @@ from calib.data.recordings.recording_options import RecordingOptions
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.robot_kinds import Mechanism, mechanism, stage_of
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.load import load_calibrated
+from calib.robot.library import load_calibrated
 
 
 @checked

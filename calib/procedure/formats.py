@@ -55,7 +55,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "recordings of motion, for calib identify",
         (
             "calib.data.recordings.recording_options",
-            "calib.data.recordings.csv_logs",
+            "calib.data.recordings.recording_files",
             "calib.data.recordings.archives",
             "calib.data.recordings.bags",
         ),

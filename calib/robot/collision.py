@@ -22,7 +22,7 @@ from calib.records import shaped
 from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, check_reachable, closing, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
-from calib.robot.formats.readback import configurations, driven_joints
+from calib.robot.formats.simulators import configurations, driven_joints
 from calib.robot.formats.urdf_tree import Node, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
 from calib.transforms import pose

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.poses.choices import IN_HAND
+from calib.data.poses import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit

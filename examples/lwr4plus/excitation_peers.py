@@ -48,7 +48,7 @@ from calib.procedure.excitation.limits import Points
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS
 from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
-from calib.robot.load import load
+from calib.robot.library import load
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design import search
 from trajectories.design.objectives import Excitation, condition_numbers

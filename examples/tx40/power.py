@@ -20,7 +20,7 @@ from calib.dynamics.torque_rows import MOTOR, POWER, TorqueRows
 from calib.identification.identify import Identification, chain_states, identify_model
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
-from calib.robot.load import load
+from calib.robot.library import load
 
 RATE, SECONDS, PERIOD, NOISE = 500.0, 20.0, 10.0, 0.03
 DRIVES = {"Ia": 0.05, "Fv": 2.0, "Fc": 3.0}  # of joint 1; a tenth of them at joint 6

@@ -12,7 +12,7 @@ import pytest
 from calib.dynamics import base, drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.robot.load import load
+from calib.robot.library import load
 
 COUNT = 10_000
 CHAIN = load("lwr4plus")

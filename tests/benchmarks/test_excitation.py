@@ -21,7 +21,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.robot import library, mdh
 from calib.robot.chain import Chain
-from calib.robot.load import load
+from calib.robot.library import load
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design.objectives import Excitation
 from trajectories.design.problem import ExcitationProblem, evaluate

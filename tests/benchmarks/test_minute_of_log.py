@@ -20,7 +20,7 @@ from calib.identification.prediction import predict
 from calib.identification.rows import make_case
 from calib.identification.scores import score
 from calib.identification.settings import IdentificationSettings
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.known_robots import random_fourier
 
 CHAIN = load("lwr4plus")

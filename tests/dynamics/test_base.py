@@ -14,7 +14,7 @@ from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.dynamics.shapes import JointRange
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR
 from calib.errors import CalibError
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import lwr4plus
 
 SENSED = "Ia Fvl Fcl offl Fvm Fcm offm"

@@ -10,7 +10,7 @@ from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel, friction_states, from_chain
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MOTOR, torque_rows
 from calib.errors import CalibError
-from calib.robot.load import load
+from calib.robot.library import load
 
 TX40 = load("tx40")
 SMOOTH = (

@@ -7,7 +7,7 @@ from calib.dynamics.rigid_body import gravity_torques
 from calib.errors import RobotError
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf
-from calib.robot.load import load
+from calib.robot.library import load
 
 ARM = """<robot name="arm"><link name="base"/>{links}
 <joint name="lift" type="prismatic"><parent link="base"/><child link="l1"/><origin xyz="0.1 0 0.2" rpy="0.3 0.2 0.1"/>

@@ -12,7 +12,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import of_base, of_standard
 from calib.dynamics.torque_rows import BOTH, DRIVE, MOTOR
 from calib.errors import CalibError
-from calib.robot.load import load
+from calib.robot.library import load
 
 IA, FV, FC, OFF = (np.array(x) for x in ((2.0, 0.7), (9.0, 3.0), (11.0, 4.0), (0.4, -0.3)))
 

@@ -11,7 +11,7 @@ from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.errors import CalibError, RobotError
 from calib.robot.chain import Chain, Element, Joint
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import displace
 
 ARMS = {name: load(name) for name in LIBRARY} | {"motley": motley()}

@@ -16,7 +16,7 @@ from calib.data.poses.pose_lists import read_poses
 from calib.errors import finding
 from calib.procedure.findings import sentence
 from calib.procedure.session.folder import open_session
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import perturbed_cell

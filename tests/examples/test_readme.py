@@ -11,7 +11,7 @@ from calib import cli
 from calib.robot import library
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf_write
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.known_robots import random_fourier

@@ -8,7 +8,7 @@ import pytest
 from calib.data.poses.measurements import KINDS, PoseMeasurements, Sockets
 from calib.geometry.accuracy import ErrorStatistics, errors, pair_errors, statistics
 from calib.geometry.installation import Installation, see
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import from_xyz_rpy, to_quaternion
 
 CELL = Installation(

@@ -13,7 +13,7 @@ from calib.geometry.model_choice.ladder import select_model
 from calib.geometry.uncertainty import error_model
 from calib.geometry.uncertainty.error_model import END_SHARE, ErrorModel, learn_errors
 from calib.geometry.uncertainty.left_out import LeftOut
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 

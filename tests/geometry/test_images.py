@@ -9,7 +9,7 @@ from differences import check
 from planted import perturb
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.choices import IN_HAND, TO_HAND
+from calib.data.poses import IN_HAND, TO_HAND
 from calib.data.poses.measurements import Positions, take
 from calib.errors import MeasurementError
 from calib.geometry.first_guess import install
@@ -19,7 +19,7 @@ from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout, step
 from calib.geometry.weighing import Settings
 from calib.robot.calibrated import Deflection
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.camera.board_pose import board_poses
 from calib.rooms.camera.camera_guess import complete_camera
 from calib.rooms.camera.lens import Lens

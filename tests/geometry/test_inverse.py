@@ -9,7 +9,7 @@ from differences import check
 from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
 
 ROBOTS = ("ur5", "lwr4plus", "tx40", "rv2sq", "panda")

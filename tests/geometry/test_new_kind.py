@@ -15,7 +15,7 @@ from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout
 from calib.geometry.residuals import Part, parts
 from calib.robot.chain import random_joints
-from calib.robot.load import load
+from calib.robot.library import load
 
 
 @dataclass(frozen=True, eq=False)

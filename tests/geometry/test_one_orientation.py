@@ -16,7 +16,7 @@ from calib.geometry.model_choice.ladder import select_model
 from calib.geometry.weighing import Settings
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
 

@@ -11,7 +11,7 @@ from calib.data.poses.pose_files import read_measurements
 from calib.geometry.checks import wrong_columns
 from calib.geometry.first_guess import install
 from calib.robot.chain import random_joints
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 

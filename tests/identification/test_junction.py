@@ -20,7 +20,7 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated
 from calib.robot.chain import random_joints
-from calib.robot.load import load_calibrated
+from calib.robot.library import load_calibrated
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 

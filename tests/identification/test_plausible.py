@@ -18,7 +18,7 @@ from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
 from calib.procedure.findings import Verdict, level_of, settle
-from calib.robot.load import load
+from calib.robot.library import load
 
 NAMES = ("joint1", "joint2", "joint3")
 ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))

@@ -12,7 +12,7 @@ from differences import check
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.robot.chain import Chain
-from calib.robot.load import load
+from calib.robot.library import load
 from poses.candidates import draw_candidates
 from poses.continuous.local import improved, merit_of
 from poses.space import PoseConstraint, SearchSpace, is_feasible

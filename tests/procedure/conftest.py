@@ -12,7 +12,7 @@ from calib import cli
 from calib.cli.shared import MAX_LINES
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import from_xyz_rpy, to_quaternion
 
 STATION = from_xyz_rpy([1.5, -0.8, 0.4], [0.1, -0.2, 2.0])

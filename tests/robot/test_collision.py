@@ -12,7 +12,7 @@ from calib.robot import capsules, collision
 from calib.robot.capsules import Obstacle, Wall
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import joint_jacobian, sweep
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import pose
 
 

@@ -12,7 +12,7 @@ from calib.robot import description, library, mdh
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 
 ODD = robot(
     joint("a", "continuous", "base", "one", axis("1 2 -3"), "0.1 0.2 0.3", "0.3 -1.2 2"),

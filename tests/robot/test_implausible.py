@@ -8,7 +8,7 @@ import pytest
 from calib.errors import RobotError
 from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies, remarks
-from calib.robot.load import load
+from calib.robot.library import load
 
 
 @pytest.mark.parametrize("change", [{"velocity": -1.0}, {"effort": -5.0}, {"velocity": np.nan}])

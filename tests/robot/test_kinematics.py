@@ -9,7 +9,7 @@ from calib.errors import RobotError
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.kinematics import forward, jacobian, joint_frames, tip_jacobian
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import rotation_vector
 
 ZOO = robot(

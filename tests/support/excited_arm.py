@@ -9,7 +9,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot.chain import Chain
 from calib.robot.kinematics import sweep, tip_jacobian
-from calib.robot.load import load
+from calib.robot.library import load
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], total, Jubien et al. 2014 as quoted in facts
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]

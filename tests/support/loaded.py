@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from calib.robot.chain import random_joints
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import perturbed_cell

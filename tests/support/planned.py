@@ -11,7 +11,7 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.known_robots import truth
 from trajectories.timing.limits import TimingLimits
 

@@ -13,7 +13,7 @@ from calib.geometry.observation import observe, prepare, stack
 from calib.geometry.result import GeometricFit
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import joint_jacobian
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import pose
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from calib.geometry.observability import observation, targets_of
-from calib.robot.load import load
+from calib.robot.library import load
 
 CHAIN = load("lwr4plus")
 LOWER, UPPER = (np.array([getattr(joint, end) for joint in CHAIN.joints]) for end in ("lower", "upper"))

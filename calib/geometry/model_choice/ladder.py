@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.choices import MODELS as CHOICES
+from calib.data.poses import MODELS as CHOICES
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import UsageError, one_of
 from calib.geometry.fit import fit, fit_with_prior, polish_frames

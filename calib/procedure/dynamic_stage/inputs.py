@@ -25,7 +25,7 @@ from calib.procedure.robot_kinds import Mechanism
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.description import remarks
-from calib.robot.load import load_calibrated, resolve
+from calib.robot.library import load_calibrated, resolve
 from calib.units import TORQUE
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
@@ -115,7 +115,7 @@ def gather(
     """Return the inputs of an identification from files: the robot, and all recordings as motions.
 
     Args:
-        robot: see `calib.robot.load`; or as a geometric fit returns it.
+        robot: see `calib.robot.library`; or as a geometric fit returns it.
         recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``), or recordings in memory.
         options: the options file's content.
         method, friction: in place of the options'.

@@ -249,7 +249,7 @@ def excite(
     they are given themselves.
 
     Args:
-        robot, base, tip: see `calib.robot.load`.
+        robot, base, tip: see `calib.robot.library`.
         settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.

@@ -114,7 +114,7 @@ def read_inputs(
     """Read robot, limits, model and earlier motions of an excitation.
 
     Args:
-        robot, base, tip: see `calib.robot.load`.
+        robot, base, tip: see `calib.robot.library`.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
 

@@ -182,7 +182,7 @@ def plan(
     """Plan the fastest motion of a robot through the waypoints of a file.
 
     Args:
-        robot, base, tip: see `calib.robot.load`.
+        robot, base, tip: see `calib.robot.library`.
         waypoints: see `calib.procedure.excitation.planning`.
         settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification; its geometry is planned with, the limits are the robot's.

@@ -13,7 +13,7 @@ from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import origin_files, urdf, urdf_write
-from calib.robot.formats.readback import link_poses, tip_poses
+from calib.robot.formats.simulators import link_poses, tip_poses
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.formats.urdf_tree import text
 from calib.robot.kinematics import forward, joint_frames

@@ -11,8 +11,8 @@ from calib.procedure.export import geometry
 from calib.procedure.export.geometry import MAX_DIFFERENCE
 from calib.procedure.export.identified import IdentifiedRobot
 from calib.robot.chain import Chain, random_joints
-from calib.robot.formats import mjcf, urdf, urdf_write
-from calib.robot.formats.readback import motion_torques
+from calib.robot.formats import urdf, urdf_write
+from calib.robot.formats.simulators import mjcf_text, motion_torques
 from calib.robot.formats.urdf_tree import UrdfTree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import moving_frames
@@ -25,7 +25,7 @@ def as_mjcf(given: IdentifiedRobot, where: str) -> str:
     Raises:
         RobotError: where Pinocchio reads other poses, torques or drives.
     """
-    model = mjcf.text(given.chain, given.bodies, *given.drives.values.T[:3])
+    model = mjcf_text(given.chain, given.bodies, *given.drives.values.T[:3])
     _check(given, model, given.chain, where, mjcf=True)
     return model
 

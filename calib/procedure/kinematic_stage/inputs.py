@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses.choices import IMAGES, JOINTS, is_image_folder
+from calib.data.poses import IMAGES, JOINTS, is_image_folder
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
@@ -22,7 +22,7 @@ from calib.robot.chain import Chain, joint_kinds
 from calib.robot.description import remarks
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.formats.urdf_tree import text
-from calib.robot.load import load, resolve
+from calib.robot.library import load, resolve
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def gather(
     """Return the inputs of a fit from files: the robot, the named stations and tools, fitted and unseen rows.
 
     Args:
-        robot: see `calib.robot.load`; or a robot in memory.
+        robot: see `calib.robot.library`; or a robot in memory.
         measured: files, or blocks in memory, to fit on.
         validate: the same, to validate on.
         options: how files are read.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.data.poses.choices import IMAGES
+from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.extensions import needed

@@ -116,7 +116,7 @@ def choose(
     """Return the m poses that determine the robot's geometry best.
 
     Args:
-        robot: see `calib.robot.load`.
+        robot: see `calib.robot.library`.
         m: how many.
         settings: what is measured, index, method, seed.
         constraints: see `calib.procedure.measuring.constraints_file`; a file, or its tables.

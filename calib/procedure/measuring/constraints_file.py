@@ -54,7 +54,7 @@ import numpy as np
 
 from calib.config import read, strict
 from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, shown
-from calib.data.poses.choices import IN_HAND, TO_HAND
+from calib.data.poses import IN_HAND, TO_HAND
 from calib.errors import require
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them

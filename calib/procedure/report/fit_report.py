@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib import files
-from calib.data.poses.choices import IMAGES
+from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.extensions import offered

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib import files
-from calib.data.poses.choices import CORNERS, JOINTS
+from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import offered
 from calib.folders import CERTIFICATE

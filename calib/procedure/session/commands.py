@@ -14,7 +14,7 @@ from rich.text import Text
 
 from calib.config import parse
 from calib.data.csv_table import read_table
-from calib.data.poses.choices import IMAGES
+from calib.data.poses import IMAGES
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.extensions import needed
 from calib.folders import CERTIFICATE, SESSION
@@ -33,7 +33,7 @@ from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, State
 from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
-from calib.robot.load import load, resolve
+from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
 
 
@@ -193,7 +193,7 @@ def begin(
     """Make a session in the new folder `folder`, after checking that the robot can be read.
 
     Args:
-        robot: see `calib.robot.load`.
+        robot: see `calib.robot.library`.
         instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`; ``none``: the geometry is not fitted.
         poses, validation: how many to choose.
         seed: of everything random.

@@ -35,7 +35,7 @@ from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.records import read_json
 from calib.robot.chain import Chain
-from calib.robot.load import load_calibrated
+from calib.robot.library import load_calibrated
 
 Say = Callable[[str], None]
 Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]

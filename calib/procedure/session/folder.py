@@ -40,7 +40,7 @@ from typing import Any
 from calib import files
 from calib.config import parse
 from calib.config_types import Text
-from calib.data.poses.choices import CORNERS, is_image_folder
+from calib.data.poses import CORNERS, is_image_folder
 from calib.errors import CalibError, SessionError, command_line, refused_as
 from calib.folders import CERTIFICATE, METRICS, PARAMETERS
 from calib.folders import SESSION as SETTINGS

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from calib import files
-from calib.data.poses.choices import IMAGES
+from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE, check_against, filled_in, read_poses, write_poses
@@ -52,7 +52,7 @@ from calib.procedure.session.folder import (
 )
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
-from calib.robot.load import load_calibrated
+from calib.robot.library import load_calibrated
 from calib.units import JOINT
 from poses.candidates import draw_candidates
 from poses.space import is_feasible

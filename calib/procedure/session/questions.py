@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
 from calib.config_types import Real
-from calib.data.poses.choices import BOARD, IN_HAND, TO_HAND
+from calib.data.poses import BOARD, IN_HAND, TO_HAND
 from calib.errors import UsageError, require
 from calib.extensions import needed
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.answers import CAMERA, CELL, Answers
 from calib.procedure.session.settings import NOTHING, InstrumentSection
-from calib.robot.load import resolve
+from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
 
 MAX_MASS = 2000.0  # [kg]: of a payload (our choice)

@@ -28,7 +28,7 @@ from calib.config_types import (  # fmt: skip
     Whole,
     shown,
 )
-from calib.data.poses.choices import Loss, Model
+from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION

@@ -1,7 +1,14 @@
-"""Library of robots: one TOML file each, with the source of its numbers."""
+"""Robots by what a user names: one of the library (a TOML file each), a file, or a folder with a ``robot.toml``."""
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+
+from calib.errors import RobotError, refuse_robot, require, suggestion
+from calib.robot import calibrated, description
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
+from calib.robot.formats import urdf
 
 
 def names() -> tuple[str, ...]:
@@ -15,3 +22,60 @@ def names() -> tuple[str, ...]:
 def path(name: str) -> Path:
     """Return the path of the file of a library robot, or of its simulated truth (``lwr4plus_truth``)."""
     return Path(str(resources.files(__name__).joinpath(f"{name}.toml")))
+
+
+def load(
+    robot: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
+) -> Chain:
+    """Return the chain of a robot given by name or path.
+
+    Args:
+        robot: a library name, the path of a ``.urdf`` or ``.toml`` file, or a folder that holds ``robot.toml``.
+        base, tip: links of a URDF between which the arm runs.
+        joint_names: the joints a measurement file names (URDF).
+
+    Raises:
+        RobotError: where nothing of this kind is found, with the library's names and the nearest one.
+    """
+    path = resolve(robot)
+    if path.suffix == ".urdf":
+        return urdf.read(path, base, tip, joint_names)
+    return _check_ends(path, description.read(path), base, tip)
+
+
+def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
+    for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
+        if wanted is not None and wanted != found:
+            refuse_robot(path, f"its {option} is '{found}', not '{wanted}'; only a URDF allows to choose base and tip")
+    return chain
+
+
+def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
+    """Return the calibrated robot of a name or path, with covariance and corrections; arguments as in `load`."""
+    path = resolve(robot)
+    if path.suffix == ".urdf":
+        return CalibratedChain(load(path, base, tip), source=str(robot))
+    found = calibrated.read(path)
+    _check_ends(path, found.complete, base, tip)
+    return found
+
+
+def resolve(robot: str | Path) -> Path:
+    """Return the file of a robot given by name or path; the working folder takes precedence over the library."""
+    place, listed = Path(robot), names()
+    require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(listed)}", RobotError)
+    known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(listed)}"
+    if place.is_dir():
+        if (place / calibrated.ROBOT).is_file():
+            return place / calibrated.ROBOT
+        require(str(robot) in listed, f"folder {place} has no robot.toml; give {known}", RobotError)
+    elif place.is_file():
+        if place.suffix in (".urdf", ".toml"):
+            return place
+        advice = "expand it first: xacro file.xacro > robot.urdf" if place.suffix == ".xacro" else f"give {known}"
+        raise RobotError(f"{place} is neither .urdf nor .toml; {advice}")
+    if str(robot) in listed:
+        return path(str(robot))
+    a_path = place.suffix in (".urdf", ".toml") or len(place.parts) > 1
+    what = f"no file {place}" if a_path else f"no robot '{robot}'{suggestion(str(robot), listed)}"
+    raise RobotError(f"{what}; give {known}")

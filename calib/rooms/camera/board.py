@@ -24,7 +24,7 @@ import numpy as np
 from calib import files
 from calib.config import parse, read_toml, strict
 from calib.config_types import OneOf, Real, Whole
-from calib.data.poses.choices import BOARD
+from calib.data.poses import BOARD
 from calib.errors import UsageError, require
 
 KINDS = ("charuco", "chessboard", "apriltag")

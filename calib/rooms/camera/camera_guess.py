@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from calib.data.poses.choices import IN_HAND, TO_HAND
+from calib.data.poses import IN_HAND, TO_HAND
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.errors import MeasurementError, counted, listing, refuse_data
 from calib.geometry.first_guess import average_pose, guess, misfit

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.choices import IN_HAND
+from calib.data.poses import IN_HAND
 from calib.errors import UsageError, require
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation, see

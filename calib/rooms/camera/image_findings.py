@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses.choices import IN_HAND
+from calib.data.poses import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding
 from calib.geometry.accuracy import Torques

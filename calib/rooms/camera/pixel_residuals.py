@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.data.poses.choices import IN_HAND
+from calib.data.poses import IN_HAND
 from calib.errors import refuse_data
 from calib.estimation import robust
 from calib.geometry.installation import Seen

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from calib.data.poses.choices import IMAGES, IN_HAND
+from calib.data.poses import IMAGES, IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
 from calib.rooms.camera.board import Board
 from calib.rooms.camera.lens import Lens

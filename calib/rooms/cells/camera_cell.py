@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import files
-from calib.data.poses.choices import BOARD, IN_HAND, JOINTS
+from calib.data.poses import BOARD, IN_HAND, JOINTS
 from calib.errors import CannotSimulate
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal, reach, seen_at

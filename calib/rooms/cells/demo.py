@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.choices import IMAGES
+from calib.data.poses import IMAGES
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.folders import CERTIFICATE, read_estimate
 from calib.geometry import installation
@@ -22,7 +22,7 @@ from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
 from calib.records import read_lines
 from calib.robot import calibrated, library
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import measured_files
 from calib.rooms.cells.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
 from calib.rooms.cells.cell import Cell, measure, wandering

@@ -9,7 +9,7 @@ from calib.geometry.installation import Installation
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import Cell, SimulatedInstrument
 from calib.rooms.cells.unmodelled import PositionErrors

@@ -30,7 +30,7 @@ from calib.identification.methods.method import IdentificationProblem
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain, random_joints
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.known_robots import random_fourier

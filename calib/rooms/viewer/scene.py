@@ -26,7 +26,7 @@ from calib.records import shielded
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames
-from calib.robot.load import load, resolve
+from calib.robot.library import load, resolve
 from calib.rooms.viewer.visuals import Visual, visuals
 from calib.transforms import invert
 

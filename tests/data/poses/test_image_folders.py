@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.data.poses.choices import is_image_folder
+from calib.data.poses import is_image_folder
 from calib.data.poses.fit_options import parse_options
 from calib.errors import MeasurementError
 from calib.rooms.camera.board import read_board

@@ -15,7 +15,7 @@ from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import find_gains
 from calib.procedure.dynamic_stage.inputs import gather, read_motion
-from calib.robot.load import load
+from calib.robot.library import load
 
 
 def identify(out: Path, *arguments: object, options: str = "") -> dict:

@@ -10,7 +10,7 @@ from calib.procedure.excitation.inputs import read_inputs
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, Term
-from calib.robot.load import load, resolve
+from calib.robot.library import load, resolve
 
 
 @pytest.fixture

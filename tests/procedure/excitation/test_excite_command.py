@@ -26,7 +26,7 @@ from calib.procedure.excitation.inputs import identifiable, read_model, read_pri
 from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from trajectories.basis import SampledMotion
 from trajectories.design.objectives import condition_numbers
 from trajectories.design.search import StartSearch

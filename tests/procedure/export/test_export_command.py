@@ -14,7 +14,7 @@ from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, 
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 

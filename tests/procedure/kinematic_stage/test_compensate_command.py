@@ -14,7 +14,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
 from calib.procedure.kinematic_stage import compensation
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy, rotation_vector, to_quaternion

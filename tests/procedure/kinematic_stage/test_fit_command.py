@@ -13,7 +13,7 @@ from calib.robot import calibrated
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import from_xyz_rpy
 
 ERRORS = {"mean", "rms", "p95", "max"}

@@ -17,7 +17,7 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report.geometry_section import iso9283_tables
 from calib.records import read_record
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy

@@ -11,7 +11,7 @@ from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.pose_limits import read_limits
-from calib.robot.load import load
+from calib.robot.library import load
 
 CONSTRAINTS = """
 [joints]

@@ -11,7 +11,7 @@ from calib.procedure.kinematic_stage import fit, inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, assess
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 

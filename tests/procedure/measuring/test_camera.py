@@ -20,7 +20,7 @@ from calib.procedure.session.commands import begin, go_on
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.questions import cell_tables
 from calib.robot.calibrated import Deflection
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.camera.board import read_board
 from calib.rooms.camera.pictures.boards import make
 from calib.rooms.camera.pictures.corner_file import Detection, Found

@@ -8,7 +8,7 @@ import pytest
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.measuring import run as measuring
 from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_run, turns
-from calib.robot.load import load
+from calib.robot.library import load
 
 CHAIN = load("ur5")
 FULL = 2 * np.pi

@@ -18,7 +18,7 @@ from calib.procedure.measuring.prediction import predicted
 from calib.procedure.measuring.run import RunSettings, is_run, plan_run, rehearsed_samples, write_run
 from calib.procedure.session.questions import cell_tables
 from calib.robot.chain import Chain, random_joints
-from calib.robot.load import load
+from calib.robot.library import load
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
 

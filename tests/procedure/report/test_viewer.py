@@ -14,7 +14,7 @@ from calib.errors import UsageError
 from calib.geometry import installation
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.viewer import scene as viewing

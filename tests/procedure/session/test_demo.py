@@ -12,7 +12,7 @@ from calib.procedure.session import steps
 from calib.procedure.session.folder import open_session
 from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 
 
 @pytest.mark.slow

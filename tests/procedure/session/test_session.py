@@ -17,7 +17,7 @@ from calib.procedure.findings import UNJUDGED
 from calib.procedure.session import certificate, commands, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.urdf_tree import with_comment
-from calib.robot.load import load
+from calib.robot.library import load
 
 
 def kinds(session: Session) -> dict[str, str]:

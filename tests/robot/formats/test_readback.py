@@ -5,9 +5,9 @@ import pytest
 
 from calib.errors import RobotError
 from calib.procedure.export.geometry import check_readback
-from calib.robot.formats import readback, urdf, urdf_write
+from calib.robot.formats import simulators, urdf, urdf_write
 from calib.robot.kinematics import joint_frames
-from calib.robot.load import load
+from calib.robot.library import load
 
 
 @pytest.mark.parametrize("robot", ["ur5", "lwr4plus"])
@@ -15,7 +15,7 @@ def test_yourdfpy_puts_every_link_where_we_do(robot):
     source = urdf_write.write_new(load(robot))
     own = urdf.parse(source)
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (7, own.n))
-    seen = readback.link_poses(source, own.links, own.base, own.joint_names, q)
+    seen = simulators.link_poses(source, own.links, own.base, own.joint_names, q)
     assert seen.shape == (own.n, 7, 4, 4) and np.abs(seen - joint_frames(own, q)).max() < 1e-12
     assert check_readback(source, "robot.urdf", load(robot)) == "Pinocchio and yourdfpy read the same poses to 1e-9"
 
@@ -29,7 +29,7 @@ def test_a_slanted_axis_is_no_disagreement():
 
 def test_a_second_reader_that_disagrees_refuses_and_one_that_cannot_read_is_said(monkeypatch):
     chain = load("ur5")
-    source, right = urdf_write.write_new(chain), readback.link_poses
+    source, right = urdf_write.write_new(chain), simulators.link_poses
     place = "calib.procedure.export.geometry.link_poses"
     monkeypatch.setattr(place, lambda *given: right(*given) + 1e-8)
     with pytest.raises(RobotError, match="poses differ by 1e-08 when yourdfpy reads the URDF"):

@@ -12,7 +12,7 @@ from calib.robot import library, mdh
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf, urdf_write
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 AWKWARD = """<?xml version='1.0' encoding="utf-8"?>

@@ -12,7 +12,7 @@ from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
-from calib.robot.load import load
+from calib.robot.library import load
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.rooms.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell

@@ -6,7 +6,7 @@ from planned import CHAIN, WAYPOINTS, limits, lwr
 
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward, tip_jacobian
-from calib.robot.load import load
+from calib.robot.library import load
 from trajectories.errors import BadInput, NothingFeasible
 from trajectories.timing.lines import line
 from trajectories.timing.path import extremes, spline

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.choices import BOARD, JOINTS
+from calib.data.poses import BOARD, JOINTS
 from calib.errors import CalibError, MeasurementError, UsageError, refused_as, require
 from calib.rooms.camera import board as boards
 from calib.rooms.camera.board import KINDS, Board

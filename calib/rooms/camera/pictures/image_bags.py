@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.poses.choices import BOARD, CORNERS, JOINTS
+from calib.data.poses import BOARD, CORNERS, JOINTS
 from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 from calib.errors import MeasurementError, require
 from calib.rooms.camera import board as boards

@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, read_table
-from calib.data.poses import plausible
-from calib.data.poses.choices import BOARD, CORNERS, JOINTS
+from calib.data.poses import BOARD, CORNERS, JOINTS, plausible
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.plausible import Limits
