@@ -214,7 +214,7 @@ def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndar
     from scipy.signal import savgol_filter  # slow to load
 
     size = 2 * min(half_width, (len(values) - 1) // 2) + 1
-    return savgol_filter(values, size, min(3, size - 1), order, STEP, axis=0)
+    return np.asarray(savgol_filter(values, size, min(3, size - 1), order, STEP, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
