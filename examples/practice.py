@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 import calib
-from calib.rooms.cells import cell, demo, measured_files, virtual_arm, virtual_cells
+from calib.rooms.cells import cell, demo, virtual_arm, virtual_cells
+from calib.rooms.cells.cell import write_log, write_measured
 from calib.rooms.cells.known_robots import random_fourier
 
 NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
@@ -34,14 +35,14 @@ def ur5() -> cell.Cell:
 def measure(path: str, poses: int = 80) -> None:
     """Measure random poses of the UR5: joints [deg], position [mm] and orientation of the tool, a row per pose."""
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (poses, 6))
-    measured_files.write(cell.measure(ur5(), q, seed=2), path)
+    write_measured(cell.measure(ur5(), q, seed=2), path)
 
 
 def teach(path: str) -> None:
     """Write places for the measured tool in the instrument's frame [m], and joints [rad] near which to reach them."""
     exact = cell.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
     seen = cell.measure(replace(ur5(), instrument=exact), TAUGHT)
-    measured_files.write(replace(seen, sigma=None, sigma_rotation=None), path, degrees=False)
+    write_measured(replace(seen, sigma=None, sigma_rotation=None), path, degrees=False)
 
 
 def missed(q: np.ndarray) -> float:
@@ -56,7 +57,7 @@ def record(path: str, motion: int) -> None:
     speeds = 0.5 * np.array([joint.velocity for joint in arm.chain.joints])
     limits = arm.chain.lower, arm.chain.upper
     reference = random_fourier(*limits, speeds, 10.0, 500.0, acceleration=15.0, seed=motion)
-    measured_files.write_log(virtual_arm.record(arm, reference, motion), path)
+    write_log(virtual_arm.record(arm, reference, motion), path)
 
 
 def bring(session: str) -> None:

@@ -30,11 +30,11 @@ HOMES = {
     "cv2": [
         "calib.rooms.camera.pictures.detection",
         "calib.rooms.camera.pictures.images",
-        "calib.rooms.camera.intrinsics",
+        "calib.rooms.camera.board_and_lens",
         "calib.rooms.camera.pictures.board_print",
         "calib.rooms.cells.rendered_camera",
     ],
-    "ruamel": ["calib.rooms.camera.camera_info"],
+    "ruamel": ["calib.rooms.camera.lens"],
     "mcap": ["calib.data.", "calib.rooms.camera."],
     "rosbags": ["calib.data.", "calib.rooms.camera."],
     "pandas": ["calib.api.rendering"],

@@ -34,13 +34,12 @@ from calib.robot.formats import urdf_write
 from calib.robot.library import load
 from calib.robot.tables import dumps
 from calib.rooms.camera.board import Board, read_board, write_board
-from calib.rooms.camera.camera_info import read_lens, write_lens
-from calib.rooms.camera.lens import pinhole
+from calib.rooms.camera.lens import pinhole, read_lens, write_lens
 from calib.rooms.camera.pictures.board_print import raster
-from calib.rooms.camera.pictures.corner_file import Found, read_corners, write_corners
 from calib.rooms.camera.pictures.detection import detect
 from calib.rooms.camera.pictures.images import decode as read_image_of
 from calib.rooms.camera.pictures.images import read_image
+from calib.rooms.camera.pixels import Found, read_corners, write_corners
 
 CHECKS = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 FEW = settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=CHECKS)

@@ -17,8 +17,7 @@ from calib import cli
 from calib.errors import MeasurementError, UsageError
 from calib.identification.identify_options import options_of, parse_options
 from calib.robot import description
-from calib.rooms.cells import measured_files
-from calib.rooms.cells.cell import measure
+from calib.rooms.cells.cell import measure, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
@@ -29,7 +28,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = perturbed_cell(calib.load("ur5").chain, seed=1)
     for name, count, seed in (("measured", 60, 0), ("other", 30, 5)):
         q = np.random.default_rng(seed).uniform(-2.0, 2.0, (count, 6))
-        measured_files.write(measure(made, q, seed=seed + 1), folder / f"{name}.csv")
+        write_measured(measure(made, q, seed=seed + 1), folder / f"{name}.csv")
     return folder
 
 

@@ -8,8 +8,7 @@ import pytest
 from both_ways import go_on, session_with
 
 from calib.robot import description
-from calib.rooms.cells import measured_files
-from calib.rooms.cells.cell import measure
+from calib.rooms.cells.cell import measure, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
@@ -25,7 +24,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cell = perturbed_cell(planted.arm(), seed=1, hidden=hidden)
         for kind, count, seed in (("first", 60, 0), ("measured", 40, 5), ("validation", 24, 7)):
             q = np.random.default_rng(seed).uniform(-2.0, 2.0, (count, planted.N))
-            measured_files.write(measure(cell, q, seed=seed + 1), folder / f"{name}{kind}.csv")
+            write_measured(measure(cell, q, seed=seed + 1), folder / f"{name}{kind}.csv")
     return folder
 
 

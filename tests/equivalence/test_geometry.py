@@ -17,8 +17,7 @@ from calib.errors import finding
 from calib.procedure.findings import sentence
 from calib.procedure.session.folder import open_session
 from calib.robot.library import load
-from calib.rooms.cells import measured_files
-from calib.rooms.cells.cell import measure
+from calib.rooms.cells.cell import measure, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
 
 
@@ -171,7 +170,7 @@ def test_what_the_poses_promised_is_held_against_the_same_figures(fitted: Path, 
     cell, names = perturbed_cell(planted.arm(), seed=1, hidden=0.0), planted.arm().joint_names
     for plan, name in (("poses", "measured"), ("validation", "validation")):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), names)
-        measured_files.write(measure(cell, q, seed=2), session.path(f"3-measured/{name}.csv"))
+        write_measured(measure(cell, q, seed=2), session.path(f"3-measured/{name}.csv"))
     assert not go_on(session)
     robot, measured = session.path(session.settings.robot.file), session.path("3-measured/measured.csv")
     words = ("fit", robot, measured, "--model", "geometry", "--out", tmp_path / "out")

@@ -12,8 +12,7 @@ from calib.robot import library
 from calib.robot.chain import random_joints
 from calib.robot.formats import urdf_write
 from calib.robot.library import load
-from calib.rooms.cells import measured_files
-from calib.rooms.cells.cell import measure
+from calib.rooms.cells.cell import measure, write_log, write_measured
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_arm import moving_arm, record
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -35,7 +34,7 @@ def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files the README speaks of, but logs."""
     cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
     (tmp_path / "robot.urdf").write_text(urdf_write.write_new(arm))
-    measured_files.write(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
+    write_measured(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
     joints = ",".join(f"{name} [rad]" for name in arm.joint_names)
     np.savetxt(tmp_path / "targets.csv", 0.5 * random_joints(arm, 5, 2), delimiter=",", header=joints, comments="")
     monkeypatch.chdir(tmp_path)
@@ -49,7 +48,7 @@ def with_logs(at_a_cell: Path) -> Path:
     moves, speed = moving_arm(cell, "lwr4plus", 1), np.array([joint.velocity for joint in arm.joints])
     for seed, name in enumerate(("log", "other")):
         motion = random_fourier(0.6 * arm.lower, 0.6 * arm.upper, 0.6 * speed, 15.0, 1000.0, seed=seed)
-        measured_files.write_log(record(moves, motion, seed), at_a_cell / f"{name}.csv")
+        write_log(record(moves, motion, seed), at_a_cell / f"{name}.csv")
     return at_a_cell
 
 

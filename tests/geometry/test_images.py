@@ -20,7 +20,7 @@ from calib.geometry.parameters import layout, step
 from calib.geometry.weighing import Settings
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
-from calib.rooms.camera.board_pose import board_poses
+from calib.rooms.camera.board_and_lens import board_poses
 from calib.rooms.camera.camera_guess import complete_camera
 from calib.rooms.camera.lens import Lens
 from calib.rooms.camera.optics import BoardShape

@@ -15,7 +15,7 @@ from study_rows import ROW
 from calib.errors import UsageError
 from calib.identification.methods.registry import VERSIONS
 from calib.rooms.studies.conditions import read_study
-from calib.rooms.studies.reports.report import run_study
+from calib.rooms.studies.report import run_study
 from calib.rooms.studies.store import JOURNAL, opened, read_rows
 from calib.rooms.studies.trial import TrialRow
 

@@ -14,7 +14,7 @@ from calib.identification.methods.registry import VERSIONS
 from calib.procedure.report.page import rendered
 from calib.rooms.studies.conditions import Condition, Study, read_study, shipped
 from calib.rooms.studies.experiment import make_experiment
-from calib.rooms.studies.reports.report import condition_table
+from calib.rooms.studies.report import condition_table
 from calib.rooms.studies.summary import MIN_DATA_SETS, sign_test, summarise
 from calib.rooms.studies.trial import FOUND, NOT_RECORDED, TrialRow, run_trial
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from calib.robot.chain import random_joints
 from calib.robot.library import load
-from calib.rooms.cells import measured_files
-from calib.rooms.cells.cell import measure
+from calib.rooms.cells.cell import measure, write_measured
 from calib.rooms.cells.virtual_cells import perturbed_cell
 
 CODE = """
@@ -35,6 +34,6 @@ print(json.dumps(loaded))
 def stages(folder: Path) -> dict[str, set[str]]:
     """Return the modules loaded at each stage of one process that works in a folder."""
     cell = perturbed_cell(load("ur5"), seed=1)
-    measured_files.write(measure(cell, random_joints(cell.nominal, 40, 0), 1), folder / "measured.csv")
+    write_measured(measure(cell, random_joints(cell.nominal, 40, 0), 1), folder / "measured.csv")
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=folder)
     return {stage: set(names) for stage, names in json.loads(done.stdout.splitlines()[-1]).items()}

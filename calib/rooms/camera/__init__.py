@@ -12,7 +12,7 @@ OFFERS = {
     "image_coverage": "image_findings:image_coverage",
     "image_words": "image_findings:image_words",
     "reprojection": "image_findings:reprojection",
-    "read_lens": "camera_info:read_lens",
+    "read_lens": "lens:read_lens",
     "read_board": "board:read_board",
 }
 TOPICS = {
@@ -21,8 +21,8 @@ TOPICS = {
         (
             "calib.rooms.camera.pictures.image_folders",
             "calib.rooms.camera.board",
-            "calib.rooms.camera.camera_info",
-            "calib.rooms.camera.pictures.corner_file",
+            "calib.rooms.camera.lens",
+            "calib.rooms.camera.pixels",
             "calib.rooms.camera.pictures.image_bags",
         ),
     )

@@ -32,6 +32,7 @@ DICTIONARIES = (
     *(f"{bits}x{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
 )  # fmt: skip
+MIN_CORNERS = 8  # corners that make an image useful
 
 
 @strict

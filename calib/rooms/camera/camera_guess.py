@@ -1,7 +1,7 @@
 """Initial values for a fit of images: lens, mounting (camera or board on the arm), and placements.
 
-Every image gives the board's pose by its corners alone (`calib.rooms.camera.board_pose`); the arm's poses beside them
-place camera and board in closed form (`calib.rooms.camera.robust_placement`). Both ways of mounting are tried.
+Each image gives the board's pose from its corners alone (`calib.rooms.camera.board_and_lens`); with the arm's poses a
+closed form places camera and board (`calib.rooms.camera.robust_placement`). Both ways of mounting are tried.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.rooms.camera import pixel_residuals  # noqa: F401  # registers what images say of the geometry
 from calib.rooms.camera.board import corners
-from calib.rooms.camera.board_pose import board_poses
+from calib.rooms.camera.board_and_lens import board_poses, estimate_lens
 from calib.rooms.camera.lens import Lens
 from calib.rooms.camera.optics import BoardShape, Optics
 from calib.rooms.camera.pixels import Pixels
@@ -64,8 +64,6 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
         if block.lens is None and isinstance(other, Pixels) and other.size == block.size and other.lens is not None:
             block = replace(block, lens=other.lens, mounting=block.mounting or other.mounting, free=())
     if block.lens is None:
-        from calib.rooms.camera.intrinsics import estimate_lens  # loads OpenCV
-
         if not block.size[0]:
             raise MeasurementError("image size unknown: no lens (camera.yaml) and no image was given", block.file)
         block = replace(block, lens=estimate_lens(block.board, block.pixel, block.size, block.model, block.file))

@@ -24,8 +24,7 @@ from calib.procedure.measuring.constraints_file import CameraTable
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
 from calib.rooms.camera.board import Board, corners, read_board
-from calib.rooms.camera.camera_info import read_lens
-from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.lens import Lens, read_lens
 from calib.rooms.camera.optics import BoardShape, Optics
 from calib.rooms.camera.pixel_residuals import ImageNoise
 from calib.rooms.camera.pixels import Pixels

@@ -39,9 +39,9 @@ def board(
         dictionary: marker dictionary: 4x4_50 to 7x7_1000, apriltag_36h11
         paper: a4, a3, a2, a1 or a0; by default the smallest that fits
     """
-    from calib.rooms.camera.pictures import boards
+    from calib.rooms.camera.pictures.board_print import make
 
-    for line in boards.make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
+    for line in make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
         say(line)
 
 
@@ -66,16 +66,19 @@ def images(
         joint_topic: joint topic of a bag with several robots
     """
     from calib.errors import UsageError
-    from calib.rooms.camera.pictures import boards
 
     with progress() as show:
         if source.is_dir() and (source / "board.toml").exists():
-            lines = boards.look(source, show)
+            from calib.rooms.camera.pictures.image_folders import look
+
+            lines = look(source, show)
         elif not source.exists():
             raise UsageError(f"{source}: no such file or folder")
         elif board is None or out is None:
             raise UsageError(f"{source} has no board.toml; for a bag give --board and --out")
         else:
-            lines = boards.from_bag(source, board, out, image_topic, joint_topic, show)
+            from calib.rooms.camera.pictures.image_bags import from_bag
+
+            lines = from_bag(source, board, out, image_topic, joint_topic, show)
     for line in lines:
         say(line)

@@ -1,13 +1,23 @@
-"""Camera measurements: corners of a board in images, one row per image."""
+"""Camera measurements: corners of a board in images, one row per image.
+
+``corners.csv``: the corners detected in the images of a folder, one per row, and why other images are unusable.
+
+Columns ``image``, ``corner``, ``u [px]``, ``v [px]``, ``sigma [px]``; an image without a usable board has one row with
+its ``problem`` and nothing else. Written beside the images, so that they are looked at once; a file that another
+program has written is read as well (without ``sigma``: 0.1 px).
+"""
 
 from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from calib import files
 from calib.data.poses import IMAGES, IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
-from calib.rooms.camera.board import Board
+from calib.errors import MeasurementError, refuse_data, refused_as
+from calib.rooms.camera.board import Board, corners
 from calib.rooms.camera.lens import Lens
 
 
@@ -73,3 +83,88 @@ class Pixels(PoseMeasurements):
     def name(self, row: int) -> str:
         """Return the image's name by its row number in the file."""
         return self.names[row - 1] if 0 < row <= len(self.names) else f"image {row}"
+
+
+HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
+USUAL = 0.1  # sigma where a file states none [px]; our choice
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Corners detected in one image.
+
+    Attributes:
+        pixel: (K, 2) of each corner of the board; NaN where it was not seen.
+        sigma: (K,) standard deviation of each coordinate [px].
+        problem: why the image is of no use; empty where it is of use.
+        edge: median width of the edges [px]; NaN without a board.
+    """
+
+    pixel: np.ndarray
+    sigma: np.ndarray
+    problem: str = ""
+    edge: float = float("nan")
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Whether each corner was detected, (K,)."""
+        return ~np.isnan(self.pixel[:, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Detections of a folder by image name, and the images' width and height (0, 0 where unknown)."""
+
+    images: dict[str, Detection]
+    size: tuple[int, int] = (0, 0)
+
+
+def write_corners(path: Path, found: Found) -> Path:
+    """Write detections as ``corners.csv``."""
+    rows: list[list[object]] = [["", "", *found.size, None, None, "size of the images"]]
+    for name, one in found.images.items():
+        edge = None if np.isnan(one.edge) else one.edge
+        if one.problem:
+            rows.append([name, None, None, None, None, edge, one.problem])
+        rows += [
+            [name, int(k), float(one.pixel[k, 0]), float(one.pixel[k, 1]), float(one.sigma[k]), edge, ""]
+            for k in np.flatnonzero(one.seen)
+        ]
+    return files.write_table(path, HEADER, rows)
+
+
+def read_corners(path: Path, board: Board) -> Found:
+    """Return the detections of a ``corners.csv`` for a board.
+
+    Raises:
+        MeasurementError: for corners that the board does not have.
+    """
+    import csv
+
+    count, images, size = len(corners(board)), dict[str, Detection](), (0, 0)
+    kinds = (OSError, UnicodeDecodeError, csv.Error)
+    readable = refused_as(MeasurementError, kinds, "cannot be read as a table ({})", path)
+    with readable, path.open(encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file, restkey="further cells", restval=""))
+    for number, row in enumerate(rows, 1):
+        if "further cells" in row:
+            refuse_data(path, "has more cells than the header names columns", row=number)
+        cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
+        name, problem = cells.get("image", ""), cells.get("problem", "")
+        with refused_as(
+            MeasurementError, (KeyError, ValueError, OverflowError), "expected image, corner, u, v ({})", path, number
+        ):
+            if not name and problem:
+                size = int(float(cells["u"])), int(float(cells["v"]))
+                continue
+            if name not in images:
+                images[name] = Detection(
+                    np.full((count, 2), np.nan), np.full(count, np.nan), problem, float(cells.get("edge") or "nan")
+                )
+            if problem or not cells.get("corner"):
+                continue
+            k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
+        if not 0 <= k < count:
+            refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
+        images[name].pixel[k], images[name].sigma[k] = place, float(cells.get("sigma") or USUAL)
+    return Found(images, size)

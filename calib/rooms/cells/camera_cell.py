@@ -26,8 +26,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import forward
 from calib.rooms.camera import board as boards
 from calib.rooms.camera.board import Board, corners
-from calib.rooms.camera.camera_info import write_lens
-from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.lens import Lens, write_lens
 from calib.rooms.camera.optics import BoardShape, Optics, shaped_points
 from calib.rooms.camera.pixels import Pixels
 from calib.rooms.cells.cell import Cell, true_poses

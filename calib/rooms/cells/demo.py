@@ -23,9 +23,8 @@ from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open
 from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.library import load
-from calib.rooms.cells import measured_files
 from calib.rooms.cells.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
-from calib.rooms.cells.cell import Cell, measure, wandering
+from calib.rooms.cells.cell import Cell, measure, planned_poses, wandering, write_log, write_measured
 from calib.rooms.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
 from calib.rooms.cells.virtual_arm import REST, MovingArm, moving_arm, play, record
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -214,7 +213,7 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda wor
     seed, cell, seen = session.settings.seed, _cell_of(session), _camera_of(session)
     if step in ("measure", "validate") and seen is not None:
         _mark(session, seen.cell.note)
-        for number, name, q in measured_files.planned(session.folder, cell.nominal):
+        for number, name, q in planned_poses(session.folder, cell.nominal):
             tell = partial(_rendering, progress, name)
             take_pictures(seen, q, session.path(f"3-measured/{name}"), seed=seed + number, say=tell)
         say("    (the simulated camera takes an image at every pose of both lists)")
@@ -240,12 +239,12 @@ def arm_of(session: Session, cell: Cell) -> MovingArm:
 def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
     _mark(session, cell.note)
-    for number, name, q in measured_files.planned(session.folder, cell.nominal):
+    for number, name, q in planned_poses(session.folder, cell.nominal):
         seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
-        measured_files.write(seen, session.path(f"3-measured/{name}.csv"))
+        write_measured(seen, session.path(f"3-measured/{name}.csv"))
         if name == "measured":
             again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
-            measured_files.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+            write_measured(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
 def _mark(session: Session, note: str) -> None:
@@ -265,4 +264,4 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
         t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
         reference = play(t, *motions[name].orders(t), motions[name].repeat)
         recorded = record(arm, reference, np.random.default_rng([seed, number]), running)
-        measured_files.write_log(recorded, session.path(f"7-recorded/{name}.csv"))
+        write_log(recorded, session.path(f"7-recorded/{name}.csv"))

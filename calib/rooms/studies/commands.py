@@ -40,7 +40,7 @@ def study(
     """
     from calib.identification.methods.registry import METHODS
     from calib.procedure.report import page
-    from calib.rooms.studies.reports import report
+    from calib.rooms.studies import report
 
     if list_methods or list_studies:
         say(*(map(str, METHODS.values()) if list_methods else ()), *(report.study_lines() if list_studies else ()))
@@ -96,8 +96,8 @@ def compare(
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs
     from calib.procedure.report import page
-    from calib.rooms.studies.reports import method_comparison
-    from calib.rooms.studies.reports.method_comparison import caveats, compare_methods, write_table
+    from calib.rooms.studies import method_comparison
+    from calib.rooms.studies.method_comparison import caveats, compare_methods, write_table
 
     table = [] if out is None else [(out, (".csv",))]
     files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)

@@ -6,8 +6,7 @@ import pytest
 from differences import check
 
 from calib.errors import CalibError, MeasurementError
-from calib.rooms.camera.camera_info import read_lens, write_lens
-from calib.rooms.camera.lens import Lens, pinhole, rays
+from calib.rooms.camera.lens import Lens, pinhole, rays, read_lens, write_lens
 
 SIZE = (800, 600)
 BASE = [780.0, 782.0, 400.0, 298.0]

@@ -10,8 +10,7 @@ from calib.data.poses import is_image_folder
 from calib.data.poses.fit_options import parse_options
 from calib.errors import MeasurementError
 from calib.rooms.camera.board import read_board
-from calib.rooms.camera.camera_info import write_lens
-from calib.rooms.camera.lens import Lens
+from calib.rooms.camera.lens import Lens, write_lens
 from calib.rooms.camera.pictures.image_bags import read_image_bag, write_image_folder
 from calib.rooms.camera.pictures.image_folders import problem_words, read_images
 from calib.rooms.cells import camera_cell as camera

@@ -22,9 +22,9 @@ from calib.procedure.session.questions import cell_tables
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
 from calib.rooms.camera.board import read_board
-from calib.rooms.camera.pictures.boards import make
-from calib.rooms.camera.pictures.corner_file import Detection, Found
+from calib.rooms.camera.pictures.board_print import make
 from calib.rooms.camera.pictures.image_bags import ImageBag, write_image_folder
+from calib.rooms.camera.pixels import Detection, Found
 from calib.rooms.cells import camera_cell as camera
 from calib.rooms.cells.cell import SimulatedInstrument
 from calib.rooms.cells.virtual_cells import rigid, virtual_cell

@@ -11,7 +11,7 @@ from calib.cli import run
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.dynamic_stage.validation import overlaps
-from calib.rooms.studies.reports.method_comparison import FAST_SECONDS, caveats, compare_methods
+from calib.rooms.studies.method_comparison import FAST_SECONDS, caveats, compare_methods
 
 
 def recorded(folder: Path) -> tuple[Path, Path]:
@@ -68,7 +68,7 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
 
 
 def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from calib.rooms.studies.reports import method_comparison
+    from calib.rooms.studies import method_comparison
 
     def broken(robot, cases, settings, say):
         if settings.method == "tls":

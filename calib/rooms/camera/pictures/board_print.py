@@ -1,14 +1,21 @@
 """Boards to print: SVG and PDF at true scale with a ruler, and their raster for a rendered camera."""
 
+from contextlib import suppress
+from pathlib import Path
+
 import cv2
 import numpy as np
 
-from calib.rooms.camera.board import Board
+from calib import files
+from calib.data.poses import BOARD
+from calib.errors import CalibError, UsageError, refused_as, require
+from calib.rooms.camera.board import KINDS, MIN_CORNERS, Board, corners, read_board, write_board
 from calib.rooms.camera.pictures.images import quiet
 
 PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}
 EDGE = 0.008  # printers leave this free [m]
 RULER = 0.016  # height of the strip with the ruler and the words [m]
+USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
 POINT = 0.0254 / 72.0  # PDF's unit [m]
 
 
@@ -167,3 +174,64 @@ def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tup
         ),
     ]
     return np.concatenate([boxes, ticks]), words
+
+
+def make(
+    out: Path, kind: str, columns: int | None, rows: int, square: float, marker: float | None, words: str | None,
+    paper: str | None, overwrite: bool = False,
+) -> list[str]:  # fmt: skip
+    """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return printing instructions.
+
+    Args:
+        out: folder.
+        kind, columns, rows, words, paper: see `calib.rooms.camera.board`; a dictionary, and the paper's name. None: the
+            usual ones.
+        square, marker: [mm].
+        overwrite: replace another board that is there, whose squares somebody may have measured.
+
+    Raises:
+        UsageError: for a board that cannot be, or does not fit onto its paper, and for another that is there already.
+    """
+    require(kind in KINDS, f"--kind {kind}: expected one of {', '.join(KINDS)}", UsageError)
+    if paper is not None and paper.lower() not in PAPERS:
+        raise UsageError(f"--paper {paper}: expected one of {', '.join(PAPERS)}")
+    min_square = 1.0  # side of a square [mm]
+    if square < min_square:
+        raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
+    usual, share, across = USUAL[kind]
+    with refused_as(UsageError, ValueError, "impossible board: {}"):
+        side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
+        made = Board(kind, columns or across, rows, side, between, words or usual).checked()
+        if (count := len(corners(made))) < MIN_CORNERS:
+            raise UsageError(f"a {made.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
+        size = page_size(made, (paper or "").lower())
+    there = out / BOARD
+    if not overwrite and there.exists() and not _as_printed(out):
+        raise UsageError(
+            f"{there} was changed after printing (measured squares?), or is another board's; nothing was written. "
+            "Take another folder (--out), or give --overwrite"
+        )
+    files.write(out / "board.pdf", pdf(made, size))
+    files.write(out / "board.svg", svg(made, size))
+    write_board(made, out / BOARD)
+    wide, high = (round(1e3 * length) for length in size)
+    return [
+        f"{made.words}, {len(corners(made))} corners, on a page of {wide} x {high} mm: {out / 'board.pdf'}",
+        "print it at 100 % (not fitted to the page), check the ruler, glue it onto glass or aluminium; then measure "
+        f"several squares together and put the size of one into {out / BOARD}: the robot's lengths get their "
+        "scale from it",
+    ]
+
+
+def _as_printed(out: Path) -> bool:
+    """Return whether a folder's ``board.toml`` still describes its ``board.svg``, as `make` wrote both."""
+    try:
+        found, drawn = read_board(out), (out / "board.svg").read_bytes()
+        sizes = []
+        for paper in ("", *PAPERS):
+            with suppress(ValueError):  # a paper that it does not fit onto
+                sizes.append(page_size(found, paper))
+        drawings = (svg(found, size) for size in dict.fromkeys(sizes))
+        return any((one.encode() if isinstance(one, str) else one) == drawn for one in drawings)
+    except (OSError, ValueError, CalibError):
+        return False

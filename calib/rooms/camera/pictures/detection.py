@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 
 from calib.errors import MeasurementError
-from calib.rooms.camera.board import DICTIONARIES, Board, corners
+from calib.rooms.camera.board import DICTIONARIES, MIN_CORNERS, Board, corners
 from calib.rooms.camera.pictures.board_print import charuco, dictionary
-from calib.rooms.camera.pictures.corner_file import Detection, Found
 from calib.rooms.camera.pictures.images import quiet, read_image
+from calib.rooms.camera.pixels import Detection, Found
 
-MIN_CORNERS = 8  # corners that make an image useful
 MIN_MARKERS = 4  # markers that tell a dictionary
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}  # of a corner's sigma [px]; tags' wander with blur
 BLURRED = 7.0  # width of an edge from which on an image is refused [px]

@@ -17,11 +17,10 @@ from calib import files
 from calib.data.poses import BOARD, CORNERS, JOINTS
 from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 from calib.errors import MeasurementError, require
-from calib.rooms.camera import board as boards
-from calib.rooms.camera.board import Board
-from calib.rooms.camera.pictures import corner_file
-from calib.rooms.camera.pictures.corner_file import Found
+from calib.rooms.camera.board import Board, read_board, write_board
 from calib.rooms.camera.pictures.detection import detected
+from calib.rooms.camera.pictures.image_folders import detection_summary
+from calib.rooms.camera.pixels import Found, write_corners
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
 
@@ -145,8 +144,19 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
 
 def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
     """Write a bag's images as a folder for `calib.rooms.camera.pictures.image_folders`."""
-    boards.write_board(board, folder / BOARD)
+    write_board(board, folder / BOARD)
     rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
     files.write_table(folder / JOINTS, ["image", *found.joint_names], rows)
-    corner_file.write_corners(folder / CORNERS, found.corners)
+    write_corners(folder / CORNERS, found.corners)
     return folder
+
+
+def from_bag(
+    bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Callable[[str], None]
+) -> list[str]:
+    """Write the corners and joint values of a bag's images as a folder; return sentences on the result."""
+    made = read_board(board)
+    found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
+    write_image_folder(found, made, out)
+    lines = detection_summary(found.corners, made, found.names)
+    return [*lines, *found.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

@@ -16,7 +16,7 @@ every length of the robot with it: measure the print.
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,14 +27,11 @@ from calib.data.poses import BOARD, CORNERS, JOINTS, plausible
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.plausible import Limits
-from calib.errors import CalibError, MeasurementError, counted, listing, require
-from calib.rooms.camera import board as boards
-from calib.rooms.camera.board import Board
-from calib.rooms.camera.camera_info import LENS, read_lens
-from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.pictures import corner_file
-from calib.rooms.camera.pictures.corner_file import Found
-from calib.rooms.camera.pixels import Pixels
+from calib.errors import CalibError, MeasurementError, UsageError, counted, listing, require
+from calib.rooms.camera.board import Board, corners, read_board
+from calib.rooms.camera.image_findings import coverage_words
+from calib.rooms.camera.lens import LENS, Lens, read_lens
+from calib.rooms.camera.pixels import Found, Pixels, read_corners, write_corners
 
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]
@@ -90,7 +87,7 @@ def read_own_board(path: Path) -> Board:
     """
     words = f"has no {BOARD}, which describes the board: copy the one that calib board wrote into it"
     require((path / BOARD).is_file(), words, MeasurementError, path)
-    return boards.read_board(path)
+    return read_board(path)
 
 
 def joint_table(path: Path) -> Table:
@@ -118,7 +115,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     images = [path / name for name in names if (path / name).is_file()]
     if stored.is_file():
         newest = max((each.stat().st_mtime for each in (*images, path / BOARD)), default=0.0)
-        kept = corner_file.read_corners(stored, board)
+        kept = read_corners(stored, board)
         if stored.stat().st_mtime >= newest and {each.name for each in images} <= set(kept.images):
             return kept
     if not images:
@@ -128,7 +125,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
 
     found = detected(((each.name, each) for each in images), board, len(images), progress)
     with suppress(CalibError):  # a folder that cannot be written into is read all the same
-        corner_file.write_corners(stored, found)
+        write_corners(stored, found)
     return found
 
 
@@ -198,3 +195,42 @@ def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
     if "bend" in camera.board:
         result += ["bend_xx", "bend_xy", "bend_yy"]
     return tuple(result)
+
+
+def look(folder: Path, show: Callable[[str], None]) -> list[str]:
+    """Return sentences on the board detection in the images of a folder."""
+    board = read_own_board(folder)
+    names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
+    found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
+    return detection_summary(found, board, names)
+
+
+def _images(folder: Path) -> list[str]:
+    from calib.rooms.camera.pictures.images import SUFFIXES
+
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    require(names, f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})", UsageError)
+    return names
+
+
+def detection_summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
+    """Return sentences on detected corners: how many images are usable, why others are not, what they cover.
+
+    Raises:
+        MeasurementError: where none is of use, with the reasons.
+    """
+    kept = [one for one in found.images.values() if not one.problem]
+    total = len(corners(board))
+    problems = problem_words({name: one.problem for name, one in found.images.items()})
+    if not kept:
+        raise MeasurementError("; ".join([f"none of {len(list(names))} images is usable ({board.words})", *problems]))
+    seen = np.array([one.seen.sum() for one in kept])
+    sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
+    edge = float(np.nanmedian([one.edge for one in kept]))
+    lines = [
+        f"{len(kept)} of {len(list(names))} images are of use ({board.words})",
+        f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide",
+    ]
+    if found.size[0]:
+        lines.append(coverage_words(np.concatenate([one.pixel[one.seen] for one in kept]), found.size))
+    return [*lines, *problems]

@@ -254,7 +254,7 @@ def make_page(
         blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))
     return filled(
-        "calib.rooms.studies.reports", "study.html", title=study.name, about=study.about, sections=sections,
+        "calib.rooms.studies", "study.html", title=study.name, about=study.about, sections=sections,
         notes=notes, issued=f"{issued()}, {len(rows)} trials",
     )  # fmt: skip
 
