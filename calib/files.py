@@ -298,7 +298,7 @@ def _not_finite(value: Any, place: str) -> Iterator[str]:
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a CSV table; floats have 12 significant digits.
+    """Write a CSV table; floats have 12 significant digits, cells of None and NaN are empty.
 
     Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
     a whole header that would be taken for one with other separators, or for a comment. A text that a spreadsheet would
@@ -336,7 +336,9 @@ def remarks(notes: Sequence[str]) -> str:
 
 
 def _cell(value: Any) -> Any:
-    return f"{value:.12g}" if isinstance(value, float) else shielded(value) if isinstance(value, str) else value
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.12g}"
+    return shielded(value) if isinstance(value, str) else value
 
 
 def _headed(header: Sequence[str]) -> io.StringIO:

@@ -28,6 +28,16 @@ OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
 """Files that identify an export, of a geometry and of dynamics."""
 
 
+class InFolder:
+    """Attribute of a folder type: the path of a file in that folder (its ``path``), by the file's name."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __get__(self, folder: Any, kind: type | None = None) -> Path:
+        return folder.path / self.name
+
+
 def check_target(
     out: Path, ours: Collection[str], marks: Collection[str], what: str, inputs: Iterable[str | Path | None] = ()
 ) -> None:

@@ -21,7 +21,7 @@ from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.geometry.observation import pose_sigmas
 from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection
-from calib.procedure.kinematic_stage.comparison import gravity_of
+from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
@@ -131,11 +131,11 @@ class GeometryFit(Judged, fit.Outcome):
             q: (m, n) joint values [rad or m].
             tool: which of the fit's tools.
         """
-        found, poses, torque = self.selection.fit, *self._poses(q)
-        sigma = pose_sigmas(found.cell, poses.q, found.free, found.estimate.covariance, torque, -1, tool)
+        found, q, torque = self.selection.fit, *self._poses(q)
+        sigma = pose_sigmas(found.cell, q, found.free, found.estimate.covariance, torque, -1, tool)
         if self.expected is not None:
-            sigma[:, 0] = self.expected.position_sigma(poses.q, torque, -1, tool)
-        return PredictedPoses(self.robot.forward(poses.q, torque) @ found.cell.tools[tool], sigma)
+            sigma[:, 0] = self.expected.position_sigma(q, torque, -1, tool)
+        return PredictedPoses(self.robot.forward(q, torque) @ found.cell.tools[tool], sigma)
 
     @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
@@ -153,16 +153,14 @@ class GeometryFit(Judged, fit.Outcome):
         """
         if self.expected is None:
             raise UsageError("no expected errors for this fit: at least 20 measured positions are needed")
-        poses, torque = self._poses(q)
-        return self.expected.position_sigma(poses.q, torque, tool=tool)
+        q, torque = self._poses(q)
+        return self.expected.position_sigma(q, torque, tool=tool)
 
-    def _poses(self, q: Any) -> tuple[PoseMeasurements, np.ndarray | None]:
-        """Return poses at joint values (m, n), and their gravity torques (m, n) [N m] if masses are known."""
+    def _poses(self, q: Any) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return joint values as an array (m, n), and gravity torques (m, n) [N m] there if masses are known."""
         chain = self.inputs.chain
-        poses = PoseMeasurements(
-            shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q"), chain.joint_names
-        )
-        return poses, gravity_of(chain, poses)
+        q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
+        return q, gravity_of(chain, q)
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

@@ -31,7 +31,6 @@ NATURE = {
 }
 """Which error each residual part (by its label) counts as."""
 
-Torques = Sequence[np.ndarray | None] | None
 _NONE = np.array([], dtype=int)
 
 
@@ -90,16 +89,15 @@ class Errors:
         return ArmErrors(*(statistics(size, factor) for size, (factor, _) in zip(sizes, ERRORS.values())))
 
 
-def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None) -> Errors:
+def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
     """Return the magnitudes of the prediction errors of all measured rows.
 
     Args:
         cell: the installation that predicts; it has the stations and tools of the measurements.
         measured: blocks of any kinds.
-        torques: gravity torques (m, n) per block [N m], for compliance terms.
     """
     found: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
-    for block in prepare(cell, measured, torques):
+    for block in prepare(cell, measured):
         for part in observe(cell, block, _NONE):
             found[NATURE[part.label]].append(part.sizes())
         if isinstance(block.measured, Sockets) and not block.measured.links:
@@ -131,7 +129,7 @@ def rms_sigma(sizes: np.ndarray) -> float:
 
 
 def pair_errors(
-    cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None, limit: int = 20000, seed: int = 0
+    cell: Installation, measured: Sequence[PoseMeasurements], limit: int = 20000, seed: int = 0
 ) -> np.ndarray:
     """Return | |p_i - p_j| - |y_i - y_j| | of pairs of measured positions [m], independent of the station.
 
@@ -139,7 +137,7 @@ def pair_errors(
     """
     generator = np.random.default_rng(seed)
     result = [np.zeros(0)]
-    for block in prepare(cell, measured, torques):
+    for block in prepare(cell, measured):
         if not isinstance(block.measured, Positions) or len(block.measured) < 2:
             continue
         first, second = _pairs(len(block.measured), limit, generator)

@@ -12,12 +12,10 @@ from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
 from calib.estimation.relevance import gram, relevance
 from calib.geometry.first_guess import install
-from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, observe, prepare, stack
-from calib.geometry.parameters import layout, parameter_values, step
-from calib.geometry.result import GeometricFit
-from calib.geometry.weighing import Settings, Weigher
+from calib.geometry.observability import base_columns
+from calib.geometry.observation import Block, families, layout, observe, parameter_values, prepare, stack, step
+from calib.geometry.weighing import GeometricFit, Settings, Weigher
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
 
@@ -31,7 +29,6 @@ def fit(
     candidates: np.ndarray | None = None,
     *,
     settings: Settings | None = None,
-    torques: Sequence[np.ndarray | None] | None = None,
     drawn: bool = False,
     prior: np.ndarray | None = None,
 ) -> GeometricFit:
@@ -47,7 +44,6 @@ def fit(
         measured: blocks of measurements.
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
-        torques: gravity torques (m, n) per block [N m], for compliance terms.
         drawn: keep all independent parameters, regularised towards nominal with the most probable strength
             (`_shrunk_fit`), instead of fixing the unidentified ones at nominal.
         prior: prior standard deviations of the whole parameter vector about its present values; infinite without a
@@ -59,7 +55,7 @@ def fit(
     settings = settings or Settings()
     table = layout(cell)
     candidates = np.arange(len(table.names)) if candidates is None else np.asarray(candidates, dtype=int)
-    blocks = prepare(cell, measured, torques)
+    blocks = prepare(cell, measured)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
     free = candidates[split.kept]
     if split is not None and not len(free):
@@ -131,10 +127,7 @@ def _shrunk_fit(
     One width for joint offsets, one for other angles, one for lengths. Where measurements come from a few places only
     (sockets, a plane), directions they hardly see would otherwise move the arm by centimetres to explain micrometres.
     """
-    table, moving = layout(cell), {e.name for e in cell.chain.elements if e.joint is not None}
-    kind = [
-        -1 if k >= table.arm else 0 if table.names[k] in moving else 1 if table.units[k] == "rad" else 2 for k in free
-    ]
+    kind = [{"offset": 0, "rad": 1, "m": 2}.get(each, -1) for each in families(cell)[free].tolist()]
     _, family = np.unique(kind, return_inverse=True)
     family = family - int(min(kind) < 0)
     prior = plausible_deviation(cell, free)
@@ -156,7 +149,7 @@ def _back_to_nominal(
     cell: Installation, nominal: Installation, candidates: np.ndarray, free: np.ndarray
 ) -> Installation:
     """Return `cell` with the arm's candidate parameters reset to nominal unless they are free."""
-    arm = candidates[candidates < layout(cell).arm]
+    arm = np.intersect1d(candidates, layout(cell).index("arm"))
     back = np.setdiff1d(arm, free)
     return step(cell, back, nominal.chain.values[back] - cell.chain.values[back])
 
@@ -204,7 +197,7 @@ def fit_with_prior(
 def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
     """Return the plausible deviation of each parameter from nominal (c,); infinite for frames and deflections."""
     table = layout(cell)
-    return np.array([PLAUSIBLE[table.units[k]] if k < table.arm else np.inf for k in columns])
+    return np.array([PLAUSIBLE[table.units[k]] if table.kinds[k] == "arm" else np.inf for k in columns])
 
 
 def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
@@ -235,18 +228,13 @@ def _whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def polish_frames(
-    cell: Installation,
-    measured: Sequence[PoseMeasurements],
-    settings: Settings | None = None,
-    torques: Sequence[np.ndarray | None] | None = None,
+    cell: Installation, measured: Sequence[PoseMeasurements], settings: Settings | None = None
 ) -> GeometricFit:
     """Return the fit of station and tool placements only, the arm unchanged; it gives the 'nominal' errors."""
-    return fit(cell, measured, layout(cell).frame_index, settings=settings, torques=torques)
+    return fit(cell, measured, layout(cell).frame_index, settings=settings)
 
 
-def placed_on(
-    cell: Installation, block: PoseMeasurements, torques: Sequence[np.ndarray | None] | None, settings: Settings
-) -> GeometricFit:
+def placed_on(cell: Installation, block: PoseMeasurements, settings: Settings) -> GeometricFit:
     """Return the arm with base and tool placement fitted to one block, arm and deflections unchanged.
 
     Where that does not settle, since the block hardly identifies some of it (the turn about a line that is driven),
@@ -254,11 +242,11 @@ def placed_on(
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))
-    found = polish_frames(start, [block], replace(settings, limit=CRAWLS), torques)
+    found = polish_frames(start, [block], replace(settings, limit=CRAWLS))
     if found.solution.status.good:
         return found
     min_column = 1e-3  # relative size of a column of a placement that a block hardly tells (our choice)
-    return polish_frames(found.cell, [block], replace(settings, tolerance=min_column), torques)
+    return polish_frames(found.cell, [block], replace(settings, tolerance=min_column))
 
 
 def without_corrections(

@@ -1,6 +1,10 @@
-"""The observation matrix of an installation: residual parts and their Jacobian for every block of measurements.
+"""Observation matrix of an installation: residual parts of each block, and their Jacobian in the fit's parameters.
 
 With it the covariance of a fit's parameters is propagated to the tool's pose.
+
+The vector of all parameters has the order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base
+placement's own axes), six per tool (in the target's own axes), of images the lenses' values and the boards' shapes,
+deflection coefficients (E).
 """
 
 from collections.abc import Sequence
@@ -8,13 +12,140 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import UsageError, require
-from calib.geometry.installation import Installation, Seen, see
-from calib.geometry.parameters import layout_counts
+from calib.geometry.installation import FRAME_AXES, Installation, Seen, see
 from calib.geometry.residuals import Part, parts
+from calib.robot import calibrated
 from calib.robot.calibrated import evaluate, extra_displacements, target_elements
 from calib.robot.kinematics import element_jacobian
+from calib.transforms import displace
+
+KINDS = ("arm", "station", "tool", "optics", "deflection")
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """Layout of the full parameter vector by kind of parameter.
+
+    Attributes:
+        names, units: one per parameter.
+        kinds: one of `KINDS` per parameter.
+        moving: positions of the optics that may be fitted.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    kinds: tuple[str, ...]
+    moving: tuple[int, ...] = ()
+
+    def index(self, *kinds: str) -> np.ndarray:
+        """Return the indices of the parameters of some kinds."""
+        return np.flatnonzero(np.isin(self.kinds, kinds))
+
+    @property
+    def frame_index(self) -> np.ndarray:
+        """Indices of placements and of fitted camera and board parameters: all but the robot's."""
+        return np.concatenate([self.index("station", "tool"), np.array(self.moving, dtype=int)])
+
+    @property
+    def rigid_index(self) -> np.ndarray:
+        """Indices of the arm's elements and of `frame_index`: all parameters of a rigid arm."""
+        return np.concatenate([self.index("arm"), self.frame_index])
+
+    def find(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
+        """Return the indices of named parameters.
+
+        Raises:
+            UsageError: for a name that does not exist.
+        """
+        table = {name: k for k, name in enumerate(self.names)}
+        for name in names:
+            require(name in table, f"unknown parameter '{name}'; expected one of {', '.join(self.names)}", UsageError)
+        return np.array([table[name] for name in names], dtype=int)
+
+
+def layout(cell: Installation) -> ParameterLayout:
+    """Return the layout of an installation's parameters."""
+    units = ("m", "m", "m", "rad", "rad", "rad")
+    frames = [f"{name}.{axis}" for name in (*cell.station_names, *cell.tool_names) for axis in FRAME_AXES]
+    terms = cell.deflection.terms
+    element_units = dict(zip(cell.chain.names, cell.chain.units))
+    return ParameterLayout(
+        names=(*cell.chain.names, *frames, *cell.optics.names, *cell.deflection.names(cell.chain)),
+        units=(
+            *cell.chain.units, *(units * (len(frames) // 6)), *cell.optics.units,
+            *(_unit(element_units, term) for term in terms),
+        ),
+        kinds=tuple(np.repeat(KINDS, layout_counts(cell)).tolist()),
+        moving=tuple((len(cell.chain.elements) + len(frames) + cell.optics.moving).tolist()),
+    )  # fmt: skip
+
+
+def families(cell: Installation) -> np.ndarray:
+    """Return the kind of each parameter (p,); of the arm's, ``offset`` of a joint, or the unit of another element."""
+    table, moving = layout(cell), {e.name for e in cell.chain.elements if e.joint is not None}
+    arm = ["offset" if name in moving else unit for name, unit in zip(cell.chain.names, cell.chain.units)]
+    return np.array([*arm, *table.kinds[len(arm) :]])
+
+
+def _unit(units: dict[str, str], term: calibrated.Term) -> str:
+    return units[term.element] + {"torque": "/(N m)", "joint": "/rad"}.get(term.basis, "")
+
+
+def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:
+    """Return the installation changed by `change` (f,) in the parameters `free` (f,); frames move on the manifold."""
+    where = layout_counts(cell)
+    full = np.zeros(sum(where))
+    full[free] = change
+    arm, stations, tools, optics, terms = np.split(full, np.cumsum(where)[:-1])
+    stations, tools = stations.reshape(-1, 6), tools.reshape(-1, 6)
+    return replace(
+        cell,
+        chain=cell.chain.with_values(cell.chain.values + arm) if arm.any() else cell.chain,
+        stations=np.array([displace(s, d) if d.any() else s for s, d in zip(cell.stations, stations)]),
+        tools=np.array([displace(t, d) if d.any() else t for t, d in zip(cell.tools, tools)]),
+        deflection=cell.deflection.with_coefficients(np.asarray(cell.deflection.coefficients) + terms)
+        if len(terms)
+        else cell.deflection,
+        optics=cell.optics.with_values(cell.optics.values + optics) if optics.any() else cell.optics,
+    )
+
+
+def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
+    """Return the number of parameters of each of `KINDS`."""
+    frames = 6 * len(cell.stations), 6 * len(cell.tools)
+    return len(cell.chain.elements), *frames, len(cell.optics), len(cell.deflection.terms)
+
+
+def parameter_values(cell: Installation) -> np.ndarray:
+    """Return the full parameter vector; frames have zeros: displacements from their present placement."""
+    _, stations, tools, _, _ = layout_counts(cell)
+    terms = np.asarray(cell.deflection.coefficients)
+    return np.concatenate([cell.chain.values, np.zeros(stations + tools), cell.optics.values, terms])
+
+
+def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
+    """Return the indices of parameters fixed at their nominal values: those in ``fix``, or all but those in ``free``.
+
+    ``free`` speaks of the arm; frames are always fitted.
+    """
+    table = layout(start)
+    fixed = table.find(options.fix)
+    if options.free:
+        fixed = np.union1d(fixed, np.setdiff1d(table.index("arm"), table.find(options.free)))
+    return fixed
+
+
+def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
+    """Return the prior standard deviations stated in the options, for the full vector; infinite where not stated."""
+    if not options.prior:
+        return None
+    table = layout(start)
+    prior = np.full(len(table.names), np.inf)
+    prior[table.find(tuple(options.prior))] = list(options.prior.values())
+    return prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +156,6 @@ class Block:
         measured: m rows.
         station: index of their station; -1 for kinds without an instrument, which refer to the arm's base.
         tool: (m,) index of each row's target among the installation's tools.
-        torque: (m, n) gravity torques [N m], or None.
         bases: (E, m) the deflection's bases, evaluated once.
         given: (K, m) displacements by the known deflections, or None.
     """
@@ -33,35 +163,29 @@ class Block:
     measured: PoseMeasurements
     station: int
     tool: np.ndarray
-    torque: np.ndarray | None = None
     bases: np.ndarray | None = None
     given: np.ndarray | None = None
 
 
-def prepare(
-    cell: Installation, measured: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None] | None = None
-) -> list[Block]:
+def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Block]:
     """Return blocks of measurements matched to stations and tools by name, with evaluated deflection bases.
 
     Raises:
         UsageError: for a station or tool the installation does not have.
     """
     blocks = []
-    for number, block in enumerate(measured):
-        torque = torques[number] if torques is not None else None
+    for block in measured:
         station = _index(cell.station_names, block.station, "station") if block.has_instrument else -1
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
-        blocks.append(_ready(cell, block, station, tools[block.tool], torque))
+        blocks.append(_ready(cell, block, station, tools[block.tool]))
     return blocks
 
 
-def _ready(
-    cell: Installation, measured: PoseMeasurements, station: int, tool: np.ndarray, torque: np.ndarray | None
-) -> Block:
-    bases = evaluate(cell.deflection, measured.q, torque) if cell.deflection.terms else None
-    known = evaluate(cell.known, measured.q, torque) if cell.known.terms else None
+def _ready(cell: Installation, measured: PoseMeasurements, station: int, tool: np.ndarray) -> Block:
+    bases = evaluate(cell.deflection, measured.q, measured.torque) if cell.deflection.terms else None
+    known = evaluate(cell.known, measured.q, measured.torque) if cell.known.terms else None
     given = extra_displacements(cell.chain, cell.known, measured.q, known)
-    return Block(measured, station, tool, torque, bases, given)
+    return Block(measured, station, tool, bases, given)
 
 
 def _index(names: tuple[str, ...], name: str, what: str) -> int:
@@ -153,7 +277,7 @@ def pose_sigmas(
     Args:
         cell: the fitted installation.
         q: (m, n) [rad or m].
-        free: (f,) positions in the parameter vector (`calib.geometry.parameters`).
+        free: (f,) positions in the parameter vector (`calib.geometry.observation`).
         covariance: (f, f) of steps along them.
         torque: (m, n) gravity torques [N m], for compliance terms.
         station: index of the station of reference; -1 for the arm's base.
@@ -161,13 +285,12 @@ def pose_sigmas(
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    result = [np.zeros((0, 2))]
+    result, whole = [np.zeros((0, 2))], PoseMeasurements(q, cell.chain.joint_names, torque=torque)
     chunk = 500  # poses at once: the Jacobian has a column per parameter
     for first in range(0, len(q), chunk):
-        rows = slice(first, first + chunk)
-        own = PoseMeasurements(q[rows], cell.chain.joint_names)
-        pulled = None if torque is None else torque[rows]
-        block = _ready(cell, own, station, np.broadcast_to(tool, len(q))[rows], pulled)
+        rows = np.arange(first, min(first + chunk, len(q)))
+        own = take(whole, rows)
+        block = _ready(cell, own, station, np.broadcast_to(tool, len(q))[rows])
         jacobian = target_jacobian(cell, predict(cell, block), free, station, block.tool, block.bases)
         spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(own))
         result.append(np.sqrt(np.sum(spread**2, axis=(0, 2))).T)

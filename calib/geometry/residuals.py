@@ -114,7 +114,7 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
     sigma = None if measured.sigma_rotation is None else measured.sigma_rotation.T
     everywhere = np.arange(len(measured))
-    angular = _inverse_right_jacobian(turn, jacobian[:, 3:])
+    angular = inverse_right_jacobian(turn, jacobian[:, 3:])
     return [*_position(measured, seen, jacobian), Part("orientation", turn, angular, sigma, 0, everywhere)]
 
 
@@ -238,7 +238,7 @@ def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
     return rows - (rows @ q) @ q.T
 
 
-def _inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
+def inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
     """Return J_r⁻¹(r) ω for rotation vectors r (3, m) and angular velocities (f, 3, m).
 
     J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  (Chirikjian 2012, vol. 2, eq. 10.86). Here

@@ -36,7 +36,7 @@ from calib.data.poses import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit
-from calib.geometry.parameters import layout
+from calib.geometry.observation import layout
 from calib.robot.chain import random_joints
 from calib.rooms.camera.camera_guess import complete_camera, pnp_poses
 from calib.rooms.camera.lens import Lens
@@ -66,7 +66,7 @@ def fitted(chain: Any, block: PoseMeasurements) -> GeometricFit:
     """Return the whole geometry fitted to one block."""
     start = install(chain, [block])
     table = layout(start)
-    return fit(start, [block], np.concatenate([table.arm_index, table.frame_index]))
+    return fit(start, [block], table.rigid_index)
 
 
 def tracked(cell: Cell, q: np.ndarray, seed: int) -> PoseMeasurements:

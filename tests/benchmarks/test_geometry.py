@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.model_choice.ladder import select_model
-from calib.geometry.observation import observe, predict, prepare
-from calib.geometry.parameters import step
+from calib.geometry.observation import observe, predict, prepare, step
 from calib.robot.chain import AXES, Chain
 from calib.robot.formats import urdf, urdf_write
 from calib.robot.kinematics import forward, jacobian

@@ -7,10 +7,9 @@ import pytest
 from planted import cell, load, measure, perturb, random_joints
 
 from calib.data.poses.measurements import PoseMeasurements, Poses
-from calib.geometry.identifiability import base_columns, observation_matrix
 from calib.geometry.installation import Installation, see
-from calib.geometry.observation import prepare
-from calib.geometry.parameters import layout
+from calib.geometry.observability import base_columns, observation_matrix
+from calib.geometry.observation import layout, prepare
 from calib.robot import mdh
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf, urdf_write
@@ -158,7 +157,7 @@ def test_the_papers_nine_rows(tool, tolerance, rank):
     elif tool == "tilted":
         table[8, 0] = 0.3
     installation = paper_form(table)
-    candidates = layout(installation).arm_index
+    candidates = layout(installation).index("arm")
     assert len(candidates) == 36
     assert split(installation, candidates=candidates, tolerance=tolerance, count=200).rank == rank
 
@@ -167,7 +166,7 @@ def test_the_papers_choice_of_what_to_drop_leaves_a_well_conditioned_matrix():
     """Without alpha0, d0, theta7, r7 the 32 columns are independent (facts, 2.1); with theta7 they hardly are."""
     installation = paper_form(lwr4plus.table_2()[0])
     table = layout(installation)
-    kept = np.setdiff1d(table.arm_index, table.find(["alpha0", "d0", "theta7", "r7"]))
+    kept = np.setdiff1d(table.index("arm"), table.find(["alpha0", "d0", "theta7", "r7"]))
     blocks = prepare(installation, [measure(installation, "pose", 200, 3)])
     matrix = observation_matrix(installation, blocks, kept)
     assert np.linalg.matrix_rank(matrix) == 32

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from calib.data.poses.measurements import Positions
+from calib.geometry import error_model
 from calib.geometry.accuracy import errors
+from calib.geometry.error_model import END_SHARE, ErrorModel, learn_errors
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
+from calib.geometry.left_out import LeftOut
 from calib.geometry.model_choice.ladder import select_model
-from calib.geometry.uncertainty import error_model
-from calib.geometry.uncertainty.error_model import END_SHARE, ErrorModel, learn_errors
-from calib.geometry.uncertainty.left_out import LeftOut
 from calib.robot.library import load
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell

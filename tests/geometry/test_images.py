@@ -15,8 +15,7 @@ from calib.errors import MeasurementError
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, placed_on
 from calib.geometry.installation import see
-from calib.geometry.observation import observe, prepare
-from calib.geometry.parameters import layout, step
+from calib.geometry.observation import layout, observe, prepare, step
 from calib.geometry.weighing import Settings
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
@@ -48,7 +47,7 @@ def started(cell, block):
     block = complete_camera(cell.cell.nominal, block)
     start = install(cell.cell.nominal, [block])
     table = layout(start)
-    return block, start, np.concatenate([table.arm_index, table.frame_index])
+    return block, start, table.rigid_index
 
 
 @pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
@@ -145,7 +144,7 @@ def test_a_print_of_another_size_is_measured_beside_another_instrument():
     block = complete_camera(cell.cell.nominal, block)
     start = install(cell.cell.nominal, [block, points])
     table = layout(start)
-    found = fit(start, [block, points], np.concatenate([table.arm_index, table.frame_index]))
+    found = fit(start, [block, points], table.rigid_index)
     values = dict(zip(found.estimate.names, zip(found.estimate.values, found.estimate.sigma)))
     for name, true in zip(("scale", "bend_xx", "bend_xy", "bend_yy"), shape.values):
         value, sigma = values[f"{block.target}.{name}"]
@@ -174,7 +173,7 @@ def test_two_cameras_see_one_board():
     start = install(cell.cell.nominal, blocks)
     assert start.optics.lens_names == ("camera", "other camera")
     table = layout(start)
-    found = fit(start, blocks, np.concatenate([table.arm_index, table.frame_index]))
+    found = fit(start, blocks, table.rigid_index)
     assert position_errors(cell.cell, placed_like(found.cell), found.cell.chain)[2] < 0.03
 
 
@@ -318,7 +317,7 @@ def test_frames_of_unseen_images_are_placed_with_the_lens_of_the_fit():
     later = camera.photograph(cell, camera.views(cell, 15, 8), 0.05, 8)
     later = complete_camera(cell.cell.nominal, later, [block])
     assert later.lens is block.lens and not later.free
-    again = placed_on(found.cell, replace(later, station="moved"), None, Settings()).cell
+    again = placed_on(found.cell, replace(later, station="moved"), Settings()).cell
     assert np.array_equal(again.optics.lenses[0].values, found.cell.optics.lenses[0].values)
     assert see(again, later.q).point == pytest.approx(see(found.cell, later.q).point, abs=1e-4)
     assert isinstance(later, Pixels) and not isinstance(later, Positions)

@@ -1,7 +1,7 @@
 """The ladder takes up what was planted, and nothing where the truth is rigid."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -86,10 +86,9 @@ def test_joint_offsets_are_found_to_be_joint_offsets():
 def test_planted_compliance_is_found(seed, known):
     """With gravity torques as compliances, near the planted ones; without, as moments fitted with the geometry."""
     truth, nominal = sagging(seed), load("lwr4plus")
-    torque = lambda q: gravity_torques(nominal, q)  # noqa: E731
-    measured = measure(truth, "position", 200, seed, sigma=SIGMA, torque=torque)
-    torques = [torque(measured.q)] if known else None
-    found = select_model(install(nominal, [measured]), [measured], torques=torques)
+    measured = measure(truth, "position", 200, seed, sigma=SIGMA, torque=partial(gravity_torques, nominal))
+    measured = measured if known else replace(measured, torque=None)
+    found = select_model(install(nominal, [measured]), [measured])
     plain = select_model(install(nominal, [measured]), [measured], "geometry")
     assert "stiffness" in found.chosen
     errors = [unseen(f.fit, truth, True) if known or f is plain else _unseen_sag(f.fit, truth) for f in (found, plain)]
@@ -148,7 +147,7 @@ def test_any_rung_can_be_asked_for(model):
 
 
 def test_what_is_fixed_stays_at_its_nominal():
-    from calib.geometry.parameters import layout
+    from calib.geometry.observation import layout
 
     truth, nominal = rigid("ur5", 3), load("ur5")
     measured = measure(truth, "position", 120, 1, sigma=SIGMA)

@@ -12,7 +12,7 @@ from calib.errors import MeasurementError
 from calib.geometry.accuracy import errors
 from calib.geometry.fit import fit
 from calib.geometry.installation import Installation, Seen, see
-from calib.geometry.parameters import layout
+from calib.geometry.observation import layout
 from calib.geometry.residuals import Part, parts
 from calib.robot.chain import random_joints
 from calib.robot.library import load

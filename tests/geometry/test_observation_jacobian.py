@@ -10,8 +10,7 @@ from planted import cell, load, measure, perturb, random_joints
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.model_choice.ladder import EFFECTS
-from calib.geometry.observation import observe, predict, prepare, target_jacobian
-from calib.geometry.parameters import layout, step
+from calib.geometry.observation import layout, observe, predict, prepare, step, target_jacobian
 from calib.robot.calibrated import Deflection, Term
 from calib.transforms import pose
 
@@ -44,7 +43,7 @@ def test_target_positions_and_rotations(name):
     """Arm, two stations, two tools seen in one block, and every deflection basis."""
     truth = moving_cell(name, ("front", "back"), ("east", "west"))
     measured = measure(truth, "pose", 9, 5, station=1, tools=(0, 1), torque=torques)
-    block = prepare(truth, [measured], [torques(measured.q)])[0]
+    block = prepare(truth, [measured])[0]
     free = np.arange(len(layout(truth).names))
     seen = predict(truth, block)
 
@@ -75,8 +74,8 @@ def test_every_effect_of_the_ladder(effect, known):
     values = 1e-3 * np.random.default_rng(0).normal(size=len(terms))
     truth = replace(cell(perturb(chain, 2), 1), deflection=Deflection(tuple(terms), values, chain))
     measured = measure(truth, "pose", 5, torque=torques)
-    block = prepare(truth, [measured], [torques(measured.q)])[0]
-    free = layout(truth).term_index
+    block = prepare(truth, [measured])[0]
+    free = layout(truth).index("deflection")
     seen = predict(truth, block)
     jacobian = target_jacobian(truth, seen, free, block.station, block.tool, block.bases)
     check(lambda x: predict(step(truth, free, x), block).point, jacobian[:, :3].transpose(1, 2, 0), np.zeros(len(free)),
@@ -104,7 +103,7 @@ def test_the_residuals_slope_is_minus_the_jacobian(name, kind):
     )
     free = np.arange(len(layout(away).names))
     if kind == "sockets":  # without an instrument the residual vectors turn with station 0, their lengths do not
-        free = np.setdiff1d(free, layout(away).station_index)
+        free = np.setdiff1d(free, layout(away).index("station"))
     block = prepare(away, [measured])[0]
     parts = observe(away, block, free)
     claimed = -np.concatenate([p.jacobian.reshape(len(free), -1) for p in parts], axis=1).T

@@ -55,7 +55,7 @@ def test_full_poses_of_one_orientation_are_placed_as_well_as_their_positions(kin
         assert isinstance(block, Poses)
         points = Positions(block.q, block.joint_names, block.position, sigma=block.sigma)
         for arm, most in ((Installation(cell.nominal), 1.1), (Installation(cell.truth.chain), 1.5)):
-            whole, some = (placed_on(arm, each, None, Settings()) for each in (block, points))
+            whole, some = (placed_on(arm, each, Settings()) for each in (block, points))
             assert whole.solution.status.good
             assert rms(whole.cell, block) < most * max(rms(some.cell, points), 52e-6)
 

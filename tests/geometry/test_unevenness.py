@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.geometry.uncertainty.left_out import Unevenness, unevenness
+from calib.geometry.left_out import Unevenness, unevenness
 
 
 def drawn(loud: float, count: int = 300) -> tuple[np.ndarray, np.ndarray]:

@@ -8,11 +8,11 @@ from planted import cell, load, measure, perturb, random_joints
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import Finding
-from calib.geometry.checks.diagnosis import diagnose, neighbour_floor
+from calib.geometry.diagnosis import diagnose, neighbour_floor
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
-from calib.geometry.identifiability import PLACES, unidentified
 from calib.geometry.installation import Installation, see
+from calib.geometry.observability import PLACES, unidentified
 from calib.robot.calibrated import Deflection, Term
 
 SIGMA = 5e-5

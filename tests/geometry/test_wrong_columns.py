@@ -8,7 +8,7 @@ import pytest
 from calib.column_changes import coupling
 from calib.data.poses.measurements import take
 from calib.data.poses.pose_files import read_measurements
-from calib.geometry.checks import wrong_columns
+from calib.geometry import diagnosis
 from calib.geometry.first_guess import install
 from calib.robot.chain import random_joints
 from calib.robot.library import load
@@ -24,9 +24,9 @@ def test_a_reversal_that_no_placement_makes_good_is_not_searched_for(monkeypatch
     q = block.q.copy()
     q[:, list(turned)] *= -1.0
     block = replace(block, q=q)
-    polish = wrong_columns.polish_frames
-    monkeypatch.setattr(wrong_columns, "polish_frames", lambda *given: placed.append(given) or polish(*given))
-    found = wrong_columns.wrong_columns(install(cell.nominal, [block]), [block], [None])
+    polish = diagnosis.polish_frames
+    monkeypatch.setattr(diagnosis, "polish_frames", lambda *given: placed.append(given) or polish(*given))
+    found = diagnosis.wrong_columns(install(cell.nominal, [block]), [block])
     assert (found.joints if found else ()) == turned
     assert len(placed) <= most
 
@@ -46,5 +46,5 @@ def test_real_poses_are_sound_unless_a_joint_counts_from_the_one_before(data, fo
     (block,) = read_measurements(file, arm.joint_names)
     block = take(block, np.arange(0, len(block), max(1, len(block) // 100)))
     changed = replace(block, q=block.q @ coupling(arm.n, 2, 1, -way).T)
-    found = wrong_columns.wrong_columns(install(arm, [changed]), [changed], [None], mirrored=True)
+    found = diagnosis.wrong_columns(install(arm, [changed]), [changed], mirrored=True)
     assert (found and (found.code, found.joints)) == (("joint-coupled", (2, 1)) if way else None)

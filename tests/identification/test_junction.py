@@ -8,7 +8,7 @@ import pytest
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
-from calib.geometry.result import calibrated_chain
+from calib.geometry.weighing import calibrated_chain
 from calib.identification.identify import identify
 from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import folder as identified

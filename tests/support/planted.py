@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from calib.data.poses.measurements import KINDS, Planes, PoseMeasurements, Sockets
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import observe, prepare, stack
-from calib.geometry.result import GeometricFit
+from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import joint_jacobian
 from calib.robot.library import load
@@ -67,7 +67,8 @@ def measure(
         return _touched(truth, kind, q, tool, sigma, stated, file, rng)
     from calib.robot import calibrated
 
-    bases = calibrated.evaluate(truth.deflection, q, torque(q) if torque else None)
+    pulled = torque(q) if torque else None
+    bases = calibrated.evaluate(truth.deflection, q, pulled)
     seen = see(truth, q, station, tool, bases)
     point = seen.point.T
     common: dict[str, Any] = dict(
@@ -77,6 +78,7 @@ def measure(
         tool_names=tuple(truth.tool_names[k] for k in np.unique(tools)),
         station=truth.station_names[station],
         file=file,
+        torque=pulled,
         sigma=np.full(count if kind in ("distance", "bar") else (count, 3), sigma) if stated and sigma else None,
     )
     if kind in ("pose", "position"):
@@ -150,7 +152,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements], torques=None) -> tuple[float, float]:
+def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements]) -> tuple[float, float]:
     """Return the squared distance of the truth from the estimate in its own covariance, and what no parameter explains.
 
     Parameters have a gauge (an offset of joint 1 is a turn of the base), what is measured has not: the residuals of
@@ -159,7 +161,7 @@ def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements], torques=No
     Returns:
         dxᵀ C⁻¹ dx, chi-squared with as many degrees of freedom as parameters; and ‖r - W dx‖ / ‖r‖.
     """
-    parts = [part for block in prepare(found.cell, exact, torques) for part in observe(found.cell, block, found.free)]
+    parts = [part for block in prepare(found.cell, exact) for part in observe(found.cell, block, found.free)]
     residual, matrix = stack(parts, [np.ones(1)] * len(parts))
     scale = np.linalg.norm(matrix, axis=0)
     dx = np.linalg.lstsq(matrix / scale, residual, rcond=None)[0] / scale

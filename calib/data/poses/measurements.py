@@ -27,6 +27,7 @@ class PoseMeasurements:
         tool: (m,) index into ``tool_names``: which reflector or target of the tool was seen.
         station: name of the instrument placement that these rows share (unused by kinds without an instrument).
         file, rows: where they came from; rows (m,) count data rows from 1.
+        torque: (m, n) gravity torques of the arm at these rows [N m], for compliance terms; None if not known.
         ignored: header names that were not used, for the message.
         notes: findings on odd values that were accepted, for the message.
 
@@ -44,6 +45,7 @@ class PoseMeasurements:
     station: str = "station"
     file: str = ""
     rows: np.ndarray = None  # type: ignore[assignment]  # set below
+    torque: np.ndarray | None = None
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 

@@ -18,9 +18,8 @@ from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, cond
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
-from calib.geometry.observation import observe, prepare
-from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit
+from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
@@ -148,12 +147,7 @@ class FoldStatistics:
 
 
 def fold_statistics(
-    found: GeometricFit,
-    measured: Sequence[PoseMeasurements],
-    terms: tuple[Term, ...],
-    reference: Chain,
-    folds: Folds,
-    torques: Sequence[np.ndarray | None] | None = None,
+    found: GeometricFit, measured: Sequence[PoseMeasurements], terms: tuple[Term, ...], reference: Chain, folds: Folds
 ) -> FoldStatistics:
     """Return the statistics of every fold at a fitted model, for its free parameters and `terms`.
 
@@ -163,11 +157,10 @@ def fold_statistics(
         terms: E deflection terms on offer.
         reference: chain on which the terms' bases are evaluated.
         folds: partition of the rows.
-        torques: gravity torques per block.
     """
     cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
-    free = np.concatenate([found.free, layout(cell).term_index])
-    rows_of = _Rows(cell, measured, free, found.used_sigmas(), found.row_weights(), found.used_noises(), torques)
+    free = np.concatenate([found.free, layout(cell).index("deflection")])
+    rows_of = _Rows(cell, measured, free, found.used_sigmas(), found.row_weights(), found.used_noises())
     rigid, groups, sizes = len(found.free), term_groups(terms), term_sizes(terms)
     pooled = all(block.has_instrument for block in measured)
     each, held_out, rows = list[Gram](), list[Gram](), []
@@ -192,12 +185,7 @@ def fold_statistics(
     return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
 
 
-def blind_folds(
-    nominal: GeometricFit,
-    measured: Sequence[PoseMeasurements],
-    folds: Folds,
-    torques: Sequence[np.ndarray | None] | None = None,
-) -> np.ndarray:
+def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], folds: Folds) -> np.ndarray:
     """Return which folds cannot be predicted (folds,): the other rows do not determine the tool position in them.
 
     There the error by the covariance of geometry and frames (nominal residuals as noise, `plausible_deviation` as
@@ -207,17 +195,15 @@ def blind_folds(
         nominal: the nominal arm with its frames fitted to all rows.
         measured: the blocks it was fitted to, positions or poses all.
         folds: partition of the rows.
-        torques: gravity torques per block.
     """
-    table = layout(nominal.cell)
-    free = np.concatenate([table.arm_index, table.frame_index])
+    free = layout(nominal.cell).rigid_index
     sigmas: list[dict[str, float]] = [{} for _ in measured]
     for piece in nominal.pieces:
         sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
     frame_sigma = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
-    known = np.where(free >= table.arm, frame_sigma, plausible_deviation(nominal.cell, free))
+    known = np.minimum(plausible_deviation(nominal.cell, free), frame_sigma)
     none = [None] * len(measured)
-    rows = _Rows(nominal.cell, measured, free, sigmas, nominal.row_weights(), none, torques)
+    rows = _Rows(nominal.cell, measured, free, sigmas, nominal.row_weights(), none)
     each, squares = [], []
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
@@ -246,7 +232,6 @@ class _Rows:
     scales: Sequence[dict[str, float]]
     weights: Sequence[np.ndarray]
     noises: Sequence[Any]
-    torques: Sequence[np.ndarray | None] | None
 
     def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
         """Return statistics of chosen rows in metres (metric parts) and whitened, and the number of metric rows.
@@ -255,14 +240,13 @@ class _Rows:
         """
         p, count = len(self.free), 0.0
         metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
-        station = np.flatnonzero(np.isin(self.free, layout(self.cell).station_index))
+        station = np.flatnonzero(np.isin(self.free, layout(self.cell).index("station")))
         chunk = 1000  # poses observed at once
         for number, (block, rows) in enumerate(zip(self.measured, chosen)):
             frames: list[np.ndarray] = []
-            torque = None if self.torques is None else self.torques[number]
             pieces = np.array_split(rows, max(1, len(rows) // chunk)) if block.has_instrument else [rows]
             for piece in filter(len, pieces):
-                ready = prepare(self.cell, [take(block, piece)], [None if torque is None else torque[piece]])
+                ready = prepare(self.cell, [take(block, piece)])
                 noise = self.noises[number].unweighted(len(piece)) if self.noises[number] else None
                 for bare in observe(self.cell, ready[0], self.free):
                     part, weight = replace(bare, noise=noise), self.weights[number][piece][bare.index]

@@ -22,10 +22,8 @@ from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import FoldStatistics, blind_folds, fold_statistics
 from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
-from calib.geometry.observation import prepare
-from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit
-from calib.geometry.weighing import Settings
+from calib.geometry.observation import layout, prepare
+from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
@@ -153,9 +151,7 @@ class ModelSelection:
             return self.rigid
         bare = polish_frames(replace(self.nominal.cell, known=Deflection()), measured, settings).cell
         drawn = not all(block.has_instrument for block in measured)
-        table = layout(bare)
-        every = np.concatenate([table.arm_index, table.frame_index])
-        return fit(bare, measured, every, settings=settings, drawn=drawn)
+        return fit(bare, measured, layout(bare).rigid_index, settings=settings, drawn=drawn)
 
 
 def select_model(
@@ -164,7 +160,6 @@ def select_model(
     model: str = "auto",
     *,
     settings: Settings | None = None,
-    torques: Sequence[np.ndarray | None] | None = None,
     fixed: np.ndarray | None = None,
     prior: np.ndarray | None = None,
     seed: int = 0,
@@ -179,7 +174,6 @@ def select_model(
         model: ``auto``, or one of `MODELS`: that step and all before it.
         settings: of every fit. With loss ``auto``, rows beyond `MAX_RESIDUAL` robust sigmas of the rigid fit change it
             to ``cauchy``, for fits and errors on unseen rows.
-        torques: gravity torques (m, n) per block [N m]; None for unknown masses.
         fixed: positions in the parameter vector that stay at their nominal.
         prior: standard deviations of the parameter vector about its nominal; infinite without a prior.
         seed: of the regions.
@@ -191,7 +185,7 @@ def select_model(
     """
     one_of(model, ("auto", *MODELS), "model", UsageError)
     climber = _Climber(
-        cell, measured, settings or Settings(), torques, np.array([], dtype=int) if fixed is None else fixed, prior,
+        cell, measured, settings or Settings(), np.array([], dtype=int) if fixed is None else fixed, prior,
         folds or transfer_folds(measured, seed), progress or (lambda done, total, what: None), seed,
     )  # fmt: skip
     climber.rigid(model)
@@ -210,7 +204,6 @@ class _Climber:
     cell: Installation
     measured: Sequence[PoseMeasurements]
     settings: Settings
-    torques: Sequence[np.ndarray | None] | None
     fixed: np.ndarray
     prior: np.ndarray | None
     asked: Folds
@@ -220,13 +213,13 @@ class _Climber:
     def __post_init__(self) -> None:
         self.steps, self.folds = -1, self.asked
         self._tick("frames")
-        self.nominal = self.best = self.stiff = polish_frames(self.cell, self.measured, self.settings, self.torques)
+        self.nominal = self.best = self.stiff = polish_frames(self.cell, self.measured, self.settings)
         self.rungs: list[ModelStep] = []
         self.chosen, self.offered = "frames", tuple[Term, ...]()
         positions = all(isinstance(block, Positions) for block in self.measured)
         if self.folds.kind == "stations" and not self.folds.blind and positions:
             for scattered in (False, True):
-                blind = blind_folds(self.nominal, self.measured, self.folds, self.torques)
+                blind = blind_folds(self.nominal, self.measured, self.folds)
                 if not blind.any():
                     break
                 self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
@@ -237,7 +230,7 @@ class _Climber:
         choices = {
             "frames": table.frame_index,
             "offsets": np.concatenate([cell.chain.driven, table.frame_index]),
-            "geometry": np.concatenate([table.arm_index, table.frame_index]),
+            "geometry": table.rigid_index,
         }
         drawn = not all(block.has_instrument for block in self.measured)
         error, last = np.inf, model if model in choices else "geometry"
@@ -245,7 +238,7 @@ class _Climber:
             self._tick(name)
             found = self.nominal if name == "frames" else fit(
                 cell, self.measured, np.setdiff1d(candidates, self.fixed), settings=self.settings,
-                torques=self.torques, drawn=drawn, prior=self.prior,
+                drawn=drawn, prior=self.prior,
             )  # fmt: skip
             unseen = self._statistics(found, ()).error_rigid()
             better = unseen < error * (1.0 - MIN_GAIN)
@@ -347,10 +340,10 @@ class _Climber:
         ridge, reference = statistics.ridges(where), self.nominal.cell.chain
         picked = tuple(terms[k] for k in where[ridge > 0.0])
         cell = replace(rigid.cell, deflection=Deflection(picked, np.zeros(len(picked)), reference))
-        free = np.concatenate([rigid.free, layout(cell).term_index])
+        free = np.concatenate([rigid.free, layout(cell).index("deflection")])
         own = np.full(len(rigid.free), np.inf) if rigid.prior is None else rigid.prior
         found = fit_with_prior(
-            cell, prepare(cell, self.measured, self.torques), free, np.concatenate([own, ridge[ridge > 0.0]]),
+            cell, prepare(cell, self.measured), free, np.concatenate([own, ridge[ridge > 0.0]]),
             settings=self.settings, nominal=replace(cell, chain=reference),
         )  # fmt: skip
         return replace(found, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
@@ -360,13 +353,13 @@ class _Climber:
 
         `poses_per_order`: harmonics of order k are offered to sets of at least 8 k poses (our choice).
         """
-        known = self.torques is not None and all(torque is not None for torque in self.torques)
+        known = all(block.torque is not None for block in self.measured)
         highest = sum(len(block) for block in self.measured) // poses_per_order
         terms = EFFECTS[effect](self.nominal.cell.chain, known)
         return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
 
     def _statistics(self, found: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
-        return fold_statistics(found, self.measured, terms, self.nominal.cell.chain, self.folds, self.torques)
+        return fold_statistics(found, self.measured, terms, self.nominal.cell.chain, self.folds)
 
     def _tick(self, what: str) -> None:
         self.steps += 1

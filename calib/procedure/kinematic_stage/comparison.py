@@ -11,14 +11,13 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.extensions import offered
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics
-from calib.geometry.checks.repeatability import ARMS, RepeatedPoses, repeated_poses
+from calib.geometry.error_model import ErrorModel, outside
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
-from calib.geometry.uncertainty.error_model import ErrorModel, outside
+from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
-from calib.robot.chain import Chain
 
 # of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all axes
 # together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
@@ -68,7 +67,6 @@ class Comparison:
 
     Attributes:
         blocks: the rows.
-        torques: gravity torques (m, n) per block, or None [N m].
         cells: nominal and calibrated installation that predict them.
         errors: of each.
         pairs: errors of the distances between pairs of positions, of each [m].
@@ -88,7 +86,6 @@ class Comparison:
     """
 
     blocks: tuple[PoseMeasurements, ...]
-    torques: list[np.ndarray | None]
     cells: tuple[Installation, Installation]
     errors: tuple[Errors, Errors]
     pairs: tuple[np.ndarray, np.ndarray]
@@ -138,14 +135,14 @@ def compare(
     shares_frames: bool = False,
 ) -> Comparison:
     """Return the errors of both arms on some rows, and of the calibrated geometry `alone` (`without_corrections`)."""
-    cells, torques = (nominal, calibrated), [gravity_of(nominal.chain, block) for block in blocks]
-    one, two = (errors(cell, blocks, torques) for cell in cells)
-    first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
+    cells = nominal, calibrated
+    one, two = (errors(cell, blocks) for cell in cells)
+    first, second = (pair_errors(cell, blocks, seed=seed) for cell in cells)
     rigid = None if alone is None else errors(alone, blocks)
-    corners: Any = [room(cell, blocks, torques) for room in offered("reprojection") for cell in cells]
+    corners: Any = [room(cell, blocks) for room in offered("reprojection") for cell in cells]
     return Comparison(
-        tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, repeated_poses(cells, blocks, torques), None if None in corners else tuple(corners) or None,
+        tuple(blocks), cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
+        shares_frames, repeated_poses(cells, blocks), None if None in corners else tuple(corners) or None,
     )  # fmt: skip
 
 
@@ -159,11 +156,11 @@ def compare_unseen(
     expected: ErrorModel | None = None,
 ) -> Comparison:
     """Return the errors of both arms on unseen rows; base and tool placement are refitted if these rows need it."""
-    block, torques, settled, thin = unseen.block, [gravity_of(nominal.chain, unseen.block)], True, None
+    block, settled, thin = unseen.block, True, None
     if unseen.own_frames:
-        placed = [placed_on(cell, block, torques, settings) for cell in (nominal, calibrated)]
+        placed = [placed_on(cell, block, settings) for cell in (nominal, calibrated)]
         nominal, calibrated = (each.cell for each in placed)
-        alone = None if alone is None else placed_on(alone, block, torques, settings).cell
+        alone = None if alone is None else placed_on(alone, block, settings).cell
         settled = all(each.solution.status.good for each in placed)
         numbers, fitted = sum(piece.part.value.size for piece in placed[1].pieces), len(placed[1].free)
         words = "base and tool placement refitted on these rows"
@@ -182,7 +179,7 @@ def compare_unseen(
     )  # fmt: skip
     sizes, intervals = found.errors[1].position, None
     if expected is not None and isinstance(block, Positions) and sizes is not None:
-        sigma = expected.sigma_on(calibrated, block, torques[0], unseen.own_frames)
+        sigma = expected.sigma_on(calibrated, block, unseen.own_frames)
         intervals = _intervals(expected, block, sigma, sizes)
     return replace(found, settled=settled, placed_by=thin, intervals=intervals)
 
@@ -194,21 +191,11 @@ def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes:
     return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)
 
 
-def interval_cells(found: Comparison, count: int) -> list[tuple[float | None, float | None, int | None]]:
-    """Return the table cells of `INTERVAL` for `count` rows; empty cells if the fit has no error model."""
-    if found.intervals is None:
-        return [(None, None, None)] * count
-    each = found.intervals
-    return list(zip((1e3 * each.sigma).tolist(), (1e3 * each.radius).tolist(), each.beyond.astype(int).tolist()))
-
-
-def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
-    """Return gravity torques (m, n) [N m] of a block; None if the robot's masses are unknown."""
-    if chain.inertias is None or len(chain.driven) != chain.n:
-        return None
-    from calib.dynamics.rigid_body import gravity_torques
-
-    return gravity_torques(chain, block.q)
+def interval_cells(found: Comparison) -> np.ndarray:
+    """Return the table cells (m, 3) of `INTERVAL` for all rows; NaN if the fit has no error model."""
+    if (each := found.intervals) is None:
+        return np.full((sum(map(len, found.blocks)), 3), np.nan)
+    return np.column_stack([1e3 * each.sigma, 1e3 * each.radius, each.beyond])
 
 
 def iso9283_sentence(found: RepeatedPoses, min_poses: int = 5, min_cycles: int = 30, usual_poses: int = 100) -> str:

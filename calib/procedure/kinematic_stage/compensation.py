@@ -28,11 +28,10 @@ from calib import files
 from calib.data.poses.pose_lists import Targets
 from calib.errors import Finding, UsageError, finding
 from calib.geometry import installation, inverse
+from calib.geometry.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
-from calib.geometry.observation import pose_sigmas
-from calib.geometry.parameters import layout
-from calib.geometry.uncertainty.error_model import Discrepancy, ErrorModel, outside
+from calib.geometry.observation import layout, pose_sigmas
 from calib.procedure.findings import lines_of, sentence
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
@@ -101,7 +100,7 @@ class Commands:
             orientation that does not count.
         sigma: (m, 2) of position [m] and orientation [rad] at ``q``, from the parameters' covariance.
         expected: (m, 2) standard deviation of the real tool's position error at ``q`` [m], all that the model leaves
-            included, and the radius within which 95 % of such errors are to be; None where the fit does not say.
+            included, and the radius within which 95 % of such errors are to be; NaN where the fit does not say.
         beyond: (m, n) joints outside the range that was measured for the fit; none where that is not known.
         dof: 6, 5 or 3.
         notes: which frames were meant, and what is odd.
@@ -118,7 +117,7 @@ class Commands:
     left: np.ndarray
     before: np.ndarray
     sigma: np.ndarray
-    expected: np.ndarray | None
+    expected: np.ndarray
     beyond: np.ndarray
     dof: int
     notes: tuple[str, ...]
@@ -352,7 +351,7 @@ def _extrapolated(chain: Chain, beyond: np.ndarray) -> Finding | None:
 
 def _predicted_sigmas(
     fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal
-) -> tuple[np.ndarray, np.ndarray | None]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the tool's sigmas (m, 2) from the parameters, and its expected errors (m, 2), see `Commands`.
 
     Where the fit did not place the tool, it counts as known.
@@ -360,14 +359,14 @@ def _predicted_sigmas(
     cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
     number = cell.tool_names.index(tool) if tool in cell.tool_names else 0
     if tool not in cell.tool_names:
-        keep = ~np.isin(free, layout(cell).tool_index)
+        keep = ~np.isin(free, layout(cell).index("tool"))
         free, covariance = free[keep], covariance[np.ix_(keep, keep)]
         cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
     torque = None if goal.torques is None else goal.torques(q)
     station = -1 if frame == "base" else _station(fitted, frame)
     own = pose_sigmas(cell, q, free, covariance, torque, station, number)
     if fitted.learnt is None or fitted.discrepancy is None:
-        return own, None
+        return own, np.full((len(q), 2), np.nan)
     errors = ErrorModel(cell, free, covariance, fitted.learnt, fitted.discrepancy)
     sigma = errors.position_sigma(q, torque, station, number)
     return own, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
@@ -387,7 +386,7 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
     """Return a finding if targets have orientations, but no orientation was measured."""
     table = layout(fitted.cell)
-    measured = {table.names[k] for k in np.intersect1d(fitted.free, table.tool_index)}
+    measured = {table.names[k] for k in np.intersect1d(fitted.free, table.index("tool"))}
     if dof == 3 or any(name.rsplit(".", 1)[-1] in ("rx", "ry", "rz") for name in measured):
         return []
     return [finding("no-orientations-measured")]
@@ -420,17 +419,16 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         raise UsageError("\n  ".join([head, *_unreached(commands)]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names
-    factors = np.array(targets.factors or [1.0] * len(names))
-    unseen = None if fitted.unseen is None else 1e3 * fitted.unseen
-    rows = []
-    for k, good in enumerate(commands.reached):
-        q = (commands.q[k] / factors).tolist() if good else [None] * len(names)
-        numbers = np.concatenate([commands.left[k], commands.before[k], commands.sigma[k]])
-        cells = [None if np.isnan(value) else 1e3 * float(value) for value in numbers]
-        there = (None, None) if commands.expected is None else (1e3 * commands.expected[k]).tolist()
-        known = None if fitted.learnt is None else int(commands.beyond[k].any())
-        status = "reached" if good else "not reached"
-        rows.append((k + 1, *q, status, *cells, unseen, *there, known, commands.reason[k]))
+    q = np.where(commands.reached[:, None], commands.q / (targets.factors or 1.0), np.nan)
+    unseen = np.full(count, np.nan if fitted.unseen is None else fitted.unseen)
+    known = np.full(count, np.nan) if fitted.learnt is None else commands.beyond.any(axis=1)
+    sizes = 1e3 * np.column_stack([commands.left, commands.before, commands.sigma, unseen, commands.expected])
+    rows = [
+        (k, *joints, "reached" if good else "not reached", *cells, beyond, reason)
+        for k, (joints, good, cells, beyond, reason) in enumerate(
+            zip(q, commands.reached, sizes, known.astype(float), commands.reason), 1
+        )
+    ]
     return files.write_table(out, ["row", *names, "status", *COLUMNS, "reason"], rows)
 
 
@@ -460,7 +458,7 @@ def lines(commands: Commands) -> list[str]:
 def _expectation(commands: Commands) -> Finding:
     """Return the finding on the expected error of the real arm at these targets, by the error model if available."""
     good, unseen = commands.reached, commands.fitted.unseen
-    if commands.expected is not None:
+    if not np.isnan(commands.expected).all():
         rms, within = np.sqrt(np.mean(commands.expected[good, 0] ** 2)), commands.expected[good, 1].max()
         return finding("expected-at-targets", rms=rms, within=within, unseen=unseen)
     if unseen is None:

@@ -5,27 +5,24 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
-import numpy as np
-
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
 from calib.extensions import offered
 from calib.geometry.accuracy import errors
-from calib.geometry.checks.diagnosis import diagnose
+from calib.geometry.diagnosis import diagnose
+from calib.geometry.error_model import ErrorModel, learn_errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
-from calib.geometry.identifiability import unidentified
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import ModelSelection, select_model
-from calib.geometry.parameters import fixed_parameters, stated_prior
-from calib.geometry.result import GeometricFit, calibrated_chain
-from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
-from calib.geometry.weighing import Settings
+from calib.geometry.observability import unidentified
+from calib.geometry.observation import fixed_parameters, stated_prior
+from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
-from calib.procedure.kinematic_stage.comparison import Comparison, gravity_of
+from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, Outlier
 from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
@@ -122,12 +119,10 @@ def run(
         selection.check_robot(inputs.chain.joint_names)
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
-    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     climb = partial(
         select_model,
         start,
         inputs.fit,
-        torques=torques,
         fixed=fixed_parameters(start, options),
         prior=stated_prior(start, options),
         folds=folds_by_name(wanted.folds, inputs.fit, seed),
@@ -137,7 +132,7 @@ def run(
     found, long = climb(asked, settings=settings), inputs.chain.stretched_length()
     status = found.fit.solution.status
     if not status.good:
-        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, None, long)
+        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, None, long)
         why = [sentence(one) for one in settle(odd, options.accept) if level_of(one) == "fail"]
         words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
         raise NotConverged("; ".join([words, *why]), found.fit)
@@ -157,9 +152,9 @@ def run(
     ]
     if selection is not None and (ratio := compared_with_fit(selection, found.fit)) is not None:
         notes.append(ratio)
-    findings = _found_of(inputs, found, named, notes, torques, options.accept)
+    findings = _found_of(inputs, found, named, notes, options.accept)
     say("estimating the expected errors")
-    expected = learn_errors(found, inputs.fit, torques, seed)
+    expected = learn_errors(found, inputs.fit, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
     result = assess(arms, inputs, findings, settings, replace(wanted, model=asked))
@@ -177,13 +172,12 @@ def assessed(outcome: T, inputs: Inputs) -> T:
 
 
 def _found_of(
-    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding],
-    torques: Sequence[np.ndarray | None], accepted: Sequence[str],
-) -> Findings:  # fmt: skip
+    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding], accepted: Sequence[str]
+) -> Findings:
     """Return the findings of a fit that do not depend on unseen rows; `notes` are findings on its residuals."""
     long = inputs.chain.stretched_length()
     left = found.cross_validated
-    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
+    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, long)
     blind = [finding("transfer-by-regions", stations=found.folds.blind)] if found.folds.blind else []
     return Findings(
         model=found.chosen,
@@ -204,10 +198,9 @@ def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], se
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []
     apart = [replace(block, station=f"{number}") for number, block in enumerate(own)]
-    torques = [gravity_of(nominal.chain, block) for block in own]
-    before = errors(nominal, own, torques).rms
-    placed = polish_frames(install(nominal.chain, apart, nominal.known), apart, settings, torques).cell
-    after = errors(placed, apart, torques).rms
+    before = errors(nominal, own).rms
+    placed = polish_frames(install(nominal.chain, apart, nominal.known), apart, settings).cell
+    after = errors(placed, apart).rms
     if before < MOVED * after:
         return []
     return [finding("instrument-moved", before=before, after=after, files=len(own))]

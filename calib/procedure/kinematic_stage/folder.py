@@ -19,14 +19,14 @@ from calib.folders import (
     ESTIMATE,
     METRICS,
     REPORT,
+    InFolder,
     check_target,
     write_covariance,
     write_estimate,
     write_staged,
 )
 from calib.geometry import installation
-from calib.geometry.installation import Installation
-from calib.geometry.uncertainty.error_model import ErrorModel
+from calib.geometry.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
 from calib.procedure.kinematic_stage.fit import Outcome
@@ -84,25 +84,10 @@ class FitFolder:
 
     path: Path
 
-    @property
-    def robot(self) -> Path:
-        """The calibrated robot."""
-        return self.path / calibrated.ROBOT
-
-    @property
-    def urdf(self) -> Path:
-        """Path of the URDF: the best geometry without joint corrections."""
-        return self.path / URDF
-
-    @property
-    def report(self) -> Path:
-        """What a certificate is printed from."""
-        return self.path / REPORT
-
-    @property
-    def residuals(self) -> Path:
-        """Path of the residuals, one row for each measured row."""
-        return self.path / RESIDUALS
+    robot = InFolder(calibrated.ROBOT)  # the calibrated robot
+    urdf = InFolder(URDF)  # the best geometry without joint corrections
+    report = InFolder(REPORT)  # data of the certificate
+    residuals = InFolder(RESIDUALS)  # one row for each measured row
 
     @property
     def tables(self) -> tuple[Path, Path]:
@@ -123,17 +108,12 @@ class FitFolder:
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the frames of the nominal arm are fitted again to the fitted rows."""
-        chosen = settings.combine(loss=self.findings().loss or settings.loss)
-        cell = installation.read(self.path)
-        rigid = calibrated.read(self.path).chain
-        return Arms(nominal_arm(inputs, chosen), cell, rigid, self._expected(cell, inputs))
-
-    def _expected(self, cell: Installation, inputs: Inputs) -> ErrorModel | None:
-        known = self.findings().discrepancy
-        if known is None:
-            return None
-        free, covariance = read_covariance(self.path, cell)
-        return ErrorModel(cell, free, covariance, np.concatenate([block.q for block in inputs.fit]), known)
+        found, cell, expected = self.findings(), installation.read(self.path), None
+        chosen = settings.combine(loss=found.loss or settings.loss)
+        if found.discrepancy is not None:
+            learnt = np.concatenate([block.q for block in inputs.fit])
+            expected = ErrorModel(cell, *read_covariance(self.path, cell), learnt, found.discrepancy)
+        return Arms(nominal_arm(inputs, chosen), cell, calibrated.read(self.path).chain, expected)
 
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
         """Read the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
@@ -151,25 +131,10 @@ class ValidationFolder:
 
     path: Path
 
-    @property
-    def judged(self) -> Path:
-        """Numbers and verdict."""
-        return self.path / METRICS
-
-    @property
-    def errors(self) -> Path:
-        """Path of the errors, one row for each unseen row."""
-        return self.path / "errors.csv"
-
-    @property
-    def rows(self) -> Path:
-        """Path of the errors of all rows, for figures."""
-        return self.path / "rows.json"
-
-    @property
-    def report(self) -> Path:
-        """What a certificate is printed from."""
-        return self.path / REPORT
+    judged = InFolder(METRICS)  # numbers and verdict
+    errors = InFolder("errors.csv")  # one row for each unseen row
+    rows = InFolder("rows.json")  # errors of all rows, for figures
+    report = InFolder(REPORT)  # data of the certificate
 
     def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return the metrics."""

@@ -13,8 +13,8 @@ from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import needed
-from calib.geometry.checks.repeatability import repeated, repeated_rows
 from calib.geometry.first_guess import check_orientations, check_scale
+from calib.geometry.repeatability import repeated, repeated_rows
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection
@@ -103,7 +103,7 @@ def gather(
     else:
         earlier = calibrated.read(source) if source.suffix == ".toml" else None
     blocks = _named(
-        [(path, block) for path, each in zip(files, measured) for block in read_file(each, chain, options)],
+        [(path, block) for path, each in zip(files, measured) for block in _loaded(each, chain, options)],
         options, settings.stations, settings.tools,
     )  # fmt: skip
     unseen: dict[str, Unseen] = {}
@@ -136,14 +136,16 @@ def with_unseen(
     unseen, notes, fit = dict(given.unseen), list[str](), given.fit
     files = {Path(block.file).resolve() for block in fit}
     for each in validate:
-        for block in read_file(each, given.chain, options, fit):
+        for block in _loaded(each, given.chain, options, fit):
             again = _path(each).resolve() in files
             if again:
                 notes.append(f"{block.file} is also a fit file: its errors are not those of unseen poses")
             shared = block if settings.refit_frames else _shared(block, fit, notes)
             unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=settings.refit_frames, seen=again)
-    copied, remarks = repeated(fit, unseen)
-    unseen = {name: replace(each, seen=each.seen or name in copied) for name, each in unseen.items()}
+    copied, remarks = repeated(fit, {name: each.block for name, each in unseen.items()})
+    unseen = {
+        name: replace(each, seen=each.seen or (name in copied and not each.held_out)) for name, each in unseen.items()
+    }
     return replace(given, unseen=unseen, notes=(*given.notes, *notes, *remarks))
 
 
@@ -227,6 +229,22 @@ def read_file(
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
     return blocks
+
+
+def _loaded(
+    each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
+) -> list[PoseMeasurements]:
+    """Return the blocks of `read_file` with the arm's gravity torques."""
+    return [replace(block, torque=gravity_of(chain, block.q)) for block in read_file(each, chain, options, like)]
+
+
+def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
+    """Return gravity torques (m, n) [N m] at joint values (m, n); None if the robot's masses are unknown."""
+    if chain.inertias is None or len(chain.driven) != chain.n:
+        return None
+    from calib.dynamics.rigid_body import gravity_torques
+
+    return gravity_torques(chain, q)
 
 
 def _path(each: Path | PoseMeasurements) -> Path:

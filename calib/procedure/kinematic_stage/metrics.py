@@ -6,9 +6,9 @@ from pathlib import Path
 
 from calib.errors import Finding
 from calib.geometry.accuracy import ArmErrors, ErrorStatistics
-from calib.geometry.checks.repeatability import RepeatedPoses
+from calib.geometry.error_model import Discrepancy
 from calib.geometry.model_choice.ladder import ModelStep
-from calib.geometry.uncertainty.error_model import Discrepancy
+from calib.geometry.repeatability import RepeatedPoses
 from calib.procedure.findings import Verdict
 
 SCHEMA = 3  # of metrics.json; 1 had no findings, 2 kept sentences in place of codes

@@ -12,10 +12,10 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.extensions import needed
 from calib.geometry.accuracy import NATURE, errors
-from calib.geometry.checks.wrong_columns import Scale, length_factor, scale_of, wrong_columns
+from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_columns
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.result import GeometricFit
+from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
 from calib.procedure.kinematic_stage.metrics import Outlier
 from calib.units import ERRORS
@@ -89,31 +89,26 @@ MAX_IMAGES = 100  # that the scale is judged by
 
 
 def findings(
-    nominal: Installation,
-    fit: GeometricFit,
-    blocks: Sequence[PoseMeasurements],
-    torques: Sequence[np.ndarray | None],
-    left: float | None,
-    reach: float,
+    nominal: Installation, fit: GeometricFit, blocks: Sequence[PoseMeasurements], left: float | None, reach: float
 ) -> list[Finding]:
     """Return the findings on implausible rows of a fit, the one that explains most first.
 
     Args:
         nominal: the arm as it was, placed.
         fit: of the calibrated one.
-        blocks: the rows; torques: gravity torques (m, n) per block [N m].
+        blocks: the rows.
         left: cross-validated error of the chosen model [m]; None where it was not computed.
         reach: of the arm [m].
     """
-    before, after = (errors(cell, blocks, torques).rms for cell in (nominal, fit.cell))
+    before, after = (errors(cell, blocks).rms for cell in (nominal, fit.cell))
     remains = after if left is None else left
-    shown, pulled = _as_positions(blocks, torques)
-    result = _wrong_way(nominal, shown, pulled, before, reach) or _moved(fit, reach)
+    shown = list(map(_as_positions, blocks))
+    result = _wrong_way(nominal, shown, before, reach) or _moved(fit, reach)
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
         arm, rms = ("nominal", before) if before < TOO_GOOD else ("calibrated", after)
         result.append(finding("commanded", arm=arm, rms=rms))
-    scale = scale_of(nominal, shown, pulled)
+    scale = scale_of(nominal, shown)
     if scale is not None and before * np.sqrt(1.0 - scale.explained) < limit("unexplained", "share") * reach:
         result += _scale(("scale-of-another-robot", "scale"), scale) or _scale(
             ("lengths-of-another-robot", "lengths-grew"), length_factor(fit)
@@ -121,31 +116,19 @@ def findings(
     return [one for one in result if level_of(one)]
 
 
-def _as_positions(
-    blocks: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None]
-) -> tuple[list[PoseMeasurements], list[np.ndarray | None]]:
-    """Return blocks and torques with images replaced by the poses they show, scaled by the board's square."""
-    shown = []
-    for block, torque in zip(blocks, torques):
-        if block.kind == IMAGES:
-            rows = np.unique(np.linspace(0, len(block) - 1, MAX_IMAGES).astype(int))
-            block = needed("camera_guess").pnp_poses(take(block, rows))
-            torque = None if torque is None else torque[rows]
-        shown.append((block, torque))
-    return [block for block, _ in shown], [torque for _, torque in shown]
+def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
+    """Return a block; of images, the poses they show, scaled by the board's square."""
+    if block.kind != IMAGES:
+        return block
+    rows = np.unique(np.linspace(0, len(block) - 1, MAX_IMAGES).astype(int))
+    return needed("camera_guess").pnp_poses(take(block, rows))
 
 
-def _wrong_way(
-    nominal: Installation,
-    blocks: Sequence[PoseMeasurements],
-    torques: Sequence[np.ndarray | None],
-    before: float,
-    reach: float,
-) -> list[Finding]:
+def _wrong_way(nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float) -> list[Finding]:
     """Return the finding on the change of columns with which the nominal arm explains the rows."""
     if not before > FLOOR * reach:
         return []
-    changed = wrong_columns(nominal, blocks, torques, mirrored=before > limit("unexplained", "share") * reach)
+    changed = wrong_columns(nominal, blocks, mirrored=before > limit("unexplained", "share") * reach)
     if changed is None:
         return []
     was, rms = (float(np.sqrt(one[0])) for one in (changed.before, changed.after))

@@ -4,22 +4,23 @@ The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In t
 rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib import files, folders
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.geometry.accuracy import NATURE
 from calib.geometry.installation import Installation
-from calib.geometry.observation import observe, prepare
-from calib.geometry.parameters import layout, parameter_values
-from calib.geometry.result import GeometricFit
+from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.residuals import inverse_right_jacobian
+from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.comparison import INTERVAL, Comparison, interval_cells
 from calib.procedure.kinematic_stage.fit import Outcome
+from calib.robot.calibrated import Deflection
+from calib.transforms import rotation_vector
 from calib.units import ERRORS
 
 HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd")
@@ -52,19 +53,10 @@ def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
         found: the fit.
         nominal: the nominal arm with its frames fitted; whose values stand in the column ``nominal``.
     """
-    table = layout(found.cell)
-    full = np.zeros((len(table.names), len(found.free)))
-    full[found.free, np.arange(len(found.free))] = 1.0
-    values, before = parameter_values(found.cell), np.zeros(len(table.names))
-    before[: table.arm] = nominal.chain.values
-    optics = table.arm + table.stations + table.tools
-    before[optics : optics + table.optics] = nominal.optics.values
-    start = table.arm
-    for after, first in zip((*found.cell.stations, *found.cell.tools), (*nominal.stations, *nominal.tools)):
-        block = slice(start, start + 6)
-        full[block] = _to_parent(after) @ full[block]
-        values[block], before[block] = _elements(after), _elements(first)
-        start += 6
+    table, full = layout(found.cell), _to_table(found.cell)[:, found.free]
+    values, before = _values(found.cell), np.zeros(len(table.names))
+    first = _values(replace(nominal, deflection=Deflection()))
+    before[: len(first)] = first
     shown = np.flatnonzero(np.abs(full).max(axis=1, initial=0.0) > 1e-9)
     full = full[shown]
     covariance = full @ found.estimate.covariance @ full.T
@@ -73,7 +65,7 @@ def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
 
 
 def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.ndarray]:
-    """Read the covariance of the fit that `cell` came from, for steps (`calib.geometry.parameters.step`).
+    """Read the covariance of the fit that `cell` came from, for steps (`calib.geometry.observation.step`).
 
     Returns:
         Positions (f,) in the parameter vector, and the covariance (f, f).
@@ -83,37 +75,32 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
         UsageError: where it belongs to another fit.
     """
     names, table = folders.read_covariance(folder)
-    parameters = layout(cell)
-    place = {name: k for k, name in enumerate(parameters.names)}
+    place = {name: k for k, name in enumerate(layout(cell).names)}
     strange = [name for name in names if name not in place]
     if strange:
         raise UsageError(
             f"{folder}/covariance.csv does not belong to the robot.toml next to it: '{strange[0]}' is no parameter "
             "there; fit again"
         )
-    back, start = np.eye(len(parameters.names)), parameters.arm
-    for placement in (*cell.stations, *cell.tools):
-        block = slice(start, start + 6)
-        back[block, block] = np.linalg.inv(_to_parent(placement))
-        start += 6
-    back = back[:, [place[name] for name in names]]
+    back = np.linalg.inv(_to_table(cell))[:, [place[name] for name in names]]
     free = np.flatnonzero(np.abs(back).max(axis=1, initial=0.0) > 0.0)
     return free, back[free] @ table @ back[free].T
 
 
-def _elements(placement: np.ndarray) -> np.ndarray:
-    return np.concatenate([placement[:3, 3], Rotation.from_matrix(placement[:3, :3]).as_rotvec()])
+def _values(cell: Installation) -> np.ndarray:
+    """Return the full parameter vector of an installation, frames as position and rotation vector."""
+    frames = [np.concatenate([t[:3, 3], rotation_vector(t[:3, :3])]) for t in (*cell.stations, *cell.tools)]
+    terms = np.asarray(cell.deflection.coefficients)
+    return np.concatenate([cell.chain.values, *frames, cell.optics.values, terms])
 
 
-def _to_parent(placement: np.ndarray) -> np.ndarray:
-    """Return ∂(position, rotation vector)/∂(d, w) (6, 6)."""
-    result = np.zeros((6, 6))
-    result[:3, :3] = placement[:3, :3]
-    vector = Rotation.from_matrix(placement[:3, :3]).as_rotvec()
-    angle = float(np.linalg.norm(vector))
-    cross = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
-    factor = 1 / 12 if angle < 1e-4 else 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    result[3:, 3:] = np.eye(3) + cross / 2 + factor * cross @ cross
+def _to_table(cell: Installation) -> np.ndarray:
+    """Return the derivative (p, p) of the tabulated values by steps along the parameters."""
+    result, start = np.eye(len(layout(cell).names)), len(cell.chain.elements)
+    for k, frame in enumerate((*cell.stations, *cell.tools)):
+        at, turn = start + 6 * k, rotation_vector(frame[:3, :3])[:, None]
+        result[at : at + 3, at : at + 3] = frame[:3, :3]
+        result[at + 3 : at + 6, at + 3 : at + 6] = inverse_right_jacobian(turn, np.eye(3)[:, :, None])[:, :, 0].T
     return result
 
 
@@ -163,11 +150,8 @@ def _key(measured: PoseMeasurements, i: int) -> tuple[str, int, str]:
 
 def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict) -> list[list[object]]:
     nominal, cell = comparison.cells
-    result, stated = [], iter(interval_cells(comparison, sum(map(len, comparison.blocks))))
-    pairs = zip(
-        prepare(nominal, comparison.blocks, comparison.torques), prepare(cell, comparison.blocks, comparison.torques)
-    )
-    for before, block in pairs:
+    result, stated = [], iter(interval_cells(comparison))
+    for before, block in zip(*(prepare(each, comparison.blocks) for each in comparison.cells)):
         measured, m = block.measured, len(block.measured)
         columns = {nature: np.full((len(names), m), np.nan) for nature, names in COMPONENTS.items()}
         for part in observe(cell, block, _NONE):
@@ -178,24 +162,13 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
             own = part.per_row()
             if NATURE[part.label] == "position" or np.isnan(first[own.index]).all():
                 first[own.index] = 1e3 * own.sizes()
-        sizes = _row_sizes(columns)
-        for i in range(m):
-            key = _key(measured, i)
-            station = measured.station if measured.has_instrument else ""
-            row: list[object] = [label, key[0], key[1], station, key[2], *map(float, measured.q[i])]
-            row += [_number(value) for values in columns.values() for value in values[:, i]]
-            row += [_number(sizes[i]), _number(first[i]), weights.get(key), int(key[:2] in named and label == "fit")]
-            row += next(stated)
-            result.append(row)
+        position, distance = columns["position"], columns["distance"]
+        length = np.sqrt(np.nansum(position**2, axis=0))
+        size = np.where(np.isnan(position).all(axis=0), np.abs(distance[0]), length)
+        numbers = np.column_stack([measured.q, *(values.T for values in columns.values()), size, first])
+        station = measured.station if measured.has_instrument else ""
+        for i, row in enumerate(numbers):
+            file, number, tool = key = _key(measured, i)
+            outlier = int((file, number) in named and label == "fit")
+            result.append([label, file, number, station, tool, *row, weights.get(key), outlier, *next(stated)])
     return result
-
-
-def _row_sizes(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the length [mm] of each row's position residual, or its distance residual."""
-    position, distance = columns["position"], columns["distance"]
-    size = np.sqrt(np.nansum(position**2, axis=0))
-    return np.where(np.isnan(position).all(axis=0), np.abs(distance[0]), size)
-
-
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)

@@ -15,11 +15,11 @@ import numpy as np
 from calib import files
 from calib.data.poses.measurements import Positions
 from calib.errors import Finding, finding
+from calib.geometry.error_model import ErrorModel
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
-from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict, catalogue, level_of, lines_of, sentence
 from calib.procedure.kinematic_stage.comparison import (
@@ -28,7 +28,6 @@ from calib.procedure.kinematic_stage.comparison import (
     Comparison,
     compare,
     compare_unseen,
-    gravity_of,
     interval_cells,
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
@@ -318,8 +317,7 @@ def _copies(inputs: Inputs) -> list[str]:
 
 def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
     """Return the nominal arm (with earlier corrections), with base and tool placement fitted to it."""
-    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
-    return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings, torques).cell
+    return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings).cell
 
 
 def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
@@ -367,26 +365,19 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
         sizes = [found.main for found in each.errors]
         if len(sizes[0]) == len(q):
             places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
-            stated = interval_cells(each, len(q))
-            rows += [
-                [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b), *map(_cell, place), *interval]
-                for number, joints, a, b, place, interval in zip(numbers, q, *sizes, places, stated)
-            ]
+            cells = np.column_stack([q, *(1e3 * size for size in sizes), places, interval_cells(each)])
+            rows += [[name, number, *values] for number, values in zip(numbers, cells)]
     joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
     files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
 
 
 def _places(found: Comparison, number: int) -> np.ndarray:
     """Return measured position [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions."""
-    block, torque = found.blocks[number], [found.torques[number]]
+    block = found.blocks[number]
     if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)
-    ready = [prepare(cell, [block], torque)[0] for cell in found.cells]
+    ready = [prepare(cell, [block])[0] for cell in found.cells]
     base = invert(found.cells[1].stations[ready[1].station])
     ways = [1e3 * (predict(cell, one).point.T - block.position) for cell, one in zip(found.cells, ready)]
     turn = base[:3, :3].T
     return np.hstack([block.position @ turn + base[:3, 3], *(way @ turn for way in ways)])
-
-
-def _cell(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)

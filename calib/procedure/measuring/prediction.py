@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from calib import files
 from calib.errors import Finding, UsageError, finding, require
 from calib.geometry.observability import Observation
-from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit
+from calib.geometry.observation import layout
+from calib.geometry.weighing import GeometricFit
 from calib.records import Array, read_json
 from poses.design import Pool
 from poses.errors import NotIdentifiable, TooFewCandidates

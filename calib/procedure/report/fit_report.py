@@ -14,8 +14,7 @@ from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.extensions import offered
-from calib.geometry.observation import predict, prepare
-from calib.geometry.parameters import layout
+from calib.geometry.observation import layout, predict, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
@@ -127,7 +126,7 @@ def collect(outcome: Outcome) -> Report:
     """Return the report of a fit's outcome, for its certificate."""
     chain, fit = outcome.inputs.chain, outcome.selection.fit
     table, names = estimate_table(fit, outcome.selection.nominal.cell), layout(fit.cell)
-    groups = {name: names.group(k) for k, name in enumerate(names.names)}
+    groups = dict(zip(names.names, names.kinds))
     fitted = set(table.names)
     sets = [rows_of("fit", outcome.fit, False)]
     sets += [rows_of(name, found, found.proves) for name, found in outcome.validation.items()]
@@ -169,7 +168,7 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
 def _points(comparison: Comparison) -> np.ndarray:
     """Return the target positions (rows, 3) [m] in the arm's base frame."""
     cell, points = comparison.cells[1], []
-    for block in prepare(cell, comparison.blocks, comparison.torques):
+    for block in prepare(cell, comparison.blocks):
         point = predict(cell, block).point.T
         base = cell.stations[block.station] if block.measured.has_instrument else cell.stations[0]
         back = invert(base)

@@ -22,8 +22,8 @@ from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE, check_against, fil
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import needed
 from calib.folders import write_staged
-from calib.geometry.checks.repeatability import drift_between, drift_within, noise_of_difference
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
+from calib.geometry.repeatability import drift_of, noise_of_difference
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import UNJUDGED, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
@@ -257,8 +257,8 @@ def drift(
         again: files whose name starts with drift.
         sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
     """
-    pairs = [(later.file, "again at the end", drift_between(chain, blocks, later)) for later in again]
-    pairs += [(block.file, "more than once", drift_within(chain, block)) for block in blocks]
+    pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
+    pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
     return [
         finding(
             "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat", file=Path(file).name, when=when,

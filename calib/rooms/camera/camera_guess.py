@@ -165,7 +165,7 @@ def pnp_poses(block: Pixels) -> Poses:
     seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
     return Poses(
         block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), station=block.station,
-        tool_names=block.tool_names, file=block.file, rows=block.rows,
+        tool_names=block.tool_names, file=block.file, rows=block.rows, torque=block.torque,
     )  # fmt: skip
 
 

@@ -14,12 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses import IN_HAND
 from calib.errors import UsageError, require
-from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal, reach, seen_at
-from calib.geometry.observability import Observation
-from calib.geometry.observation import Block, observe, prepare, target_jacobian
-from calib.geometry.parameters import layout
+from calib.geometry.observability import Observation, base_columns
+from calib.geometry.observation import Block, layout, observe, prepare, target_jacobian
 from calib.procedure.measuring.constraints_file import CameraTable
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
@@ -103,8 +101,7 @@ class CameraView:
 
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
         """Return the observation Jacobian of images in columns identifiable with the board in view."""
-        table = layout(self.cell)
-        columns = np.concatenate([table.arm_index, table.frame_index])
+        columns = layout(self.cell).rigid_index
         q = self.draw(100, lambda each: np.all(self(each) <= 1e-8, axis=1), lower, upper, seed)
         if len(q) < 20:
             raise UsageError(

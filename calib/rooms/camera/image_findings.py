@@ -8,10 +8,9 @@ import numpy as np
 from calib.data.poses import IN_HAND
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding
-from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
-from calib.geometry.result import GeometricFit
+from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.metrics import ImageCoverage
 from calib.rooms.camera.pixel_residuals import PixelPart
 from calib.rooms.camera.pixels import Pixels
@@ -36,11 +35,11 @@ def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
     return tuple(result)
 
 
-def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float | None:
+def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float | None:
     """Return the rms distance between detected and predicted corners [px]; None without images."""
     squares = [
         np.sum(part.value**2, axis=0)
-        for block in prepare(cell, blocks, torques)
+        for block in prepare(cell, blocks)
         for part in observe(cell, block, np.array([], dtype=int))
         if isinstance(part, PixelPart)
     ]

@@ -123,11 +123,10 @@ def write_corners(path: Path, found: Found) -> Path:
     """Write detections as ``corners.csv``."""
     rows: list[list[object]] = [["", "", *found.size, None, None, "size of the images"]]
     for name, one in found.images.items():
-        edge = None if np.isnan(one.edge) else one.edge
         if one.problem:
-            rows.append([name, None, None, None, None, edge, one.problem])
+            rows.append([name, None, None, None, None, one.edge, one.problem])
         rows += [
-            [name, int(k), float(one.pixel[k, 0]), float(one.pixel[k, 1]), float(one.sigma[k]), edge, ""]
+            [name, int(k), float(one.pixel[k, 0]), float(one.pixel[k, 1]), float(one.sigma[k]), one.edge, ""]
             for k in np.flatnonzero(one.seen)
         ]
     return files.write_table(path, HEADER, rows)

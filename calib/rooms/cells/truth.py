@@ -50,7 +50,7 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
 def _rms(arm: Installation, block: Poses) -> float:
     reference = arm.deflection.reference or arm.chain
     torque = None if reference.inertias is None else gravity_torques(reference, block.q)
-    return 1e3 * errors(arm, [block], [torque]).rms
+    return 1e3 * errors(arm, [replace(block, torque=torque)]).rms
 
 
 @dataclass(frozen=True, eq=False)

@@ -270,18 +270,13 @@ def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
     """Write the comparison as CSV."""
     lines = [
         (
-            one.rank or "", one.name, *_cells(one.unseen, one.sigma, one.raw, one.training), one.worst[0] or "",
-            *_cells(one.worst[1], one.behind, one.behind_sigma), "yes" if one.good else "no",
-            "yes" if one.chosen else "no", one.parameters, *_cells(one.seconds), one.iterations, one.simulations,
-            one.failure,
+            one.rank or "", one.name, one.unseen, one.sigma, one.raw, one.training, one.worst[0] or "", one.worst[1],
+            one.behind, one.behind_sigma, "yes" if one.good else "no", "yes" if one.chosen else "no", one.parameters,
+            one.seconds, one.iterations, one.simulations, one.failure,
         )
         for one in found
     ]  # fmt: skip
     return files.write_table(path, HEADER, lines)
-
-
-def _cells(*values: float) -> list[object]:
-    return ["" if np.isnan(value) else value for value in values]
 
 
 COLUMNS = (

@@ -35,7 +35,6 @@ from calib.rooms.studies.summary import (
     SLACK,
     ConditionSummary,
     MethodSummary,
-    Quartiles,
 )
 from calib.rooms.studies.trial import TrialRow
 from calib.workers import workers
@@ -217,15 +216,12 @@ def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], li
     lines: list[list[object]] = []
     for one in conditions:
         for method in one.methods:
-            spreads = [value for name in FIGURES for value in _parts(method.figures[name])]
+            figures = [method.figures[name] for name in FIGURES]
+            spreads = [value for one in figures for value in (one.median, one.lower, one.upper)]
             flags = ["yes" if flag else "no" for flag in (method.as_good, method.chosen)]
             head = [one.condition.name, method.method, method.trials, sum(method.failures.values()), method.rank]
-            lines.append([*head, *flags, "" if math.isnan(method.p) else method.p, *spreads])
+            lines.append([*head, *flags, method.p, *spreads])
     return header, lines
-
-
-def _parts(found: Quartiles) -> list[object]:
-    return ["" if math.isnan(value) else value for value in (found.median, found.lower, found.upper)]
 
 
 def make_page(

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from calib import cli
 from calib.data.poses.measurements import Poses, Positions
-from calib.geometry.checks import repeatability
-from calib.geometry.checks.repeatability import RepeatedPoses
+from calib.geometry import repeatability
 from calib.geometry.installation import Installation, see
+from calib.geometry.repeatability import RepeatedPoses
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report.geometry_section import iso9283_tables

@@ -27,7 +27,7 @@ def rows(
     bare = None if alone is None else Errors(np.full(50, 1e-3 * alone), None, None)
     nothing = (np.zeros(0), np.zeros(0))
     return Comparison(
-        (), [], (None, None), (sizes[0], sizes[1]), nothing, 50, "", proves, bare, shares_frames  # type: ignore[arg-type]
+        (), (None, None), (sizes[0], sizes[1]), nothing, 50, "", proves, bare, shares_frames  # type: ignore[arg-type]
     )  # fmt: skip
 
 

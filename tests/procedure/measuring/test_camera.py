@@ -179,8 +179,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
-    from calib.geometry.observation import pose_sigmas
-    from calib.geometry.parameters import layout
+    from calib.geometry.observation import layout, pose_sigmas
     from calib.procedure.measuring.prediction import predicted as foretold
     from calib.robot.chain import random_joints
     from calib.rooms.camera.camera_guess import complete_camera
@@ -193,7 +192,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     block = complete_camera(cell.cell.nominal, camera.photograph(cell, q, 0.05, 5))
     start = install(cell.cell.nominal, [block])
     table = layout(start)
-    found = fit(start, [block], np.concatenate([table.arm_index, table.frame_index]))
+    found = fit(start, [block], table.rigid_index)
     stated = pose_sigmas(found.cell, everywhere, found.free, found.estimate.covariance, station=-1)[:, 0]
     assert 0.4 < np.median(stated / predicted.spread) < 2.5  # the noise of the arm is our choice there
     assert np.corrcoef(np.log(stated), np.log(predicted.spread))[0, 1] > 0.5

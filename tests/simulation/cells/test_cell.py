@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
-from calib.geometry.result import GeometricFit
-from calib.geometry.weighing import Settings
+from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.library import load

@@ -4,9 +4,9 @@
 
 with Σ the parameters' covariance, d the distance of q from the nearest pose of the fit and g that from
 the ranges of single joints that were, every joint counting by its lever [m]. s says where errors are larger than
-elsewhere (`calib.geometry.uncertainty.left_out`). κ and v are the most probable ones of errors on held-out rows: at
+elsewhere (`calib.geometry.left_out`). κ and v are the most probable ones of errors on held-out rows: at
 random (near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius
-that holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.uncertainty.left_out`): nothing
+that holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.left_out`): nothing
 is said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the
 median of the ones to that of the others, and is larger outside the range of a joint, by what that end of it showed when
 it was left out; sigmas are stated in units of the larger radius.
@@ -23,12 +23,11 @@ from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import SETTLED, Gram, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
+from calib.geometry.left_out import LeftOut, Profile, unevenness
 from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.observation import observe, pose_sigmas, prepare
-from calib.geometry.parameters import layout
-from calib.geometry.uncertainty.left_out import LeftOut, Profile, unevenness
+from calib.geometry.observation import layout, observe, pose_sigmas, prepare
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -76,7 +75,7 @@ class ErrorModel:
 
     Attributes:
         cell: the installation.
-        free, covariance: of its parameters (`calib.geometry.parameters`).
+        free, covariance: of its parameters (`calib.geometry.observation`).
         learnt: (m, n) poses of the fit [rad or m].
         discrepancy: see `Discrepancy`.
     """
@@ -101,25 +100,22 @@ class ErrorModel:
         own = pose_sigmas(self.cell, q, self.free, self.covariance, torque, station, tool)[:, 0] ** 2
         return self._sigma(own, q)
 
-    def sigma_on(
-        self, cell: Installation, block: Positions, torque: np.ndarray | None = None, placed_anew: bool = False
-    ) -> np.ndarray:
+    def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
         """Return `position_sigma` on measured rows (m,) [m].
 
         Args:
             cell: the installation that predicts them: that of the fit, or one placed anew.
             block: m rows.
-            torque: (m, n) gravity torques [N m].
             placed_anew: whether base and tool were placed on these very rows; then errors that a placement takes up
                 do not count.
         """
-        ready = prepare(cell, [block], [torque])[0]
+        ready = prepare(cell, [block])[0]
         if not placed_anew:
-            return self.position_sigma(block.q, torque, ready.station, ready.tool)
+            return self.position_sigma(block.q, block.torque, ready.station, ready.tool)
         own, now = layout(self.cell), layout(cell)
-        stays = (self.free < own.arm) | (self.free >= own.arm + own.stations + own.tools)
-        where = self.free[stays]
-        where = np.where(where < own.arm, where, where - len(own.names) + len(now.names))
+        kinds = np.array(own.kinds)[self.free]
+        stays = ~np.isin(kinds, ("station", "tool"))
+        where = self.free[stays] + np.where(kinds[stays] == "arm", 0, len(now.names) - len(own.names))
         columns = np.concatenate([now.frame_index, where])
         jacobian = next(part.jacobian for part in observe(cell, ready, columns) if part.label == "position")
         frames = len(now.frame_index)
@@ -194,12 +190,7 @@ def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.maximum(result, 0.05)
 
 
-def learn_errors(
-    selected: ModelSelection,
-    measured: Sequence[PoseMeasurements],
-    torques: Sequence[np.ndarray | None] | None = None,
-    seed: int = 0,
-) -> ErrorModel | None:
+def learn_errors(selected: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0) -> ErrorModel | None:
     """Return the error model estimated from errors on held-out rows; None for too few or no positions.
 
     For every fold the geometry and the ridges of all chosen effects are estimated anew: ridges from all rows would
@@ -208,7 +199,6 @@ def learn_errors(
     Args:
         selected: the model and its fit of all rows.
         measured: the blocks it was fitted to.
-        torques: gravity torques (m, n) per block [N m].
         seed: of the random folds.
     """
     found = selected.fit
@@ -217,7 +207,7 @@ def learn_errors(
         return None
     q = np.concatenate([block.q for block in measured])
     levers = _joint_levers(found.cell.chain, q)
-    rows = _Rows(selected, measured, torques)
+    rows = _Rows(selected, measured)
     near = [*rows.left_out(random_folds(measured, 5, seed), levers)]
     groups = [(-1, selected.folds), *_range_folds(measured)]
     far = [(joint, errors) for joint, each in groups for errors in rows.left_out(each, levers)]
@@ -251,12 +241,7 @@ def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]
 class _Rows:
     """Rows of a fit, linearised about its geometry without effects, for the evaluation of folds."""
 
-    def __init__(
-        self,
-        selected: ModelSelection,
-        measured: Sequence[PoseMeasurements],
-        torques: Sequence[np.ndarray | None] | None,
-    ):
+    def __init__(self, selected: ModelSelection, measured: Sequence[PoseMeasurements]):
         found, terms = selected.fit, selected.offered
         max_poses = 1500  # poses that folds are judged by (our choice)
         every = max(1, -(-sum(map(len, measured)) // max_poses))
@@ -270,17 +255,14 @@ class _Rows:
         self.poses = np.concatenate(poses)
         gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in found.outliers(MAX_RESIDUAL)}
         self.counts = [np.array([(b.file, int(row)) not in gross for row in b.rows], bool) for b in self.measured]
-        torques = [None] * len(measured) if torques is None else torques
-        given = [None if torque is None else torque[rows] for torque, rows in zip(torques, self.chosen)]
         cell = found.cell
         if terms:
-            cell = replace(
-                cell, deflection=Deflection(terms, np.zeros(len(terms)), selected.nominal.cell.chain)
-            )  # fmt: skip
+            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), selected.nominal.cell.chain))
         table = layout(cell)
-        own = np.flatnonzero(found.free < len(table.names) - table.terms)
-        self.free = np.concatenate([found.free[own], table.term_index])
-        self.station = np.flatnonzero(np.isin(self.free, table.station_index))
+        terms_index = table.index("deflection")
+        own = np.flatnonzero(~np.isin(found.free, terms_index))
+        self.free = np.concatenate([found.free[own], terms_index])
+        self.station = np.flatnonzero(np.isin(self.free, table.index("station")))
         wide = plausible_deviation(cell, self.free[: len(own)])
         if found.prior is not None:
             wide = np.minimum(wide, found.prior[own])
@@ -289,7 +271,7 @@ class _Rows:
         scales, weights = found.used_sigmas(), found.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
         self.metric: list[tuple[np.ndarray, np.ndarray]] = []
-        for number, ready in enumerate(prepare(cell, self.measured, given)):
+        for number, ready in enumerate(prepare(cell, self.measured)):
             parts = observe(cell, ready, self.free)
             root = np.sqrt(weights[number][self.chosen[number]])
             self.whitened.append(

@@ -19,7 +19,7 @@ Rows that stand twice in what was measured: copied, or a file given twice. They 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import counted
-from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare
 from calib.records import stored
@@ -58,45 +57,31 @@ def noise_of_difference(sigma: float) -> float:
     return float(np.sqrt(6.0) * sigma)
 
 
-def drift_between(chain: Chain, first: Sequence[PoseMeasurements], later: PoseMeasurements) -> Drift | None:
-    """Return the drift between measurements and later ones of the same poses; None without common poses.
+def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:
+    """Return the drift between measurements and earlier ones of the same poses; None without common poses.
 
     Displacements by differing joint values (nominal arm) are subtracted by magnitude: the instrument frame is unknown.
 
     Args:
         chain: the nominal arm.
-        first, later: measured poses or positions; other kinds are ignored.
+        later: measured poses or positions; other kinds are ignored.
+        first: the earlier ones; None for earlier rows of `later`.
     """
-    return _compared(chain, _points(first), _points([later]), own=False)
-
-
-def drift_within(chain: Chain, measured: PoseMeasurements) -> Drift | None:
-    """Return the drift within one series, as `drift_between`; None if no pose was measured more than once."""
-    points = _points([measured])
-    return _compared(chain, points, points, own=True)
-
-
-def _points(blocks: Sequence[PoseMeasurements]) -> list[tuple[Positions, int]]:
-    return [(block, k) for block in blocks if isinstance(block, Positions) for k in range(len(block))]
-
-
-def _compared(
-    chain: Chain, first: Sequence[tuple[Positions, int]], later: Sequence[tuple[Positions, int]], own: bool
-) -> Drift | None:
-    if not first or not later:
+    before = [later] if first is None else first
+    earlier = [(block, k) for block in before if isinstance(block, Positions) for k in range(len(block))]
+    if not earlier or not isinstance(later, Positions):
         return None
-    q, squares = np.array([block.q[k] for block, k in first]), []
+    q, squares = np.array([block.q[k] for block, k in earlier]), []
+    tool = np.array([block.tool[k] for block, k in earlier])
     max_apart = 1e-3  # joints of a pose that is visited again differ by less [rad or m]; our choice
-    for place, (block, k) in enumerate(later):
-        near = [int(i) for i in np.flatnonzero(np.abs(q - block.q[k]).max(axis=1) < max_apart)]
-        near = [i for i in near if not own or i < place]
-        near = [i for i in near if first[i][0].tool[first[i][1]] == block.tool[k]]
-        if not near:
-            continue
-        other, row = first[near[0]]
-        before, after = forward(chain, np.array([other.q[row], block.q[k]]))[:, :3, 3]
-        shift, joints = block.position[k] - other.position[row], after - before
-        squares.append(max(float(shift @ shift) - float(joints @ joints), 0.0))
+    for k in range(len(later)):
+        same = (np.abs(q - later.q[k]).max(axis=1) < max_apart) & (tool == later.tool[k])
+        near = np.flatnonzero(same if first is not None else same[:k])
+        if len(near):
+            other, row = earlier[near[0]]
+            was, now = forward(chain, np.array([other.q[row], later.q[k]]))[:, :3, 3]
+            shift, joints = later.position[k] - other.position[row], now - was
+            squares.append(max(float(shift @ shift) - float(joints @ joints), 0.0))
     return Drift(len(squares), float(np.sqrt(np.mean(squares)))) if squares else None
 
 
@@ -173,16 +158,15 @@ def _sizes(values: Sequence[Any]) -> MeanAndMax | None:
 
 
 def repeated_poses(
-    cells: tuple[Installation, Installation], measured: Sequence[PoseMeasurements], torques: Torques = None
+    cells: tuple[Installation, Installation], measured: Sequence[PoseMeasurements]
 ) -> RepeatedPoses | None:
     """Return accuracy and repeatability of all poses measured at least `min_cycles` times; None without such poses.
 
     Args:
         cells: the nominal and the calibrated arm, whose predictions are compared.
         measured: blocks; those without an instrument are ignored.
-        torques: gravity torques (m, n) per block [N m], for compliance terms.
     """
-    ready = zip(measured, *(prepare(cell, measured, torques) for cell in cells))
+    ready = zip(measured, *(prepare(cell, measured) for cell in cells))
     found = [
         _repeated_pose(cells, blocks, block, index)
         for block, *blocks in ready
@@ -279,16 +263,7 @@ def _variation(points: np.ndarray, directions: np.ndarray) -> float:
     return max(float(np.linalg.norm(a - b)) for k, a in enumerate(centres) for b in centres[:k])
 
 
-class _Aside(Protocol):
-    """Rows excluded from the fit; see `calib.procedure.kinematic_stage.inputs.Unseen`."""
-
-    @property
-    def block(self) -> PoseMeasurements: ...
-    @property
-    def held_out(self) -> bool: ...
-
-
-def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> tuple[set[str], list[str]]:
+def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasurements]) -> tuple[set[str], list[str]]:
     """Return the names of unseen files that mostly repeat rows of the fit, and notes on repeated rows.
 
     Args:
@@ -313,13 +288,12 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> t
     # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
     max_copied_share = 0.5
     for name, aside in unseen.items():
-        copied = [mark in known for mark in _marks(aside.block)]
-        again = _measured_again(fit, aside.block) & ~np.array(copied, dtype=bool)
+        copied = np.array([mark in known for mark in _marks(aside)], dtype=bool)
+        again = _measured_again(fit, aside) & ~copied
         for chosen, words in ((copied, "identical to fitted rows"), (again, "at joint values of fitted rows")):
-            if told := _row_numbers(aside.block, chosen):
+            if told := _row_numbers(aside, chosen):
                 notes.append(f"{name}: {_rows(told)} {words}: not unseen")
-        same = _row_numbers(aside.block, again | copied)
-        if len(same) > max_copied_share * len(aside.block) and not aside.held_out:
+        if len(_row_numbers(aside, again | copied)) > max_copied_share * len(aside):
             proofless.add(name)
     return proofless, notes
 

@@ -196,7 +196,7 @@ class LeftOut:
         """Return the factors by which intervals widen beyond the lower and the upper end of each joint's range.
 
         Args:
-            weights, radii, reach: of the interval, as in `calib.geometry.uncertainty.error_model.Discrepancy`.
+            weights, radii, reach: of the interval, as in `calib.geometry.error_model.Discrepancy`.
             q: (poses, n) [rad or m].
         """
         sigma = np.sqrt(np.maximum(self.shapes @ np.array(weights), 1e-30))
