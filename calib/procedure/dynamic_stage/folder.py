@@ -30,10 +30,9 @@ from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
-from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import plain, read_json

@@ -1,23 +1,252 @@
-"""Identification of the guided procedure: reading, identification, prediction of other motion, verdict."""
+"""Identification of the guided procedure: the model, its errors on the recordings, and the verdict.
 
-from dataclasses import dataclass, replace
+`assess` returns the same result for a new model and for one read from its folder.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from os.path import realpath
 from typing import TypeVar
 
+import numpy as np
+
+from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.errors import CalibError, Finding, finding
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
-from calib.identification.possible.solve import contradiction
+from calib.identification.loop.replay import Replay, replay
+from calib.identification.methods.bias import LoopDisagreement
+from calib.identification.possible.solve import Contradiction, contradiction
+from calib.identification.prediction import Dynamics, predict
+from calib.identification.rows import Case
+from calib.identification.scores import Score, score
 from calib.identification.uncertainty.geometry_uncertainty import (
     GeometryComparison,
     GeometryUncertainty,
     compare,
     propagate,
 )
-from calib.identification.uncertainty.torque_errors import TorqueErrorModel, learn_torque_errors
+from calib.identification.uncertainty.torque_errors import (
+    TorqueDiscrepancy,
+    TorqueErrorModel,
+    TorqueIntervals,
+    intervals,
+    learn_torque_errors,
+)
+from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
-from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, assess
-from calib.procedure.dynamic_stage.verdict import model_findings, resting_parameters
+from calib.procedure.dynamic_stage.verdict import (
+    Resting,
+    beyond,
+    excitation_notes,
+    extrapolates,
+    friction_drives,
+    judge,
+    model_findings,
+    motion_findings,
+    resting_parameters,
+    too_narrow,
+    with_duration,
+    with_prior,
+)
+from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
-from calib.units import TORQUE
+from calib.simulation.loop.controllers import Controller
+from calib.units import TORQUE, without_gains
+
+REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
+MAX_REPLAYS = 3  # recordings that are replayed
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFindings:
+    """Findings of an identification that the verdict needs besides the recordings; stored in its folder.
+
+    Attributes:
+        rests: its parameters that rest on a prior.
+        notes: remarks on the model in folders of earlier versions, as text.
+        noticed: findings on the model, whatever the unseen recordings are.
+        controller: that was stated or identified; None without any.
+        errors: what makes errors of its torques likely; None where too little was recorded to say.
+        contradiction: its distance from every physically consistent robot; None if unknown.
+        unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
+    """
+
+    rests: Resting
+    notes: tuple[str, ...] = ()
+    noticed: tuple[Finding, ...] = ()
+    controller: Controller | None = None
+    errors: TorqueDiscrepancy | None = None
+    contradiction: Contradiction | None = None
+    unlike: LoopDisagreement | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of a model on the recordings.
+
+    Attributes:
+        fit, validation: case name → its score.
+        predictions: case name → predicted torques (N, rows) at the full rate.
+        repeated: validation case → share of its states that the training motion has been in, where it is no proof.
+        excitation: case name → what the motion can identify.
+        intervals: unseen case (without any, the first of the training) → the errors expected there.
+    """
+
+    fit: Mapping[str, Score]
+    validation: Mapping[str, Score]
+    predictions: Mapping[str, np.ndarray]
+    repeated: Mapping[str, float]
+    excitation: Mapping[str, ExcitationReport]
+    intervals: Mapping[str, TorqueIntervals]
+
+    @property
+    def proofs(self) -> dict[str, Score]:
+        """Scores on unseen recordings by name, without repeats of the training motion."""
+        return {name: one for name, one in self.validation.items() if one.evidence}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Assessment(Errors):
+    """Errors of a model on the recordings, and the verdict.
+
+    Attributes:
+        verdict: as of `calib.procedure.dynamic_stage.verdict`.
+        warnings: what a user should know of the recordings, and of the model.
+        noticed: the findings behind the warnings.
+        tracking: by recording, the replays with the model fed forward.
+        tracking_failure: reason for missing replays.
+    """
+
+    verdict: Verdict
+    warnings: tuple[str, ...]
+    noticed: tuple[Finding, ...]
+    tracking: Mapping[str, Replay] = field(default_factory=dict)
+    tracking_failure: str = ""
+
+
+def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
+    """Return the unseen recordings that repeat training motion: name → share of their states in the training."""
+    shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
+    return {name: share for name, share in shares.items() if share >= REPEAT}
+
+
+def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
+    """Return the findings on samples that are both unseen and training data."""
+    found = []
+    for case, own in product(unseen, cases):
+        first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
+        if own.motion.file and realpath(case.motion.file) == realpath(own.motion.file) and first < last:
+            found.append(finding("unseen-overlaps", file=case.name, training=own.name, first=first, last=last))
+    return found
+
+
+def errors_of(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    errors: TorqueErrorModel | None = None,
+    say: Progress = lambda words: None,
+) -> Errors:
+    """Return the predictions of every recording by a model, and their errors.
+
+    Args:
+        errors: the model's expected torque errors, for the intervals.
+    """
+    predictions, scores = {}, {}
+    for case in (*inputs.cases, *inputs.unseen):
+        say(f"predicting {case.name}")
+        predictions[case.name] = predict(dynamics, case)
+        scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
+    expected: dict[str, TorqueIntervals] = {}
+    for case in () if errors is None else inputs.unseen or inputs.cases[:1]:
+        say(f"errors to expect of {case.name}")
+        expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
+    repeated = repeated_motion(inputs.cases, inputs.unseen)
+    stated = {name: one.coverage() for name, one in expected.items()}
+    validation = {
+        case.name: replace(scores[case.name], evidence=case.name not in repeated, interval95=stated.get(case.name))
+        for case in inputs.unseen
+    }
+    fit = {case.name: scores[case.name] for case in inputs.cases}
+    excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
+    return Errors(fit, validation, predictions, repeated, excitation, expected)
+
+
+def assess(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    findings: ModelFindings,
+    errors: TorqueErrorModel | None = None,
+    wrong: Sequence[int] | None = None,
+    progress: Progress | None = None,
+) -> Assessment:
+    """Return the predictions of every recording by a model, their errors, and the verdict.
+
+    Args:
+        inputs: training recordings (for the model's own error) and unseen ones.
+        dynamics: the model.
+        findings: what is known of it.
+        errors: what errors its torques are expected to have.
+        wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
+    """
+    say = progress or (lambda words: None)
+    wrong = driven(dynamics, inputs.cases) if wrong is None else wrong
+    found = errors_of(inputs, dynamics, errors, say)
+    say("judging")
+    labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
+    odd = plausibility.implausible(inputs, findings.contradiction, findings.unlike)
+    figures, rules = judge(found.fit, found.proofs, found.repeated, found.excitation, labels)
+    if drives := friction_drives(joint + 1 for joint in wrong):
+        figures, rules = "", drives
+    rules += too_narrow({name: found.intervals[name] for name in found.proofs if name in found.intervals}, labels)
+    verdict = with_duration(with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), found.excitation)
+    say("tracking with the model fed forward")
+    relative = inputs.unit != TORQUE
+    amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
+    replays, failure = track(inputs, dynamics, found.predictions, findings.controller) if not relative else ({}, "")
+    if any(one.inertia_added.any() for one in replays.values()):
+        use = lines_of([finding("prediction-not-simulation")])
+        verdict = replace(verdict, reason="; ".join([verdict.reason, *use]))
+    if relative:
+        verdict, failure = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}"), lines_of(amperes)[0]
+    noticed = (
+        *amperes, *odd, *rules, *overlaps(inputs.cases, inputs.unseen),
+        *(one for case in (*inputs.cases, *inputs.unseen) for one in beyond(case, inputs.chain)),
+        *motion_findings(found.validation, found.repeated),
+        *(one for case in inputs.unseen for one in extrapolates(case.name, found.intervals.get(case.name))),
+        *findings.noticed,
+    )  # fmt: skip
+    said = dict.fromkeys((*lines_of(noticed), *excitation_notes(found.excitation), *findings.notes))
+    return Assessment(
+        **vars(found), verdict=verdict, warnings=tuple(said), noticed=noticed, tracking=replays,
+        tracking_failure=failure,
+    )  # fmt: skip
+
+
+def track(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    predictions: Mapping[str, np.ndarray],
+    controller: Controller | None = None,
+) -> tuple[dict[str, Replay], str]:
+    """Return replays of unseen recordings (else of a training recording) by name, or why there are none.
+
+    Args:
+        predictions: case name → torques by the model.
+        controller: that was identified, where the loop's is not stated; see `calib.identification.loop.replay`.
+    """
+    chain, loop = inputs.chain, inputs.options.settings.loop
+    chosen = inputs.unseen[:MAX_REPLAYS] or inputs.cases[:1]
+    try:
+        read = (
+            None if loop is None else controller if loop.controller == "identify" else loop.stated_controller(chain.n)
+        )
+        rate = None if read is None or loop is None else loop.rate
+        replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
+        return {one.name: replace(one, unseen=bool(inputs.unseen)) for one in replays}, ""
+    except CalibError as error:
+        return {}, str(error)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

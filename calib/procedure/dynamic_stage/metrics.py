@@ -27,9 +27,8 @@ from calib.identification.parameter_constraints import Binding
 from calib.identification.rows import Case
 from calib.identification.scores import Score
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.records import Array, Number
 from calib.simulation.loop.controllers import Controller
 
@@ -163,12 +162,9 @@ class JudgedMetrics:
 
 def _judged(found: Assessment) -> dict[str, Any]:
     """Return the entries of an assessment common to both records, without the names of the rows."""
-    replays = {one.name: one for one in found.tracking.replays}
-    return {
-        **dict(zip(("verdict", "reason", "code", "advice"), vars(found.verdict).values())),
-        "warnings": found.warnings, "noticed": found.noticed, "validation": found.validation,
-        "tracking": replays, "tracking_failure": found.tracking.failure,
-    }  # fmt: skip
+    same = ("warnings", "noticed", "validation", "tracking", "tracking_failure")
+    judged = dict(zip(("verdict", "reason", "code", "advice"), vars(found.verdict).values()))
+    return judged | {name: getattr(found, name) for name in same}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -263,7 +259,7 @@ def _five_digits(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnseenReport(JudgedMetrics):
-    """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.validation`."""
+    """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.identify`."""
 
     units: tuple[str, ...]
     fit: Mapping[str, Score]

@@ -11,13 +11,31 @@ import numpy as np
 from calib.column_changes import Explanation
 from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.errors import Finding, finding
-from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes
+from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes, compare_sizes, signs_of
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.methods.bias import LoopDisagreement
 from calib.identification.possible.solve import Contradiction
-from calib.procedure.findings import level_of, limit
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.findings import level_of, limit, settle
 from calib.robot.chain import Chain
 from calib.robot.description import impossible_bodies
+from calib.units import TORQUE
+
+
+def implausible(
+    inputs: IdentificationInputs, impossible_by: Contradiction | None, loop: LoopDisagreement | None
+) -> tuple[Finding, ...]:
+    """Return all findings on the recordings, the robot's description and the estimate, those accepted marked.
+
+    Args:
+        impossible_by: distance of the estimate from every physically consistent robot.
+        loop: disagreement of recorded torques with an estimate that relies on the stated loop.
+    """
+    chain, gravity = inputs.chain, inputs.options.settings.gravity
+    sizes = [compare_sizes(case, chain, gravity, inputs.unit == TORQUE) for case in inputs.cases]
+    signs = {case.name: signs_of(case, chain, gravity) for case in (*inputs.cases, *inputs.unseen)}
+    found = [*findings(sizes, chain.joint_names), *impossible(impossible_by), *another_loop(loop), *described(chain)]
+    return settle([*found, *wrong_joints(signs, chain.joint_names)], inputs.options.accept)
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:

@@ -151,9 +151,9 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
     return []
 
 
-def extrapolates(name: str, expected: TorqueIntervals) -> list[Finding]:
+def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
     """Return how a recording leaves the training range."""
-    if not (share := float(expected.beyond.mean())):
+    if expected is None or not (share := float(expected.beyond.mean())):
         return []
     joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]
     ways = "; ".join(expected.ways(joints))

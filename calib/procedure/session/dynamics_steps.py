@@ -28,7 +28,7 @@ from calib.identification.identify_options import FileSettings, IdentifyOptions,
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
-from calib.procedure.dynamic_stage.validation import Assessment, assess
+from calib.procedure.dynamic_stage.identify import Assessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
@@ -312,7 +312,7 @@ def _as_delivered(session: Session, found: Assessment) -> Verdict:
             known = prediction_of_export(Path(folder))
         except CalibError as error:
             verdict = verdict.for_prediction(f"the dynamics cannot be exported: {error}")
-    worst = max((one.raw.total for name, one in found.validation.items() if name not in found.repeated), default=0.0)
+    worst = max((one.raw.total for one in found.proofs.values()), default=0.0)
     left, what = (worst, "identified model") if known is None else (known.exported, "exported robot")
     tolerance = session.settings.dynamics.tolerance_percent
     if not tolerance or left <= tolerance:

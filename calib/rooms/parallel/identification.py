@@ -1,6 +1,6 @@
 """Identification of a parallel robot from encoders and motor torques: platform, actuator or power rows."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,6 @@ import numpy as np
 
 from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
-from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, UsageError, finding
 from calib.identification.friction.passivity import MIN_ENERGY_SHARE
@@ -17,12 +16,10 @@ from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
-from calib.identification.prediction import predict
 from calib.identification.rows import Case
-from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
+from calib.procedure.dynamic_stage.identify import Assessment, Errors, ModelFindings, errors_of
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
-from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, repeated_motion
 from calib.procedure.dynamic_stage.verdict import (
     excitation_notes,
     friction_drives,
@@ -111,31 +108,26 @@ def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], 
     """Return the prediction errors of all recordings, with a verdict."""
     model, cases, unseen = found.dynamics.model, inputs.cases, inputs.unseen
     assert isinstance(model, ParallelModel)
-    predictions = {case.name: predict(found.dynamics, case) for case in (*cases, *unseen)}
-    fit, validation = ({case.name: score(case, predictions[case.name]) for case in part} for part in (cases, unseen))
-    repeated = repeated_motion(cases, unseen)
-    excitation = {case.name: report_excitation(case.motion) for case in cases}
-    proofs = {name: one for name, one in validation.items() if name not in repeated}
-    validation |= {name: replace(one, evidence=name in proofs) for name, one in validation.items()}
-    verdict, rules = _judged(model, found, cases, fit, proofs, repeated, excitation)
+    errors = errors_of(inputs, found.dynamics)
+    verdict, rules = _judged(model, found, cases, errors)
     noticed = (
-        *rules, *motion_findings(validation, repeated), *findings.noticed,
+        *rules, *motion_findings(errors.validation, errors.repeated), *findings.noticed,
         *settle(_encoders(model.known, (*cases, *unseen))),
     )  # fmt: skip
-    notes = (*lines_of(noticed), *excitation_notes(excitation), *findings.notes)
-    return Assessment(fit, validation, predictions, repeated, excitation, verdict, notes, noticed)
+    notes = (*lines_of(noticed), *excitation_notes(errors.excitation), *findings.notes)
+    return Assessment(**vars(errors), verdict=verdict, warnings=notes, noticed=noticed)
 
 
 def _judged(
-    model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case], fit: Mapping[str, Score],
-    proofs: Mapping[str, Score], repeated: Mapping[str, float], excitation: Mapping[str, ExcitationReport],
-) -> tuple[Verdict, list[Finding]]:  # fmt: skip
+    model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case], errors: Errors
+) -> tuple[Verdict, list[Finding]]:
     if drives := friction_drives(_driven_joints(model, found, cases), "a payload that the options do not name"):
         return Verdict.of("", drives), drives
     labels = found.settings.torque_rows.titles(model.known.robot.joint_names)
     kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
-    figures, rules = judge(fit, proofs, repeated, excitation, labels, kind)
-    return with_duration(with_prior(Verdict.of(figures, rules), resting_parameters(found)), excitation), rules
+    figures, rules = judge(errors.fit, errors.proofs, errors.repeated, errors.excitation, labels, kind)
+    verdict = with_prior(Verdict.of(figures, rules), resting_parameters(found))
+    return with_duration(verdict, errors.excitation), rules
 
 
 def _driven_joints(

@@ -26,9 +26,8 @@ from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.identify import judged
+from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.validation import overlaps, repeated_motion
 from calib.procedure.dynamic_stage.verdict import motion_findings
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.report.page import Block, Column, Section, Text, table

@@ -9,8 +9,8 @@ import pytest
 
 from calib.cli import run
 from calib.errors import UsageError
+from calib.procedure.dynamic_stage.identify import overlaps
 from calib.procedure.dynamic_stage.inputs import gather
-from calib.procedure.dynamic_stage.validation import overlaps
 from calib.rooms.studies.method_comparison import FAST_SECONDS, caveats, compare_methods
 
 
