@@ -24,7 +24,7 @@ from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report import fit_report, geometry_section
 from calib.procedure.report.fit_report import Report
-from calib.procedure.report.page import Page, Picture, Section, Table, Text
+from calib.procedure.report.page import Page, Picture, Section, Table, Text, shortened
 
 if TYPE_CHECKING:
     import jinja2
@@ -90,26 +90,16 @@ def certificate(
     if len(files) > MAX_LISTED_FILES:
         marks.append((f"and {len(files) - MAX_LISTED_FILES} more, see Files", "", ""))
     return Page(
-        title,
-        subtitle,
-        issued(now),
-        [(label, _shortened(value, most)) for label, value in first.items()],
-        behind,
-        marks,
+        title, subtitle, issued(now), [(label, shortened(value, most)) for label, value in first.items()], behind, marks
     )
 
 
 def _fitting(section: Section) -> Section:
     """Return a section with its reason shortened to fit the first sheet; the full text becomes its first block."""
-    short = _shortened(section.reason, MAX_REASON_LETTERS)
+    short = shortened(section.reason, MAX_REASON_LETTERS)
     if short == section.reason:
         return section
     return replace(section, reason=short, blocks=[Text("Reason in full", [section.reason]), *section.blocks])
-
-
-def _shortened(text: str, most: int) -> str:
-    """Return a text, cut at a word with an ellipsis if it is longer than `most` letters."""
-    return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
 
 
 def file_row(name: str, role: str, path: Path) -> FileRow:

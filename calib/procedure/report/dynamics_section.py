@@ -1,6 +1,6 @@
 """The dynamics section of reports, for the console output of an identification and for certificates."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +18,19 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import LoopMetrics, ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
-from calib.procedure.report.page import Block, Column, KeyFigure, Pictures, Section, Table, Text, relative_sigma, table
+from calib.procedure.report.page import (
+    Block,
+    Column,
+    KeyFigure,
+    Pictures,
+    Section,
+    Table,
+    Text,
+    grouped,
+    relative_sigma,
+    shortened,
+    table,
+)
 from calib.records import read_rows, typed_rows
 from calib.robot.chain import Chain
 from calib.units import small
@@ -47,7 +59,7 @@ PARAMETERS = (
     Column("value", "{0.value:.4g}"),
     Column("σ", lambda row: "" if row.sigma is None else f"{row.sigma:.2g}"),
     Column("RSD", lambda row: relative_sigma(row.rsd)),
-    Column("what it holds", lambda row: _shortened(row.expression), number=False),
+    Column("what it holds", lambda row: shortened(row.expression, WORDS), number=False),
 )
 FED_FORWARD = {
     FEEDBACK: "feedback alone", CAD: "CAD fed forward", IDENTIFIED: "model fed forward",
@@ -120,23 +132,11 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
 
 
 def outcome_section(outcome: IdentificationOutcome) -> Section:
-    """Return the console's section on an identification: ladder, model, errors, tracking, verdict."""
-    found = record_of(outcome)
-    chain, torques = outcome.inputs.chain, outcome.found.settings.torque_rows
+    """Return the console's section on an identification: that of its certificate, without figures and parameters."""
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
-    blocks: list[Block] = [_friction_table(found)] if found.ladder else []
-    blocks += [Text("", _model_sentences(found)), *_geometry_blocks(found, effects)]
-    if found.loop:
-        blocks.append(Text("", _loop_sentences(found.loop)))
-    rows = torques.titles(chain.joint_names)
-    units = outcome.inputs.row_units
-    blocks += [
-        _error_table(found.identification, found.validation, rows, units),
-        *_interval_blocks(found.validation, rows, units),
-        *tracking_blocks(found.tracking, found.tracking_failure),
-    ]
-    blocks.append(Text("", found.warnings, "note"))
-    return Section("Dynamics", blocks, found.verdict, found.reason)
+    return certificate_section(
+        DynamicReport(record_of(outcome), (), tuple(effects), UnseenReport.of(outcome.inputs, outcome)), {}
+    )
 
 
 def certificate_section(
@@ -151,8 +151,7 @@ def certificate_section(
     """
     metrics, unseen = found.metrics, found.unseen
     pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
-    blocks: list[Block] = [_error_table(unseen.fit, unseen.validation, unseen.rows, unseen.units)]
-    blocks += _interval_blocks(unseen.validation, unseen.rows, unseen.units)
+    blocks: list[Block] = [_error_table(unseen), _interval_table(unseen)]
     blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
@@ -165,7 +164,7 @@ def certificate_section(
         blocks.append(Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(metrics.tracking, metrics.tracking_failure)
     blocks.append(Text("What was exported", exported))
-    blocks.append(Text("Notes on the dynamics", list(dict.fromkeys((*metrics.warnings, *unseen.warnings)))))
+    blocks.append(Text("Notes on the dynamics", list(dict.fromkeys((*metrics.warnings, *unseen.warnings))), "note"))
     return Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))
 
 
@@ -206,72 +205,60 @@ def _rsd(percent: float) -> str:
     return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
-def _error_table(
-    training: Mapping[str, Score], unseen: Mapping[str, Score], rows: Sequence[str],
-    units: Sequence[str],
-) -> Table:  # fmt: skip
-    """Return the table of torque errors, per row and recording.
-
-    Args:
-        training, unseen: recordings by name.
-        rows, units: names and units of the torque rows.
-    """
-    cells: list[Sequence[str]] = []
-    strong = set()
-    labelled = [(name, one, "fitted") for name, one in training.items()]
-    labelled += [(name, one, "unseen" if one.evidence else "repeat: no evidence") for name, one in unseen.items()]
-    for name, one, label in labelled:
-        parts = one.raw, one.filtered, one.moving, one.standing
-        cells.append((f"{name} ({label})",))
-        strong.add(len(cells))
-        cells.append(("all", *(percent(part.total) for part in parts), "", "", ""))
-        for j, row in enumerate(rows):
-            rms, white = one.raw.rms[j], one.whiteness[j]
-            cells.append((
-                row, *(percent(part.joints[j]) for part in parts),
-                percent(one.above_band_percent[j]),
-                f"{rms:.3g} {units[j]}" if np.isfinite(rms) else "",
-                "" if white is None else f"{100 * white.outside:.0f} %",
-            ))  # fmt: skip
+def _error_table(unseen: UnseenReport) -> Table:
+    """Return the table of torque errors, per row and recording."""
+    sets = {f"{name} (fitted)": one for name, one in unseen.fit.items()}
+    for name, one in unseen.validation.items():
+        sets[f"{name} ({'unseen' if one.evidence else 'repeat: no evidence'})"] = one
+    groups = {label: _error_rows(one, unseen) for label, one in sets.items()}
     header = ("torque", "error", "in band", "moving", "standing", "torque above band", "rms", "ACF outside")
-    return Table("Torque errors", header, cells, ERROR_NOTE, frozenset(strong), range(1, 8))
+    return grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
 
 
-def _interval_blocks(
-    unseen: Mapping[str, Score], rows: Sequence[str], units: Sequence[str]
-) -> list[Block]:  # fmt: skip
-    """Return the coverage of the predicted 95 % intervals, per row of unseen recordings."""
-    cells: list[Sequence[str]] = []
-    strong = set()
-    for name, one in unseen.items():
-        if (found := one.interval95) is None:
-            continue
-        cells.append((name,))
-        strong.add(len(cells))
-        cells.append(("all", f"{found.coverage_percent:.1f} %", "", f"{found.extrapolated_percent:.0f} %"))
-        for row, inside, half, unit in zip(rows, found.joints_percent, found.median, units):
-            cells.append((row, f"{inside:.0f} %", f"± {half:.3g} {unit}", ""))
-    if not cells:
-        return []
+def _error_rows(one: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
+    parts = one.raw, one.filtered, one.moving, one.standing
+    yield "all", *(percent(part.total) for part in parts), "", "", ""
+    for j, (row, unit, rms, white) in enumerate(zip(unseen.rows, unseen.units, one.raw.rms, one.whiteness)):
+        yield (
+            row, *(percent(part.joints[j]) for part in parts), percent(one.above_band_percent[j]),
+            f"{rms:.3g} {unit}" if np.isfinite(rms) else "", "" if white is None else f"{100 * white.outside:.0f} %",
+        )  # fmt: skip
+
+
+def _of_all(row: Sequence[str]) -> bool:
+    return row[0] == "all"
+
+
+def _interval_table(unseen: UnseenReport) -> Table:
+    """Return the table of the predicted 95 % intervals' coverage, per row of unseen recordings; empty without any."""
+    groups = {}
+    for name, one in unseen.validation.items():
+        if (found := one.interval95) is not None:
+            rows = zip(unseen.rows, found.joints_percent, found.median, unseen.units)
+            groups[name] = [
+                ("all", f"{found.coverage_percent:.1f} %", "", f"{found.extrapolated_percent:.0f} %"),
+                *((row, f"{inside:.0f} %", f"± {half:.3g} {unit}", "") for row, inside, half, unit in rows),
+            ]
     header = ("torque", "errors within the 95 % interval", "median interval", "of the time extrapolated")
-    return [Table("Intervals stated", header, cells, strong=frozenset(strong), numbers=range(1, 4))]
+    return grouped("Intervals stated", header, groups, strong=_of_all)
 
 
 def _friction_table(metrics: ModelMetrics) -> Table:
     """Return the table of friction models with their error on held-out time, of all rows and of each."""
-    rows, strong = [], set()
-    for step in metrics.ladder:
-        if step.kept:
-            strong.add(len(rows))
-        at = ", ".join(map(str, step.kept_at_joints))
-        joints = [f"{x:.1f}" if np.isfinite(x) else "–" for x in step.joints_percent]
-        total = f"{step.cross_validated_percent:.2f}" if np.isfinite(step.cross_validated_percent) else "–"
-        rows.append((step.model, str(step.parameters), total, *joints, at or step.note))
-    each = [str(j + 1) for j in range(max((len(step.joints_percent) for step in metrics.ladder), default=0))]
-    rows = [(*row[:-1], *[""] * (len(each) + 4 - len(row)), row[-1]) for row in rows]
-    header = ("friction", "p", "total", *each, "kept at joints")
+
+    def shown(shares: Iterable[float], digits: int) -> str:
+        return "".join(f"{x:.{digits}f}" if np.isfinite(x) else "–" for x in shares)
+
+    count = max(len(step.joints_percent) for step in metrics.ladder)
+    columns = [
+        Column("friction", "{0.model}", number=False),
+        Column("p", "{0.parameters}"),
+        Column("total", lambda step: shown([step.cross_validated_percent], 2)),
+        *(Column(str(j + 1), lambda step, j=j: shown(step.joints_percent[j : j + 1], 1)) for j in range(count)),
+        Column("kept at joints", lambda step: ", ".join(map(str, step.kept_at_joints)) or step.note, number=False),
+    ]
     title = "Ladder of friction models: relative error on held-out time [%]"
-    return Table(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), range(1, 3 + len(each)))
+    return table(title, columns, metrics.ladder, f"Chosen: {metrics.friction}.", lambda step: step.kept)
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
@@ -372,10 +359,10 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Bl
     if not replays:
         return []
     first = next(iter(replays.values()))
-    rows: list[Sequence[str]] = []
-    for name, one in replays.items():
-        rows.append((name,))
-        rows += [(FED_FORWARD[key], *map(_number, 1e3 * rms)) for key, rms in one.rms.items()]
+    groups = {
+        name: [(FED_FORWARD[key], *map(_number, 1e3 * rms)) for key, rms in one.rms.items()]
+        for name, one in replays.items()
+    }
     joints = [str(j + 1) for j in range(len(first.inertia_added))]
     lines = []
     gain = f": feedforward of the model reduces the tracking error by a factor of {first.feedback_over_model:.3g}"
@@ -391,7 +378,7 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Bl
     motion = "unseen motion" if first.unseen else "the training motion, which gives too small errors"
     lines.append(f"the simulated robot is the identified model plus the unexplained torque; {control}; {motion}{gain}")
     title = "Tracking, simulated: rms of q - reference [mrad or mm]"
-    return [Table(title, ("fed forward", *joints), rows, numbers=range(1, 1 + len(joints))), Text("", lines)]
+    return [grouped(title, ("fed forward", *joints), groups), Text("", lines)]
 
 
 def _identifiability(found: DynamicReport) -> list[str]:
@@ -410,7 +397,3 @@ def _identifiability(found: DynamicReport) -> list[str]:
     elif any(proof.whiteness):
         lines.append(f"The residual on {where} cannot be distinguished from white noise.")
     return lines
-
-
-def _shortened(words: str) -> str:
-    return words if len(words) <= WORDS else f"{words[:WORDS].rsplit(' ', 2)[0]} …"

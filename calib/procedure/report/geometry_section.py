@@ -22,6 +22,7 @@ from calib.procedure.report.page import (
     Section,
     Table,
     Text,
+    grouped,
     relative_sigma,
     table,
 )
@@ -193,31 +194,25 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
 def _error_table(metrics: FitMetrics) -> Table:
     """Return the table of errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
     sets = _sets(metrics)
-    rows: list[Sequence[str]] = []
-    strong = set()
-    for label, found in sets:
-        rows.append((label,))
-        for words, arm, numbers in _error_lines(found):
-            if arm == "calibrated":
-                strong.add(len(rows))
-            cells = [f"{size:.4f}" for size in (numbers.mean, numbers.rms, numbers.p95, numbers.max)]
-            rows.append((words if arm == "nominal" else "", ARMS[arm], *cells))
     notes = ["Distances of pairs do not depend on the placement of instrument and tool."]
     notes += [ALONE_NOTE] * any(found.urdf_alone for _, found in sets)
     header = ("error", "arm", "mean", "rms", "95 %", "max")
-    return Table(
-        "Errors of the nominal and the calibrated arm", header, rows, " ".join(notes), frozenset(strong), range(2, 6)
-    )
+    groups = {label: list(_error_rows(found)) for label, found in sets}
+    calibrated = lambda row: row[1:2] == ("calibrated",)  # noqa: E731
+    title = "Errors of the nominal and the calibrated arm"
+    return grouped(title, header, groups, " ".join(notes), calibrated, texts=2)
 
 
-def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistics]]:
-    for key, (words, unit) in KINDS.items():
+def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
+    """Yield error, arm, and the arm's mean, rms, 95 % quantile and maximum, as text."""
+    kinds: dict[str, Mapping[str, ErrorStatistics | None]] = {
+        f"{words} [{unit}]": {arm: _errors(found, arm, key) for arm in ARMS} for key, (words, unit) in KINDS.items()
+    }
+    for words, arms in (*kinds.items(), ("distance of pairs [mm]", found.pair_distance_mm)):
         for arm in ARMS:
-            if (numbers := _errors(found, arm, key)) is not None:
-                yield f"{words} [{unit}]", arm, numbers
-    for arm in ARMS:
-        if numbers := found.pair_distance_mm.get(arm):
-            yield "distance of pairs [mm]", arm, numbers
+            if numbers := arms.get(arm):
+                sizes = numbers.mean, numbers.rms, numbers.p95, numbers.max
+                yield words if arm == "nominal" else "", ARMS[arm], *(f"{size:.4f}" for size in sizes)
 
 
 def _ladder_table(metrics: FitMetrics) -> Table:

@@ -3,7 +3,7 @@
 A certificate shows the same values as HTML; this module does not depend on robots.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,6 +64,21 @@ def table(
     bold = frozenset(k for k, record in enumerate(records) if strong(record))
     numbers = [k for k, column in enumerate(columns) if column.number]
     return Table(title, [column.name for column in columns], rows, note, bold, numbers)
+
+
+def grouped(
+    title: str, header: Sequence[str], groups: Mapping[str, Iterable[Sequence[str]]], note: str = "",
+    strong: Callable[[Sequence[str]], bool] = lambda row: False, texts: int = 1,
+) -> Table:  # fmt: skip
+    """Return a table of rows under headings, with the `strong` rows in bold, and numbers behind `texts` columns."""
+    rows = [row for heading, own in groups.items() for row in ((heading,), *own)]
+    bold = frozenset(k for k, row in enumerate(rows) if strong(row))
+    return Table(title, header, rows, note, bold, range(texts, len(header)))
+
+
+def shortened(text: str, most: int) -> str:
+    """Return a text, cut at a word with an ellipsis if it is longer than `most` letters."""
+    return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
 
 
 @dataclass(frozen=True)
@@ -171,8 +186,8 @@ def relative_sigma(percent: float | None) -> str:
 
 
 def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
-    """Yield each block as a rich renderable, without pictures."""
-    for block in blocks:
+    """Yield each block as a rich renderable, without pictures and empty blocks."""
+    for block in filter(len, blocks):
         if isinstance(block, Table):
             yield _rich_table(block)
         elif isinstance(block, Text):
