@@ -164,7 +164,6 @@ class Panel:
         xnames, ynames: labels at 0, 1, … instead of numbers; x names of one line stand upright.
         grid: ``x``, ``y``, ``both`` or none.
         equal: one scale for both axes.
-        bare: letters of the axes whose labels are left out, since a neighbour has them.
         symlog: the y axis is linear up to there from zero, and logarithmic beyond; 0: all linear.
         ticks: at most about so many numbers at an axis.
     """
@@ -180,7 +179,6 @@ class Panel:
     ynames: Sequence[str] | None = None
     grid: str = ""
     equal: bool = False
-    bare: str = ""
     symlog: float = 0.0
     ticks: int = 0
 
@@ -210,7 +208,6 @@ class Panel:
             show(on=axes)
         if self.grid:
             axes.grid(axis=self.grid)  # type: ignore[arg-type]
-        axes.tick_params(labelbottom="x" not in self.bare, labelleft="y" not in self.bare)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +220,7 @@ class Chart:
         columns: panels in a row.
         width: of the figure [in].
         title: of the whole, at its head; the labels of the first panel's layers stand there, too.
+        shared: letters of the axes labelled at the lowest panel of a column, and at the first of a row, only.
     """
 
     panels: Sequence[Panel]
@@ -230,6 +228,7 @@ class Chart:
     columns: int = 1
     width: float = PAGE_WIDTH
     title: str = ""
+    shared: str = ""
 
 
 def figure(chart: Chart) -> Figure:
@@ -237,8 +236,14 @@ def figure(chart: Chart) -> Figure:
     with style.styled(quiet_titles=bool(chart.title)):
         rows = -(-len(chart.panels) // chart.columns)
         result, axes = style.sheet(rows, chart.columns, chart.width, chart.height, 0.25 if chart.title else 0.0)
-        for panel, place in zip(chart.panels, axes):
+        for k, (panel, place) in enumerate(zip(chart.panels, axes)):
             panel.draw(place)
+            if "x" in chart.shared and k + chart.columns < len(chart.panels):
+                place.set_xlabel("")
+                place.tick_params(labelbottom=False)
+            if "y" in chart.shared and k % chart.columns:
+                place.set_ylabel("")
+                place.tick_params(labelleft=False)
         for place in axes[len(chart.panels) :]:
             place.set_axis_off()
         if chart.title:

@@ -115,10 +115,8 @@ def torques(
             line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
             line(t, measured[:, j] - predicted[:, j], "-", QUIET, 0.5, label="measured - predicted"),
         ]
-        inner = j + columns < len(rows)
-        words = "" if inner else "time [s]"
-        panels.append(Panel(lines, f"{row} [{unit}]{left}", words, xlim=(t[0], t[-1]), bare="x" if inner else ""))
-    return Chart(panels, 0.7 + 0.95 * -(-len(rows) // columns), columns, title=title)
+        panels.append(Panel(lines, f"{row} [{unit}]{left}", "time [s]", xlim=(t[0], t[-1])))
+    return Chart(panels, 0.7 + 0.95 * -(-len(rows) // columns), columns, title=title, shared="x")
 
 
 def autocorrelations(
@@ -134,21 +132,15 @@ def autocorrelations(
     """
     shown = [(row, white) for row, white in zip(rows, found) if white is not None and len(white.acf)]
     columns = min(7 if len(shown) > MAX_HALF_PAGE_ROWS else 4 if width > HALF_WIDTH else 3, max(1, len(shown)))
-    panels = []
-    for k, (row, white) in enumerate(shown):
-        inner = k + columns < len(shown)
-        panels.append(
-            Panel(
-                [bars([0.0, *white.acf], upright=True, thick=0.4), level(white.bound), level(-white.bound)],
-                row,
-                "" if inner else "lag [samples]",
-                ylim=(-1.0, 1.0),
-                xlim=(0.0, len(white.acf) + 1.0),
-                ticks=3,
-                bare="y" * (k % columns > 0) + "x" * inner,
-            )
+    panels = [
+        Panel(
+            [bars([0.0, *white.acf], upright=True, thick=0.4), level(white.bound), level(-white.bound)],
+            row, "lag [samples]", ylim=(-1.0, 1.0), xlim=(0.0, len(white.acf) + 1.0), ticks=3,
         )
-    return Chart(panels or [Panel([])], 0.65 + 0.95 * -(-max(1, len(shown)) // columns), columns, width, title)
+        for row, white in shown
+    ]  # fmt: skip
+    height = 0.65 + 0.95 * -(-max(1, len(shown)) // columns)
+    return Chart(panels or [Panel([])], height, columns, width, title, shared="xy")
 
 
 def from_folder(folder: Path) -> dict[str, Picture]:

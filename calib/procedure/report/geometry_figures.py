@@ -79,20 +79,10 @@ def residuals_by_joint(
             line(x, factor * errors, ".", colour, size=4.5, label=label)
             for errors, colour, label in ((before, BEFORE, "nominal"), (after, AFTER, "calibrated"))
         ]
-        inner = j % columns > 0
-        panels.append(
-            Panel(
-                cloud,
-                x=f"{joint_names[j]} [{'m' if prismatic[j] else 'deg'}]",
-                y="" if inner else f"error [{unit}]",
-                ylim=limits,
-                log="y",
-                grid="y",
-                bare="y" if inner else "",
-                ticks=5,
-            )
-        )
-    return Chart(panels, 0.55 + 1.35 * -(-n // columns), columns, title=f"{nature} errors of {len(q)} poses")
+        name = f"{joint_names[j]} [{'m' if prismatic[j] else 'deg'}]"
+        panels.append(Panel(cloud, x=name, y=f"error [{unit}]", ylim=limits, log="y", grid="y", ticks=5))
+    title = f"{nature} errors of {len(q)} poses"
+    return Chart(panels, 0.55 + 1.35 * -(-n // columns), columns, title=title, shared="y")
 
 
 def error_map(

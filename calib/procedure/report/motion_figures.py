@@ -43,24 +43,19 @@ def _motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence
     units = motion_units(joint.kind for joint in joints)
     panels, nearest, title = [], np.inf, ""
     for j, joint in enumerate(joints):
-        last = joint is joints[-1]
         label = joint.name.replace("_", "_\n") if len(joint.name) > 12 else joint.name
         for (values, lower, upper), quantity, unit in zip(series, TITLES, units):
             first = values is series[0][0]
             bounds = [level(float(bound)) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
-            panels.append(
-                Panel(
-                    [line(times, values[:, j]), *bounds], f"{quantity} [{unit}]" if j == 0 else "",
-                    "time [s]" if last else "", label if first else "", xlim=(times[0], times[-1]), ticks=4,
-                    bare="" if last else "x",
-                )
-            )  # fmt: skip
+            head, curve = f"{quantity} [{unit}]" if j == 0 else "", line(times, values[:, j])
+            limits = times[0], times[-1]
+            panels.append(Panel([curve, *bounds], head, "time [s]", label if first else "", xlim=limits, ticks=4))
             if len(bounds) < 2 or upper[j] <= lower[j]:
                 continue
             gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
             if gap < nearest:
                 nearest, title = gap, f"{quantity} of {joint.name} comes closest to its limit (dashed)"
-    return Chart(panels, 0.7 + 0.75 * len(joints), len(series), title=title)
+    return Chart(panels, 0.7 + 0.75 * len(joints), len(series), title=title, shared="x")
 
 
 def _motion_figure(designed: Designed) -> Chart:
