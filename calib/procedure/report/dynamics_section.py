@@ -18,19 +18,7 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import LoopMetrics, ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
-from calib.procedure.report.page import (
-    Block,
-    Column,
-    KeyFigure,
-    Pictures,
-    Section,
-    Table,
-    Text,
-    grouped,
-    relative_sigma,
-    shortened,
-    table,
-)
+from calib.procedure.report import page
 from calib.records import read_rows, typed_rows
 from calib.robot.chain import Chain
 from calib.units import small
@@ -46,20 +34,20 @@ ERROR_NOTE = (
     "white noise; 5 % if it is white."
 )
 EFFECTS = (
-    Column("geometric error", "{0.element}", number=False),
-    Column("sigma", lambda one: small(one.sigma, one.unit)),
-    Column("moves most", "{0.parameter}", number=False),
-    Column("shift [its σ of torque noise]", "{0.shift_sigma:.2f}"),
-    Column("parameters moved", "{0.parameters_moved}"),
-    Column("torque rms [N m]", lambda one: f"{one.torque_rms or 0.0:.2g}"),
+    page.Column("geometric error", "{0.element}", number=False),
+    page.Column("sigma", lambda one: small(one.sigma, one.unit)),
+    page.Column("moves most", "{0.parameter}", number=False),
+    page.Column("shift [its σ of torque noise]", "{0.shift_sigma:.2f}"),
+    page.Column("parameters moved", "{0.parameters_moved}"),
+    page.Column("torque rms [N m]", lambda one: f"{one.torque_rms or 0.0:.2g}"),
 )
 PARAMETERS = (
-    Column("parameter", "{0.name}", number=False),
-    Column("unit", "{0.unit}", number=False),
-    Column("value", "{0.value:.4g}"),
-    Column("σ", lambda row: "" if row.sigma is None else f"{row.sigma:.2g}"),
-    Column("RSD", lambda row: relative_sigma(row.rsd)),
-    Column("what it holds", lambda row: shortened(row.expression, WORDS), number=False),
+    page.Column("parameter", "{0.name}", number=False),
+    page.Column("unit", "{0.unit}", number=False),
+    page.Column("value", "{0.value:.4g}"),
+    page.Column("σ", lambda row: "" if row.sigma is None else f"{row.sigma:.2g}"),
+    page.Column("RSD", lambda row: page.relative_sigma(row.rsd)),
+    page.Column("what it holds", lambda row: page.shortened(row.expression, WORDS), number=False),
 )
 FED_FORWARD = {
     FEEDBACK: "feedback alone", CAD: "CAD fed forward", IDENTIFIED: "model fed forward",
@@ -131,7 +119,7 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
     return [*lines, *(f"  {note}".replace(":: ", ": ") for note in inputs.notes)]
 
 
-def outcome_section(outcome: IdentificationOutcome) -> Section:
+def outcome_section(outcome: IdentificationOutcome) -> page.Section:
     """Return the console's section on an identification: that of its certificate, without figures and parameters."""
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
     return certificate_section(
@@ -140,8 +128,8 @@ def outcome_section(outcome: IdentificationOutcome) -> Section:
 
 
 def certificate_section(
-    found: DynamicReport, drawn: Mapping[str, Pictures], exported: Sequence[str] = (), tolerance: float = 0.0
-) -> Section:
+    found: DynamicReport, drawn: Mapping[str, page.Pictures], exported: Sequence[str] = (), tolerance: float = 0.0
+) -> page.Section:
     """Return the section of a certificate: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
@@ -151,21 +139,21 @@ def certificate_section(
     """
     metrics, unseen = found.metrics, found.unseen
     pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
-    blocks: list[Block] = [_error_table(unseen), _interval_table(unseen)]
+    blocks: list[page.Block] = [_error_table(unseen), _interval_table(unseen)]
     blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
-    blocks.append(Text("The model", _model_sentences(metrics)))
-    blocks.append(Text("What the motion identifies", _identifiability(found)))
+    blocks.append(page.Text("The model", _model_sentences(metrics)))
+    blocks.append(page.Text("What the motion identifies", _identifiability(found)))
     blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
     note = "R marks parameters into which others are regrouped; complete table: 8-dynamics/estimate.csv."
-    blocks += [*pictures("parameters"), table("Identified parameters", PARAMETERS, found.estimate, note)]
+    blocks += [*pictures("parameters"), page.table("Identified parameters", PARAMETERS, found.estimate, note)]
     if metrics.loop:
-        blocks.append(Text("Closed loop", _loop_sentences(metrics.loop)))
+        blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(metrics.tracking, metrics.tracking_failure)
-    blocks.append(Text("What was exported", exported))
-    blocks.append(Text("Notes on the dynamics", list(dict.fromkeys((*metrics.warnings, *unseen.warnings))), "note"))
-    return Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))
+    warnings = list(dict.fromkeys((*metrics.warnings, *unseen.warnings)))
+    blocks += [page.Text("What was exported", exported), page.Text("Notes on the dynamics", warnings, "note")]
+    return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
@@ -176,7 +164,7 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
     return name, found, where
 
 
-def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure]:
+def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[page.KeyFigure]:
     """Return the torque errors that decide the verdict, of the worst unseen recording."""
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
@@ -189,9 +177,9 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
     worst, row = max(shares, default=(np.nan, "torque"))
     allowed = f"{tolerance:g} %" if tolerance else ""
     return [
-        KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
-        KeyFigure("the same in the motion's band", "", percent(band.total), "", basis),
-        KeyFigure(f"in that band, the worst row: {row}", "", percent(worst), "", basis),
+        page.KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
+        page.KeyFigure("the same in the motion's band", "", percent(band.total), "", basis),
+        page.KeyFigure(f"in that band, the worst row: {row}", "", percent(worst), "", basis),
     ]
 
 
@@ -205,14 +193,14 @@ def _rsd(percent: float) -> str:
     return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
-def _error_table(unseen: UnseenReport) -> Table:
+def _error_table(unseen: UnseenReport) -> page.Table:
     """Return the table of torque errors, per row and recording."""
     sets = {f"{name} (fitted)": one for name, one in unseen.fit.items()}
     for name, one in unseen.validation.items():
         sets[f"{name} ({'unseen' if one.evidence else 'repeat: no evidence'})"] = one
     groups = {label: _error_rows(one, unseen) for label, one in sets.items()}
     header = ("torque", "error", "in band", "moving", "standing", "torque above band", "rms", "ACF outside")
-    return grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
+    return page.grouped("Torque errors", header, groups, ERROR_NOTE, _of_all)
 
 
 def _error_rows(one: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
@@ -229,7 +217,7 @@ def _of_all(row: Sequence[str]) -> bool:
     return row[0] == "all"
 
 
-def _interval_table(unseen: UnseenReport) -> Table:
+def _interval_table(unseen: UnseenReport) -> page.Table:
     """Return the table of the predicted 95 % intervals' coverage, per row of unseen recordings; empty without any."""
     groups = {}
     for name, one in unseen.validation.items():
@@ -240,10 +228,10 @@ def _interval_table(unseen: UnseenReport) -> Table:
                 *((row, f"{inside:.0f} %", f"± {half:.3g} {unit}", "") for row, inside, half, unit in rows),
             ]
     header = ("torque", "errors within the 95 % interval", "median interval", "of the time extrapolated")
-    return grouped("Intervals stated", header, groups, strong=_of_all)
+    return page.grouped("Intervals stated", header, groups, strong=_of_all)
 
 
-def _friction_table(metrics: ModelMetrics) -> Table:
+def _friction_table(metrics: ModelMetrics) -> page.Table:
     """Return the table of friction models with their error on held-out time, of all rows and of each."""
 
     def shown(shares: Iterable[float], digits: int) -> str:
@@ -251,14 +239,14 @@ def _friction_table(metrics: ModelMetrics) -> Table:
 
     count = max(len(step.joints_percent) for step in metrics.ladder)
     columns = [
-        Column("friction", "{0.model}", number=False),
-        Column("p", "{0.parameters}"),
-        Column("total", lambda step: shown([step.cross_validated_percent], 2)),
-        *(Column(str(j + 1), lambda step, j=j: shown(step.joints_percent[j : j + 1], 1)) for j in range(count)),
-        Column("kept at joints", lambda step: ", ".join(map(str, step.kept_at_joints)) or step.note, number=False),
+        page.Column("friction", "{0.model}", number=False),
+        page.Column("p", "{0.parameters}"),
+        page.Column("total", lambda step: shown([step.cross_validated_percent], 2)),
+        *(page.Column(str(j + 1), lambda step, j=j: shown(step.joints_percent[j : j + 1], 1)) for j in range(count)),
+        page.Column("kept at joints", lambda step: ", ".join(map(str, step.kept_at_joints)) or step.note, number=False),
     ]
     title = "Ladder of friction models: relative error on held-out time [%]"
-    return table(title, columns, metrics.ladder, f"Chosen: {metrics.friction}.", lambda step: step.kept)
+    return page.table(title, columns, metrics.ladder, f"Chosen: {metrics.friction}.", lambda step: step.kept)
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
@@ -293,7 +281,7 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
     return lines
 
 
-def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[Block]:
+def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[page.Block]:
     """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest ones."""
     found = metrics.geometry
     if found is None:
@@ -305,9 +293,9 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
             f"{tilt.sigmas:.2g} of its sigma of torque noise"
         )
     known = [one for one in effects if one.matters == "yes" and None not in (one.sigma, one.shift_sigma)]
-    blocks: list[Block] = [Text("Geometry and dynamics", lines)]
+    blocks: list[page.Block] = [page.Text("Geometry and dynamics", lines)]
     if found.changed and known:
-        blocks.append(table("Which geometric errors matter for the dynamics", EFFECTS, known[:SHOWN]))
+        blocks.append(page.table("Which geometric errors matter for the dynamics", EFFECTS, known[:SHOWN]))
     return blocks
 
 
@@ -351,11 +339,11 @@ def _number(value: float, unit: str = "") -> str:
     return f"{value:.3g}{unit}" if np.isfinite(value) else "–"
 
 
-def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Block]:
+def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[page.Block]:
     """Return the blocks on the simulated tracking errors with the model as feedforward."""
     if failure:
         why = f"tracking with the model as feedforward was not simulated:  {failure}"
-        return [Text("Tracking, simulated", [why])]
+        return [page.Text("Tracking, simulated", [why])]
     if not replays:
         return []
     first = next(iter(replays.values()))
@@ -378,7 +366,7 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[Bl
     motion = "unseen motion" if first.unseen else "the training motion, which gives too small errors"
     lines.append(f"the simulated robot is the identified model plus the unexplained torque; {control}; {motion}{gain}")
     title = "Tracking, simulated: rms of q - reference [mrad or mm]"
-    return [grouped(title, ("fed forward", *joints), groups), Text("", lines)]
+    return [page.grouped(title, ("fed forward", *joints), groups), page.Text("", lines)]
 
 
 def _identifiability(found: DynamicReport) -> list[str]:

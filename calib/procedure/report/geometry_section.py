@@ -12,20 +12,8 @@ from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.report import page
 from calib.procedure.report.fit_report import Report
-from calib.procedure.report.page import (
-    Block,
-    Column,
-    KeyFigure,
-    Picture,
-    Pictures,
-    Section,
-    Table,
-    Text,
-    grouped,
-    relative_sigma,
-    table,
-)
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
@@ -35,27 +23,27 @@ MAX_POSES = 30  # repeated poses that are listed
 MAX_OUTLIERS = 20
 MAX_NAMED_OUTLIERS = 8  # outliers named in a sentence
 LADDER = (
-    Column("model", "{0.model}", number=False),
-    Column("parameters", lambda step: _counted(step)),
-    Column("cross-validated rms [mm]", lambda step: _numbered(step.cross_validated_mm, 4)),
-    Column("remark", "{0.note}", number=False),
+    page.Column("model", "{0.model}", number=False),
+    page.Column("parameters", lambda step: _counted(step)),
+    page.Column("cross-validated rms [mm]", lambda step: _numbered(step.cross_validated_mm, 4)),
+    page.Column("remark", "{0.note}", number=False),
 )
 OUTLIERS = (
-    Column("file", lambda each: Path(each.file).name, number=False),
-    Column("row", "{0.row}"),
-    Column("residual", "{0.nature}", number=False),
-    Column("size", "{0.size}"),
-    Column("robust sigmas", "{0.sigmas:.1f}"),
+    page.Column("file", lambda each: Path(each.file).name, number=False),
+    page.Column("row", "{0.row}"),
+    page.Column("residual", "{0.nature}", number=False),
+    page.Column("size", "{0.size}"),
+    page.Column("robust sigmas", "{0.sigmas:.1f}"),
 )
 REPEATED = (
-    Column("pose", "{0[0]}", number=False),
-    Column("cycles", lambda at: str(len(at[1].rows))),
-    Column("AP nominal [mm]", lambda at: f"{np.linalg.norm(at[1].nominal_mm):.3f}"),
-    Column("AP calibrated [mm]", lambda at: f"{np.linalg.norm(at[1].calibrated_mm):.3f}"),
-    Column("AP calibrated x, y, z [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
-    Column("RP [mm]", "{0[1].repeatability_mm:.3f}"),
-    Column("RP a, b, c [deg]", lambda at: ", ".join(f"{value:.4f}" for value in at[1].repeatability_deg)),
-    Column("vAP [mm]", lambda at: _numbered(at[1].multidirectional_mm, 3)),
+    page.Column("pose", "{0[0]}", number=False),
+    page.Column("cycles", lambda at: str(len(at[1].rows))),
+    page.Column("AP nominal [mm]", lambda at: f"{np.linalg.norm(at[1].nominal_mm):.3f}"),
+    page.Column("AP calibrated [mm]", lambda at: f"{np.linalg.norm(at[1].calibrated_mm):.3f}"),
+    page.Column("AP calibrated x, y, z [mm]", lambda at: ", ".join(f"{value:+.3f}" for value in at[1].calibrated_mm)),
+    page.Column("RP [mm]", "{0[1].repeatability_mm:.3f}"),
+    page.Column("RP a, b, c [deg]", lambda at: ", ".join(f"{value:.4f}" for value in at[1].repeatability_deg)),
+    page.Column("vAP [mm]", lambda at: _numbered(at[1].multidirectional_mm, 3)),
 )
 ISO_NOTE = (
     "After ISO 9283. AP: barycentre of a pose's cycles minus the command (pose by the arm's model, with station and "
@@ -85,42 +73,42 @@ def read_lines(inputs: Inputs) -> list[str]:
     return lines
 
 
-def outcome_section(metrics: FitMetrics) -> Section:
+def outcome_section(metrics: FitMetrics) -> page.Section:
     """Return the console's section on a fit: ladder, errors, repeated poses, findings, verdict."""
-    blocks: list[Block] = [_ladder_table(metrics), _error_table(metrics)]
+    blocks: list[page.Block] = [_ladder_table(metrics), _error_table(metrics)]
     sizes = [f"{label}: {_rms_words(found)}" for label, found in _sets(metrics)]
-    blocks.append(Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
+    blocks.append(page.Text("", [f"model {metrics.model}, {parameter_words(metrics)}", *sizes]))
     if metrics.advice and not any(metrics.advice in line for line in metrics.warnings):
-        blocks.append(Text("", [metrics.advice], "what to do"))
-    blocks += [Text("", _repeated_sentences(metrics)), Text("", outlier_sentences(metrics), "outliers")]
-    blocks += [Text("", metrics.warnings, "note"), Text("", metrics.not_identifiable, "identifiability")]
-    return Section("Geometry", blocks, metrics.verdict, metrics.reason)
+        blocks.append(page.Text("", [metrics.advice], "what to do"))
+    blocks += [page.Text("", _repeated_sentences(metrics)), page.Text("", outlier_sentences(metrics), "outliers")]
+    blocks += [page.Text("", metrics.warnings, "note"), page.Text("", metrics.not_identifiable, "identifiability")]
+    return page.Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
-def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section:
+def certificate_section(report: Report, drawn: Mapping[str, page.Picture]) -> page.Section:
     """Return the section of a certificate: errors, ladder, parameters, identifiability, figures, outliers.
 
     Args:
         drawn: figures by name (`geometry_figures.draw`); those that are not there are left out.
     """
     metrics = report.metrics
-    blocks: list[Block] = [_error_table(metrics), *iso9283_tables(metrics)]
+    blocks: list[page.Block] = [_error_table(metrics), *iso9283_tables(metrics)]
     blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
     blocks.append(_pictures("What remains", drawn, ("joints", "map")))
     blocks.append(_pictures("Image coverage", drawn, [name for name in drawn if name.startswith("coverage")]))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
-    blocks.append(Text("Identifiability", _identifiability(report)))
+    blocks.append(page.Text("Identifiability", _identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks.append(_parameter_table(report))
     if metrics.outliers:
         note = "Rows beyond 4 robust sigmas. They are part of the fit; a robust loss, if chosen, reduces their weight."
-        blocks.append(table("Outliers", OUTLIERS, metrics.outliers, note, most=MAX_OUTLIERS))
-    blocks.append(Text("Notes", metrics.warnings))
-    return Section("Geometry", blocks, metrics.verdict, metrics.reason, _key_figures(report))
+        blocks.append(page.table("Outliers", OUTLIERS, metrics.outliers, note, most=MAX_OUTLIERS))
+    blocks.append(page.Text("Notes", metrics.warnings))
+    return page.Section("Geometry", blocks, metrics.verdict, metrics.reason, _key_figures(report))
 
 
-def _key_figures(report: Report) -> list[KeyFigure]:
+def _key_figures(report: Report) -> list[page.KeyFigure]:
     """Return the errors that decide the verdict, before and after calibration.
 
     Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
@@ -151,16 +139,16 @@ def _key_figures(report: Report) -> list[KeyFigure]:
         spread = f"± {sigma:.2g} {unit}" if np.isfinite(sigma) else ""
         judged = metrics.tolerance_mm and before is proof.nominal.main
         allowed = f"{metrics.tolerance_mm:g} mm" if judged else ""
-        what = f"{label} {words}".strip()
-        result.append(
-            KeyFigure(f"{what}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
-        )
+        kinds = {"rms": (before.rms, after.rms, spread, basis, allowed)}
         if arm == next(iter(arms)):
-            result.append(KeyFigure(f"{what}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
+            kinds["largest"] = before.max, after.max, "", basis, ""
+        for kind, (one, two, *rest) in kinds.items():
+            what = f"{label} {words}".strip()
+            result.append(page.KeyFigure(f"{what}, {kind}", _size(one, unit), _size(two, unit), *rest))
     return result
 
 
-def _left_out(metrics: FitMetrics) -> KeyFigure | None:
+def _left_out(metrics: FitMetrics) -> page.KeyFigure | None:
     """Return the cross-validated errors of both arms; None if they did not decide the verdict (`validation.judge`)."""
     found, nominal = metrics.findings, metrics.fit.nominal.main
     if found is None or found.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
@@ -170,7 +158,7 @@ def _left_out(metrics: FitMetrics) -> KeyFigure | None:
     allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else ""
     alone = metrics.fit.judged(metrics.deliverable) is metrics.fit.urdf_alone
     after = _size(1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated), "mm")
-    return KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "cross-validated rows", allowed)
+    return page.KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "cross-validated rows", allowed)
 
 
 def _size(value: float, unit: str) -> str:
@@ -191,7 +179,7 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
     return [(f"fitted: {metrics.fit.poses} poses", metrics.fit), *unseen]
 
 
-def _error_table(metrics: FitMetrics) -> Table:
+def _error_table(metrics: FitMetrics) -> page.Table:
     """Return the table of errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
     sets = _sets(metrics)
     notes = ["Distances of pairs do not depend on the placement of instrument and tool."]
@@ -200,7 +188,7 @@ def _error_table(metrics: FitMetrics) -> Table:
     groups = {label: list(_error_rows(found)) for label, found in sets}
     calibrated = lambda row: row[1:2] == ("calibrated",)  # noqa: E731
     title = "Errors of the nominal and the calibrated arm"
-    return grouped(title, header, groups, " ".join(notes), calibrated, texts=2)
+    return page.grouped(title, header, groups, " ".join(notes), calibrated, texts=2)
 
 
 def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
@@ -215,10 +203,10 @@ def _error_rows(found: ComparedRows) -> Iterator[tuple[str, ...]]:
                 yield words if arm == "nominal" else "", ARMS[arm], *(f"{size:.4f}" for size in sizes)
 
 
-def _ladder_table(metrics: FitMetrics) -> Table:
+def _ladder_table(metrics: FitMetrics) -> page.Table:
     """Return the table of the models tried, with their errors on held-out rows."""
     note = f"Chosen: {metrics.model}, {parameter_words(metrics)}."
-    return table("Ladder of models", LADDER, metrics.ladder, note, lambda step: step.kept)
+    return page.table("Ladder of models", LADDER, metrics.ladder, note, lambda step: step.kept)
 
 
 def _counted(step: ModelStep) -> str:
@@ -245,7 +233,7 @@ def _rms_words(rows: ComparedRows) -> str:
     return f"rms {', '.join(f'{one.main.rms:.3f} mm {arm}' for arm, one in arms.items() if one and one.main)}"
 
 
-def _parameter_table(report: Report) -> Table:
+def _parameter_table(report: Report) -> page.Table:
     """Return the table of fitted parameters; if there are many joint corrections, without them."""
     shown = [row for row in report.parameters if len(report.parameters) <= MAX_ROWS or row.group != "deflection"]
     rows = []
@@ -254,13 +242,13 @@ def _parameter_table(report: Report) -> Table:
         digits = ".3f" if factor > 1 else ".4g"
         numbers = [f"{factor * number:{digits}}" for number in (row.nominal, row.value)]
         change = f"{factor * (row.value - row.nominal):+{digits}}"
-        rows.append((row.name, printed, *numbers, change, f"{factor * row.sigma:.2g}", relative_sigma(row.rsd)))
+        rows.append((row.name, printed, *numbers, change, f"{factor * row.sigma:.2g}", page.relative_sigma(row.rsd)))
     left = len(report.parameters) - len(shown)
     note = f"{left} joint corrections are listed in joint_corrections.csv." if left else ""
     if report.kept:
         note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
     header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
-    return Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
+    return page.Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
 
 
 def outlier_sentences(metrics: FitMetrics) -> list[str]:
@@ -295,8 +283,8 @@ def _identifiability(report: Report) -> list[str]:
     return lines
 
 
-def _pictures(title: str, drawn: Mapping[str, Picture], names: Sequence[str]) -> Pictures:
-    return Pictures(title, [drawn[name] for name in names if name in drawn])
+def _pictures(title: str, drawn: Mapping[str, page.Picture], names: Sequence[str]) -> page.Pictures:
+    return page.Pictures(title, [drawn[name] for name in names if name in drawn])
 
 
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:
@@ -305,13 +293,13 @@ def _repeated_sentences(metrics: FitMetrics) -> list[str]:
     return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
 
 
-def iso9283_tables(metrics: FitMetrics) -> list[Table]:
+def iso9283_tables(metrics: FitMetrics) -> list[page.Table]:
     """Return the tables of accuracy and repeatability after ISO 9283, one per set of rows with repeated poses."""
     result = []
     for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
         if iso := found.iso9283:
             title = f"Accuracy and repeatability, {name} ({iso9283_sentence(iso)})"
-            result.append(table(title, REPEATED, [*enumerate(iso.each, 1)], ISO_NOTE, most=MAX_POSES))
+            result.append(page.table(title, REPEATED, [*enumerate(iso.each, 1)], ISO_NOTE, most=MAX_POSES))
     return result
 
 

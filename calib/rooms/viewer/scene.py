@@ -1,11 +1,10 @@
 """The scene of a folder as plain arrays, shown by `calib.rooms.viewer.viewer`.
 
 A folder is that of a fit, an identification, an excitation, a planned motion, or a session that has several of them.
-All points are in the base of the arm that is drawn.
+All points are in the base of the arm that is drawn; its meshes are those of the URDF's ``<visual>`` elements.
 """
 
-import csv
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +21,45 @@ from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.measuring.run import is_run, rehearsed_samples
-from calib.records import shielded
+from calib.records import Frozen
 from calib.robot import calibrated, library
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
+from calib.robot.collision import find_mesh, urdf_meshes
+from calib.robot.formats.urdf_tree import numbers, origin
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.library import load, resolve
-from calib.rooms.viewer.visuals import Visual, visuals
 from calib.transforms import invert
+
+DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer shows
+
+
+@dataclass(frozen=True, eq=False)
+class Visual(Frozen):
+    """A mesh file that moves with a link: its placement (4, 4) in the link's frame, its scale (3,)."""
+
+    link: str
+    file: Path
+    placement: np.ndarray
+    scale: np.ndarray
+
+
+def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
+    """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing files.
+
+    Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse
+    the whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
+    """
+    places, found, missing = list(Path(path).resolve().parents), [], []
+    for link, visual, mesh in urdf_meshes(path, "visual"):
+        name = mesh.attributes.get("filename", "")
+        file = find_mesh(name, places)
+        if file is None or file.suffix.lower() not in DRAWABLE:
+            missing.append(name)
+            continue
+        scale = numbers(mesh, "scale", str(path), "1 1 1")
+        found.append(Visual(link.attributes.get("name", ""), file, origin(visual, str(path)), scale))
+    return found, missing
+
 
 FRAMES = 50.0  # positions of the arm per second of motion; our choice
 
@@ -38,7 +69,6 @@ class Measured:
     """m measured poses: where the target was seen, and where the two arms say it is.
 
     Attributes:
-        name: what they are.
         q: (m, n) [rad or m].
         seen, nominal, calibrated: (m, 3) [m].
         unseen: (m,) whether the row was kept from the fit.
@@ -46,7 +76,6 @@ class Measured:
             it [rad]; NaN where none was measured.
     """
 
-    name: str
     q: np.ndarray
     seen: np.ndarray
     nominal: np.ndarray
@@ -112,7 +141,7 @@ class Scene:
     chosen: tuple[tuple[str, np.ndarray], ...] = ()
     played: tuple[Played, ...] = ()
     torques: tuple[Torques, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
 
 def read(folder: str | Path, robot: str | None = None) -> Scene:
@@ -141,9 +170,13 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         chain,
         tuple(meshes),
         tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
-        tuple((path.stem, _chosen(path, chain)) for path in plans if not is_run(path)) if chain else (),
+        tuple(
+            (path.stem, read_poses(path, chain.joint_names, kinds=joint_kinds(chain)))
+            for path in plans
+            if chain and not is_run(path)
+        ),
         (
-            *(_rehearsed(path, chain) for path in plans if chain and is_run(path)),
+            *(Played(path.stem, *rehearsed_samples(path, chain)) for path in plans if chain and is_run(path)),
             *(_played(path, folder) for path in motions),
         ),
         tuple(_torques(path, folder, chain) for path in torques),
@@ -191,61 +224,44 @@ def _meshes(chain: Chain | None, source: Path | None) -> tuple[list[Visual], lis
     return known, [words] if words else []
 
 
-def _chosen(path: Path, chain: Chain) -> np.ndarray:
-    return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
-
-
 def _measured(place: Path) -> Measured:
     """Return the measured positions of ``residuals.csv``, with the predictions of both arms."""
     after, before = installation.read_arms(place)
-    with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
-        known = set(map(shielded, after.station_names))
-        rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in known]
-    joints = [shielded(f"{joint.name} [{joint.unit}]") for joint in after.chain.joints]
-    q = np.array([[float(row[name]) for name in joints] for row in rows]).reshape(-1, after.chain.n)
-    miss = 1e-3 * np.array([[float(row[f"d{axis} [mm]"]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
-    seen, nominal, modelled = (np.zeros((len(rows), 3)) for _ in range(3))
-    for s, t, own in _groups(rows, after):
+    table = read_table(FitFolder(place).residuals)
+    positions = ~np.isnan(table.numbers("dx", "length", gaps=True))
+    table = table.where(positions & np.isin(table.texts("station"), after.station_names))
+    q = np.column_stack([table.numbers(joint.name, "joint") for joint in after.chain.joints])
+    miss, turned = _triples(table, "d", "length"), np.full((len(q), 3), np.nan)
+    if "drx" in table:
+        turned = _triples(table, "dr", "angle")
+    seen, nominal, modelled = (np.zeros((len(q), 3)) for _ in range(3))
+    stations, tools = np.array(table.texts("station")), np.array(table.texts("tool"))
+    for station, tool in sorted(set(zip(stations.tolist(), tools.tolist()))):
+        own = np.flatnonzero((stations == station) & (tools == tool))
+        s, t = after.station_names.index(station), after.tool_names.index(tool)
         base = invert(after.stations[s])
         modelled[own] = _points(after, q[own], s, t) @ base[:3, :3].T + base[:3, 3]
         seen[own] = modelled[own] + miss[own] @ base[:3, :3].T
-        known = after.station_names[s] in before.station_names
-        there = _points(before, q[own], s, t) if known else _points(replace(after, chain=before.chain), q[own], s, t)
-        nominal[own] = there @ base[:3, :3].T + base[:3, 3]
-    unseen = np.array([row["set"] != "fit" for row in rows], dtype=bool)
-    turns = [[float(row.get(f"dr{axis} [deg]") or "nan") for axis in "xyz"] for row in rows]
-    return Measured("measured", q, seen, nominal, modelled, unseen, np.radians(turns).reshape(-1, 3))
+        drawn = before if station in before.station_names else replace(after, chain=before.chain)
+        nominal[own] = _points(drawn, q[own], s, t) @ base[:3, :3].T + base[:3, 3]
+    return Measured(q, seen, nominal, modelled, np.array(table.texts("set")) != "fit", turned)
+
+
+def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
+    """Return the columns x, y, z of a table whose names begin with `head`, as (m, 3) in SI; NaN where empty."""
+    return np.column_stack([table.numbers(f"{head}{axis}", dimension, gaps=True) for axis in "xyz"])
 
 
 def _joined(fitted: Measured, errors: Path) -> Measured:
     """Return fitted rows followed by a session's unseen rows."""
-    if not errors.is_file():
+    table = read_table(errors) if errors.is_file() else ()
+    if not isinstance(table, Table) or "x" not in table:  # written by an earlier version
         return fitted
-    table = read_table(errors)
-    if "x" not in table:  # written by an earlier version
-        return fitted
-    known = ~np.isnan(table.numbers("x", "length", gaps=True))
-    triples = [
-        np.column_stack([table.numbers(f"{head}{axis}", "length", gaps=True) for axis in "xyz"])[known]
-        for head in ("", "to_nominal_", "to_calibrated_")
-    ]
-    n = fitted.q.shape[1]
-    q = np.column_stack([table.numbers(name, "joint") for name in table.header[2 : 2 + n]])[known]
-    return Measured(
-        fitted.name,
-        np.vstack([fitted.q, q]),
-        np.vstack([fitted.seen, triples[0]]),
-        np.vstack([fitted.nominal, triples[0] + triples[1]]),
-        np.vstack([fitted.calibrated, triples[0] + triples[2]]),
-        np.concatenate([fitted.unseen, np.ones(len(q), dtype=bool)]),
-        np.vstack([fitted.turned, np.full((len(q), 3), np.nan)]),
-    )
-
-
-def _groups(rows: list[dict[str, str]], cell: Installation) -> list[tuple[int, int, np.ndarray]]:
-    """Return station, tool and indices of the rows that share them."""
-    keys = [(cell.station_names.index(r["station"]), cell.tool_names.index(r["tool"])) for r in rows]
-    return [(s, t, np.array([k for k, key in enumerate(keys) if key == (s, t)])) for s, t in sorted(set(keys))]
+    table = table.where(~np.isnan(table.numbers("x", "length", gaps=True)))
+    seen, *away = (_triples(table, head, "length") for head in ("", "to_nominal_", "to_calibrated_"))
+    q = np.column_stack([table.numbers(name, "joint") for name in table.header[2 : 2 + fitted.q.shape[1]]])
+    unseen = q, seen, *(seen + one for one in away), np.ones(len(q), dtype=bool), np.full((len(q), 3), np.nan)
+    return Measured(*map(np.concatenate, zip(vars(fitted).values(), unseen)))
 
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
@@ -261,11 +277,6 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
     return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
 
 
-def _rehearsed(path: Path, chain: Chain) -> Played:
-    """Return a planned measuring run: poses and the motions between them."""
-    return Played(path.stem, *rehearsed_samples(path, chain))
-
-
 def _played(path: Path, folder: Path) -> Played:
     table = read_table(path)
     return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), table.block("v"))
@@ -274,9 +285,9 @@ def _played(path: Path, folder: Path) -> Played:
 def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
     table = read_table(path)
     measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
-    t = table.cells[table.index("t")]
+    t = np.asarray(table.cells[table.index("t")], dtype=float)
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
-    return Torques(_name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, table.block("q"))
+    return Torques(_name(path, folder), rows, units, t, measured, predicted, table.block("q"))
 
 
 def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -19,7 +19,7 @@ from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.rooms.viewer import scene as viewing
 from calib.rooms.viewer import viewer
-from calib.rooms.viewer.visuals import visuals
+from calib.rooms.viewer.scene import visuals
 
 
 @pytest.fixture(scope="module")
