@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from os.path import realpath
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -144,7 +144,7 @@ def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
 
 def errors_of(
     inputs: IdentificationInputs,
-    dynamics: Dynamics,
+    dynamics: Dynamics[Any],
     errors: TorqueErrorModel | None = None,
     say: Progress = lambda words: None,
 ) -> Errors:
@@ -159,9 +159,10 @@ def errors_of(
         predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
     expected: dict[str, TorqueIntervals] = {}
-    for case in () if errors is None else inputs.unseen or inputs.cases[:1]:
-        say(f"errors to expect of {case.name}")
-        expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
+    if errors is not None:
+        for case in inputs.unseen or inputs.cases[:1]:
+            say(f"errors to expect of {case.name}")
+            expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     stated = {name: one.coverage() for name, one in expected.items()}
     validation = {
