@@ -34,12 +34,14 @@ from calib.robot.formats import urdf_write
 from calib.robot.library import load
 from calib.robot.tables import dumps
 from calib.rooms.camera.board import Board, read_board, write_board
-from calib.rooms.camera.lens import pinhole, read_lens, write_lens
+from calib.rooms.camera.lens import Lens, read_lens, write_lens
 from calib.rooms.camera.pictures.board_print import raster
 from calib.rooms.camera.pictures.detection import detect
 from calib.rooms.camera.pictures.images import decode as read_image_of
 from calib.rooms.camera.pictures.images import read_image
 from calib.rooms.camera.pixels import Found, read_corners, write_corners
+
+LENS = Lens("pinhole", np.array([900.0, 900.0, 319.5, 239.5, 0, 0, 0, 0, 0]), (640, 480))
 
 CHECKS = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 FEW = settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=CHECKS)
@@ -152,7 +154,7 @@ KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], Any]]] = {
     "corners": ("corners.csv", corner_table, lambda path: read_corners(path, BOARD)),
     "board": ("board.toml", lambda tmp: write_board(BOARD, tmp / "made_board.toml").read_bytes(), read_board),
     "camera": (
-        "camera.yaml", lambda tmp: write_lens(pinhole(900.0, (640, 480)), tmp / "made.yaml").read_bytes(), read_lens,
+        "camera.yaml", lambda tmp: write_lens(LENS, tmp / "made.yaml").read_bytes(), read_lens,
     ),
     "bag": ("b.mcap", bag, lambda path: read_recording(path, Joints(JOINTS))),
 }  # fmt: skip

@@ -276,7 +276,7 @@ def test_a_board_of_another_square_is_refused_with_its_size():
 def test_images_from_one_direction_do_not_tell_the_focal_length():
     cell, _ = study()
     q = camera.views(cell, 12, 0, camera.Views((0.35, 0.4), 0.01))
-    with pytest.raises(MeasurementError, match=r"focal length is identified to .* tilt it"):
+    with pytest.raises(MeasurementError, match=r"focal length is identified .* tilt it"):
         complete_camera(cell.cell.nominal, camera.photograph(cell, q, 0.05, 0))
     with pytest.raises(MeasurementError, match="1 image with a board: a lens takes 4"):
         complete_camera(cell.cell.nominal, take(study()[1], [0]))

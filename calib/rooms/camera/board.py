@@ -15,7 +15,7 @@ Squares are counted, not inner corners::
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from calib import files
 from calib.config import parse, read_toml, strict
 from calib.config_types import OneOf, Real, Whole
 from calib.data.poses import BOARD
-from calib.errors import UsageError, require
+from calib.errors import require
 
 KINDS = ("charuco", "chessboard", "apriltag")
 DICTIONARIES = (
@@ -86,18 +86,6 @@ class Board:
         """Short description of the board."""
         what = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
         return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
-
-    def checked(self) -> Board:
-        """Return this board after the checks of a board file.
-
-        Raises:
-            ValueError: where a value cannot be.
-        """
-        return parse(Board, asdict(self), "board", _Refused)
-
-
-class _Refused(UsageError, ValueError):
-    """Error for an impossible board."""
 
 
 def corners(board: Board) -> np.ndarray:

@@ -31,7 +31,6 @@ NAMES = {
     "pinhole": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-PLAIN = 9  # values of a pinhole without the rational model's denominator
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,45 +79,24 @@ class Lens:
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixels (N, 2) of points (N, 3) [m] in the camera's frame."""
-        return _projected(self, points, False)[0]
+        return self.project_with_slopes(points)[0]
 
     def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k)."""
-        return _projected(self, points, True)
+        depth, focal = points[:, 2], self.values[:2]
+        plane = points[:, :2] / depth[:, None]
+        bent, across, by_value = BEND[self.model](plane, self.values[4:])
+        by_point = np.empty((len(points), 2, 3))
+        by_point[:, :, :2] = across / depth[:, None, None]
+        by_point[:, :, 2] = -np.einsum("nij,nj->ni", across, plane) / depth[:, None]
+        result = np.zeros((len(points), 2, len(self.values)))
+        result[:, 0, 0], result[:, 1, 1] = bent[:, 0], bent[:, 1]
+        result[:, 0, 2] = result[:, 1, 3] = 1.0
+        result[:, :, 4:] = by_value * focal[:, None]
+        return bent * focal + self.values[2:4], by_point * focal[:, None], result
 
 
-def pinhole(focal: float, size: tuple[int, int], distortion: tuple[float, ...] = ()) -> Lens:
-    """Return a pinhole lens with square pixels and the principal point at the image centre.
-
-    Args:
-        focal: [px].
-        size: width and height [px].
-        distortion: k1 k2 p1 p2 k3, from the first on.
-    """
-    middle = 0.5 * (size[0] - 1), 0.5 * (size[1] - 1)
-    return Lens("pinhole", np.array([focal, focal, *middle, *distortion, *[0.0] * (5 - len(distortion))]), size)
-
-
-def _projected(lens: Lens, points: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    depth = points[:, 2]
-    plane = points[:, :2] / depth[:, None]
-    bend = _fisheye if lens.model == "fisheye" else _brown_conrady
-    bent, across, by_value = bend(plane, lens.values[4:], slopes)
-    focal = lens.values[:2]
-    pixel = bent * focal + lens.values[2:4]
-    if not slopes:
-        return pixel, np.empty(0), np.empty(0)
-    by_point = np.empty((len(points), 2, 3))
-    by_point[:, :, :2] = across / depth[:, None, None]
-    by_point[:, :, 2] = -np.einsum("nij,nj->ni", across, plane) / depth[:, None]
-    result = np.zeros((len(points), 2, len(lens.values)))
-    result[:, 0, 0], result[:, 1, 1] = bent[:, 0], bent[:, 1]
-    result[:, 0, 2] = result[:, 1, 3] = 1.0
-    result[:, :, 4:] = by_value * focal[:, None]
-    return pixel, by_point * focal[:, None], result
-
-
-def _brown_conrady(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return distorted coordinates (N, 2) and their derivatives by undistorted ones (N, 2, 2) and k (N, 2, len(k))."""
     a, b = plane[:, 0], plane[:, 1]
     square = a * a + b * b
@@ -129,8 +107,6 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.n
     scale = above / below
     tangent = np.stack([2 * p1 * a * b + p2 * (square + 2 * a * a), p1 * (square + 2 * b * b) + 2 * p2 * a * b], axis=1)
     bent = plane * scale[:, None] + tangent
-    if not slopes:
-        return bent, np.empty(0), np.empty(0)
     steep = (k1 + square * (2 * k2 + 3 * k3 * square)) / below
     steep -= scale * (k4 + square * (2 * k5 + 3 * k6 * square)) / below
     across = np.empty((len(plane), 2, 2))
@@ -148,7 +124,7 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.n
     return bent, across, by_value
 
 
-def _fisheye(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fisheye(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return distorted coordinates and derivatives of a fisheye lens, as `_brown_conrady`."""
     r = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
     angle = np.arctan(r)
@@ -156,12 +132,13 @@ def _fisheye(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray
     long = angle * (1.0 + powers @ k)
     scale = long / r
     bent = plane * scale[:, None]
-    if not slopes:
-        return bent, np.empty(0), np.empty(0)
     steep = (1.0 + (powers * np.array([3, 5, 7, 9])) @ k) / (1.0 + r * r)  # d long / d r
     unit = plane / r[:, None]
     across = scale[:, None, None] * np.eye(2) + (steep - scale)[:, None, None] * unit[:, :, None] * unit[:, None, :]
     return bent, across, unit[:, :, None] * (angle[:, None] * powers)[:, None, :]
+
+
+BEND = {"pinhole": _brown_conrady, "fisheye": _fisheye}
 
 
 def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
@@ -173,10 +150,9 @@ def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
         plane = wanted * start[:, None]
     else:
         plane = wanted.copy()
-    bend = _fisheye if lens.model == "fisheye" else _brown_conrady
     iterations = 20  # of the inverse; Newton's, so that a handful does
     for _ in range(iterations):
-        bent, across, _ = bend(plane, lens.values[4:], True)
+        bent, across, _ = BEND[lens.model](plane, lens.values[4:])
         error = bent - wanted
         determinant = across[:, 0, 0] * across[:, 1, 1] - across[:, 0, 1] * across[:, 1, 0]
         determinant = np.where(np.abs(determinant) < 1e-9, np.nan, determinant)

@@ -193,15 +193,11 @@ class View:
 
 def shaped_points(board: Board, shape: BoardShape, points: np.ndarray) -> np.ndarray:
     """Return the positions of a corner table's points (N, 3) [m] on the printed board."""
-    return _shaped(board, shape, points)[0]
+    return shape_slopes(board, shape, points)[0]
 
 
 def shape_slopes(board: Board, shape: BoardShape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (N, 3) [m] on the printed board, and their derivatives by the four values (N, 3, 4)."""
-    return _shaped(board, shape, points)
-
-
-def _shaped(board: Board, shape: BoardShape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x, y = (points[:, :2] - 0.5 * np.array(board.extent)).T
     slope = np.zeros((len(points), 3, 4))
     slope[:, :2, 0] = points[:, :2]

@@ -20,12 +20,12 @@ from calib import files
 from calib.data.poses import BOARD, IN_HAND, JOINTS
 from calib.errors import CannotSimulate
 from calib.geometry.installation import Installation
-from calib.geometry.inverse import Goal, reach, seen_at
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import forward
 from calib.rooms.camera import board as boards
 from calib.rooms.camera.board import Board, corners
+from calib.rooms.camera.camera_view import CameraView
 from calib.rooms.camera.lens import Lens, write_lens
 from calib.rooms.camera.optics import BoardShape, Optics, shaped_points
 from calib.rooms.camera.pixels import Pixels
@@ -41,7 +41,6 @@ FIVE_MEGAPIXEL = Lens(
     "pinhole", np.array([2400.0, 2405.0, 1220.0, 1010.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (2448, 2048)
 )  # an 8 mm lens before 3.45 µm pixels, about
 RANGE, TILT = (0.35, 0.8), 0.7  # distance [m] and largest tilt [rad] of what is looked at; our choice
-TRIES = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +132,7 @@ def board_poses(found: CameraCell, q: np.ndarray) -> np.ndarray:
 
 
 def views(
-    found: CameraCell,
-    count: int,
-    seed: int | np.random.Generator = 0,
-    sought: Views | None = None,
-    free: Callable[[np.ndarray], np.ndarray] | None = None,
+    found: CameraCell, count: int, seed: int | np.random.Generator = 0, sought: Views | None = None
 ) -> np.ndarray:
     """Return joint values (count, n) at random within the limits, with the board in the camera's view.
 
@@ -146,43 +141,20 @@ def views(
         count: how many.
         seed: of the draw.
         sought: which views.
-        free: q (m, n) -> (m,) bool, where the arm may be; None for anywhere.
 
     Raises:
         CannotSimulate: where hardly any are found.
     """
-    sought, rng, arm = sought or Views(), np.random.default_rng(seed), found.cell.nominal
-    lower, upper = arm.sampling_limits()
-    goal = Goal(replace(found.cell.truth, chain=arm, deflection=Deflection()), 6, lower, upper)
-    result = np.zeros((0, arm.n))
-    for _ in range(TRIES):
-        wanted = _random_views(found, 4 * count, rng, sought)
-        targets = invert(wanted) if found.mounting == IN_HAND else wanted
-        q = reach(goal, targets, rng.uniform(lower, upper, (len(targets), arm.n)), 40)
-        there = np.linalg.norm(seen_at(goal, q).poses() - targets, axis=(1, 2)) < 1e-3
-        q = q[there]
-        seen = visible(found, q)
-        q = q[seen.all(axis=1) if sought.whole else seen.sum(axis=1) >= 12]
-        result = np.concatenate([result, q if free is None else q[free(q)]])
-        if len(result) >= count:
-            return result[:count]
-    raise CannotSimulate(f"the camera sees the board at hardly any posture of the arm ({len(result)} of {count} found)")
+    sought, arm = sought or Views(), found.cell.nominal
+    near, far = sought.distance if found.mounting == IN_HAND else (2.0 * sought.distance[0], 3.0 * sought.distance[1])
+    cell = replace(found.cell.truth, chain=arm, deflection=Deflection())
+    view = CameraView(cell, found.board, found.mounting, sought.tilt, (near, far), 0.0)
 
-
-def _random_views(found: CameraCell, count: int, rng: np.random.Generator, sought: Views) -> np.ndarray:
-    """Return random poses (count, 4, 4) of the board in front of the camera, with its centre well inside the image."""
-    lens, middle = found.lens, 0.5 * np.array([*found.board.extent, 0.0])
-    if found.mounting != IN_HAND:
-        sought = replace(sought, distance=(2.0 * sought.distance[0], 3.0 * sought.distance[1]))
-    turn = Rotation.from_rotvec(np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0]))
-    about = rng.uniform(-np.pi, np.pi, count)
-    lean = sought.tilt * np.sqrt(rng.uniform(0.0, 1.0, count))
-    tilt = Rotation.from_rotvec(lean[:, None] * np.column_stack([np.cos(about), np.sin(about), np.zeros(count)]))
-    rotation = (tilt * turn).as_matrix()
-    depth = rng.uniform(*sought.distance, count)
-    share = rng.uniform(-0.7, 0.7, (count, 2)) * 0.5 * np.array(lens.size) / lens.values[:2]
-    place = np.column_stack([share * depth[:, None], depth])
-    return pose(rotation, place - rotation @ middle)
+    least = len(corners(found.board)) if sought.whole else 12
+    q = view.draw(count, lambda each: visible(found, each).sum(axis=1) >= least, *arm.sampling_limits(), seed)
+    if len(q) < count:
+        raise CannotSimulate(f"the camera sees the board at hardly any posture of the arm ({len(q)} of {count} found)")
+    return q
 
 
 def visible(found: CameraCell, q: np.ndarray) -> np.ndarray:
@@ -237,7 +209,7 @@ def take_pictures(
         imaging: light, focus and noise.
         seed: of all noise.
         moving: (m, n) how far the joints move during the exposure [rad or m]; None: the arm stands still.
-        say: called with each image's name.
+        say: called with a line on each image.
     """
     from calib.rooms.camera.pictures.images import write_image
     from calib.rooms.cells.rendered_camera import render
@@ -248,7 +220,7 @@ def take_pictures(
     names = [f"{k + 1:04}.png" for k in range(len(q))]
     for k, name in enumerate(names):
         if say:
-            say(name)
+            say(f"rendering {folder.name}/{name}")
         way = q[k : k + 1]
         if moving is not None and moving[k].any():
             way = q[k] + np.linspace(-0.5, 0.5, 7)[:, None] * moving[k]

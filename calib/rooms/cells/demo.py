@@ -106,14 +106,9 @@ def run(
         return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
     before, after = _compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started
-    return DemoResult(
-        session, session.verdicts().level, _results(session), seconds, (), before, after, _largest_memory()
-    )
-
-
-def _largest_memory() -> float:
-    """Return the largest resident set of this process so far [MB]; the system reports kB on Linux, bytes on macOS."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
+    unit = 2.0**20 if sys.platform == "darwin" else 2.0**10  # the system counts in bytes on macOS, in kB on Linux
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    return DemoResult(session, session.verdicts().level, _results(session), seconds, (), before, after, memory)
 
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
@@ -189,8 +184,7 @@ def simulate_next(folder: Path, say: Say) -> None:
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
         if waiting is None:
-            seen = _camera_of(session)
-            _compare_with_truth(session, _cell_of(session) if seen is None else seen.cell, say)
+            _compare_with_truth(session, _cells_of(session)[0], say)
             return
         if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: {command_line('next', folder)}")
@@ -198,24 +192,22 @@ def simulate_next(folder: Path, say: Say) -> None:
     say(f"next: {command_line('next', folder)}")
 
 
-def _cell_of(session: Session) -> Cell:
-    """Return the virtual cell of a session of the demonstration."""
-    return virtual_cell(session.settings.robot.given, session.settings.seed)
-
-
-def _camera_of(session: Session) -> CameraCell | None:
-    """Return the virtual cell with a camera if the session's instrument is a camera."""
-    return seen_by_camera(_cell_of(session)) if session.settings.instrument.measures == IMAGES else None
+def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
+    """Return the virtual cell of a session, and the same with its camera if the instrument is a camera."""
+    cell = virtual_cell(session.settings.robot.given, session.settings.seed)
+    if session.settings.instrument.measures != IMAGES:
+        return cell, None
+    seen = seen_by_camera(cell)
+    return seen.cell, seen
 
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
     """Simulate the files that a step waits for."""
-    seed, cell, seen = session.settings.seed, _cell_of(session), _camera_of(session)
+    seed, (cell, seen) = session.settings.seed, _cells_of(session)
     if step in ("measure", "validate") and seen is not None:
         _mark(session, seen.cell.note)
         for number, name, q in planned_poses(session.folder, cell.nominal):
-            tell = partial(_rendering, progress, name)
-            take_pictures(seen, q, session.path(f"3-measured/{name}"), seed=seed + number, say=tell)
+            take_pictures(seen, q, session.path(f"3-measured/{name}"), seed=seed + number, say=progress)
         say("    (the simulated camera takes an image at every pose of both lists)")
     elif step in ("measure", "validate"):
         simulate_measurements(session, cell, seed)
@@ -225,10 +217,6 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda wor
         say("    (the simulated arm plays both motions)")
     else:
         raise SessionError(f"the demonstration cannot simulate the files of {step} needs")
-
-
-def _rendering(progress: Say, name: str, image: str) -> None:
-    progress(f"rendering {name}/{image}")
 
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:

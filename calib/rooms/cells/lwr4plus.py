@@ -7,6 +7,7 @@ arm in the camera's frame, frame 8 places the LED fixture behind joint 7.
 from functools import cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.robot import description, library
 from calib.robot.chain import Chain
@@ -23,10 +24,8 @@ POSES, BASE_PARAMETERS, CONDITION = 17, 32, 11.1878
 
 def transform(alpha: float, d: float, theta: float, r: float) -> np.ndarray:
     """Return Rot_x(alpha) Trans_x(d) Rot_z(theta) Trans_z(r), (4, 4)."""
-    ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
-    about_z = np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, 1.0]])
-    return pose(about_x, about_x @ [d, 0.0, 0.0]) @ pose(about_z, [0.0, 0.0, r])
+    about_x, about_z = Rotation.from_euler("x", alpha), Rotation.from_euler("z", theta)
+    return pose(about_x, [d, 0.0, 0.0]) @ pose(about_z, [0.0, 0.0, r])
 
 
 @cache

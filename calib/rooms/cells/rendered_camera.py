@@ -90,7 +90,8 @@ def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, 
     if np.any(high <= low):
         return result
     scale = SUB * float(np.max(lens.values[:2]) / seen[:, 2].min())
-    sheet, per_metre = _sheet(board, scale)
+    level = int(np.ceil(np.log(scale) / np.log(1.25)))
+    sheet, per_metre = _sheet_at(board, level), 1.25**level
     place = _on_sheet(board, lens, pose, shape, low, high)
     x, y = (((place[:, :, axis] + PAPER) * per_metre - 0.5).astype(np.float32) for axis in (0, 1))
     fine = cv2.remap(sheet, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=background)
@@ -102,12 +103,6 @@ def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, 
 @lru_cache(maxsize=4)
 def _sheet_at(board: Board, level: int) -> np.ndarray:
     return raster(board, 1.25**level, PAPER)
-
-
-def _sheet(board: Board, wanted: float) -> tuple[np.ndarray, float]:
-    """Return the board's raster at the next resolution level, and its pixels per metre."""
-    level = int(np.ceil(np.log(wanted) / np.log(1.25)))
-    return _sheet_at(board, level), 1.25**level
 
 
 def _outline(board: Board) -> np.ndarray:

@@ -99,11 +99,6 @@ def _median(header: str, figure: str) -> Column:
     return Column(header, lambda one: _short(one.figures[figure].median))
 
 
-def _quartiles(one: MethodSummary) -> str:
-    found = one.figures["torque_error"]
-    return f"{_short(found.lower)}–{_short(found.upper)}"
-
-
 def _mark(one: MethodSummary) -> str:
     return "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
 
@@ -113,7 +108,7 @@ COLUMNS = (
     Column("trials", "{0.trials}"),
     Column("failed", lambda one: ", ".join(f"{count} {status}" for status, count in one.failures.items()) or "0"),
     _median("torque [%]", "torque_error"),
-    Column("quartiles", _quartiles),
+    Column("quartiles", lambda one: "–".join(map(_short, one.figures["torque_error"][1:3]))),
     _median("worst joint [%]", "torque_worst"),
     _median("β [%]", "beta_error"),
     _median("in σ", "beta_sigma"),
@@ -216,10 +211,9 @@ def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], li
     lines: list[list[object]] = []
     for one in conditions:
         for method in one.methods:
-            figures = [method.figures[name] for name in FIGURES]
-            spreads = [value for one in figures for value in (one.median, one.lower, one.upper)]
             flags = ["yes" if flag else "no" for flag in (method.as_good, method.chosen)]
             head = [one.condition.name, method.method, method.trials, sum(method.failures.values()), method.rank]
+            spreads = [value for name in FIGURES for value in method.figures[name][:3]]
             lines.append([*head, *flags, method.p, *spreads])
     return header, lines
 
@@ -264,7 +258,6 @@ class StudyOutcome:
     """Result of a study.
 
     Attributes:
-        study: what was asked.
         conditions: what the rows say, condition by condition.
         progress: of this command.
         notes: what a user should know.
@@ -272,7 +265,6 @@ class StudyOutcome:
         rows: which file holds how many rows, in words; "" where nothing was run.
     """
 
-    study: Study
     conditions: tuple[ConditionSummary, ...]
     progress: Progress
     notes: tuple[str, ...]
@@ -348,17 +340,15 @@ def run_study(
             f"nothing to report: {out} holds {there}; "
             + ("run the study first, or name its folder (--out)" if report_only else "ask for runs (--runs, runs)")
         )
-    if versions := sorted({row.toolkit for row in own}):
-        notes += [f"rows were made by several versions: {', '.join(versions)}"] if len(versions) > 1 else []
+    if len(versions := sorted({row.toolkit for row in own})) > 1:
+        notes.append(f"rows were made by several versions: {', '.join(versions)}")
     if progress.lost:
         notes.append(f"{progress.lost} trials were lost with their workers; run the same command again")
     conditions = tuple(summary.summarise(study, own))
     notes += reasons(conditions)
-    header, lines = summary_table(conditions)
-    files.write_table(out / SUMMARY, header, lines)
-    page = make_page(study, conditions, own, notes, plots)
-    files.write(out / REPORT, page)
-    return StudyOutcome(study, conditions, progress, tuple(notes), out, settled)
+    files.write_table(out / SUMMARY, *summary_table(conditions))
+    files.write(out / REPORT, make_page(study, conditions, own, notes, plots))
+    return StudyOutcome(conditions, progress, tuple(notes), out, settled)
 
 
 def _check_folder(out: Path, named: Sequence[str | Path]) -> None:

@@ -13,6 +13,7 @@ taken that is cheap: no more than `ALIKE` times the processor time of the cheape
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import binomtest
@@ -28,8 +29,7 @@ FIGURES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Quartiles:
+class Quartiles(NamedTuple):
     """Median and quartiles of a figure over runs; failures count as infinite errors, and are excluded otherwise."""
 
     median: float
@@ -122,7 +122,8 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
 
 
 def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
-    errors = {name: {row.seed: _error(row) for row in own} for name, own in rows.items()}
+    lost = float("inf")  # error of a trial without an estimate
+    errors = {name: {row.seed: row.torque_error if row.found else lost for row in own} for name, own in rows.items()}
     plain = [_summary(name, own) for name, own in rows.items()]
     plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
     if not plain:
@@ -147,10 +148,6 @@ def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
     """Return the median of a method's error over another's on the same data sets; infinite without common data sets."""
     both = [(one[seed], other[seed]) for seed in one.keys() & other.keys() if np.isfinite(other[seed])]
     return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
-
-
-def _error(row: TrialRow) -> float:
-    return row.torque_error if row.found else float("inf")
 
 
 def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:

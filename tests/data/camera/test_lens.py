@@ -6,7 +6,7 @@ import pytest
 from differences import check
 
 from calib.errors import CalibError, MeasurementError
-from calib.rooms.camera.lens import Lens, pinhole, rays, read_lens, write_lens
+from calib.rooms.camera.lens import Lens, rays, read_lens, write_lens
 
 SIZE = (800, 600)
 BASE = [780.0, 782.0, 400.0, 298.0]
@@ -43,7 +43,8 @@ def test_derivatives_and_the_inverse(name):
 
 
 def test_a_point_where_the_distortion_turns_back_is_out_of_sight():
-    strong = pinhole(400.0, SIZE, (-0.4,))  # r (1 - 0.4 r²) falls again beyond r = 0.91
+    # r (1 - 0.4 r²) falls again beyond r = 0.91
+    strong = Lens("pinhole", np.array([400.0, 400.0, *BASE[2:], -0.4, 0, 0, 0, 0]), SIZE)
     inside, beyond = np.array([[0.3, 0.0, 1.0]]), np.array([[1.5, 0.0, 1.0]])
     assert np.all(strong.project(beyond) < SIZE)
     assert strong.in_sight(np.concatenate([inside, beyond, -inside])).tolist() == [True, False, False]

@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 
 from calib import files
+from calib.config import parse
 from calib.data.poses import BOARD
-from calib.errors import CalibError, UsageError, refused_as, require
+from calib.errors import CalibError, UsageError, require
 from calib.rooms.camera.board import KINDS, MIN_CORNERS, Board, corners, read_board, write_board
 from calib.rooms.camera.pictures.images import quiet
 
@@ -34,21 +35,14 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
 def _black(board: Board) -> np.ndarray:
     """Return the black rectangles (N, 4) of a board: x, y, width, height [m] in its frame."""
     side, found = board.square, []
-    if board.kind != "apriltag":
-        found += [
-            np.array([[c * side, r * side, side, side]])
-            for r in range(board.rows) for c in range(board.columns) if (r + c) % 2 == 0
-        ]  # fmt: skip
-    places = []
-    if board.kind == "charuco":
-        margin = 0.5 * (side - board.marker)
-        places = [
-            (c * side + margin, r * side + margin, board.marker)
-            for r in range(board.rows) for c in range(board.columns) if (r + c) % 2 == 1
-        ]  # fmt: skip
+    fields = [(r, c) for r in range(board.rows) for c in range(board.columns)]
     if board.kind == "apriltag":
         pitch = side + board.marker
-        places = [(c * pitch, r * pitch, side) for r in range(board.rows) for c in range(board.columns)]
+        places = [(c * pitch, r * pitch, side) for r, c in fields]
+    else:
+        found = [np.array([[c * side, r * side, side, side]]) for r, c in fields if (r + c) % 2 == 0]
+        margin, white = 0.5 * (side - board.marker), [field for field in fields if sum(field) % 2 == 1]
+        places = [(c * side + margin, r * side + margin, board.marker) for r, c in white if board.kind == "charuco"]
     words = dictionary(board.dictionary)
     for number, (x, y, size) in enumerate(places):
         bits = cv2.aruco.generateImageMarker(words, number, words.markerSize + 2, borderBits=1)
@@ -74,14 +68,13 @@ def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
     width, height = (round((length + 2.0 * margin) * pixels_per_metre) for length in board.extent)
     image = np.ones((height, width), dtype=np.float32)
     for x, y, w, h in _black(board):
-        own = []
-        for first, length, count in ((x, w, width), (y, h, height)):
+        shares = []
+        for first, length, count in ((y, h, height), (x, w, width)):
             low, high = ((place + margin) * pixels_per_metre for place in (first, first + length))
-            start, stop = int(np.floor(low)), min(int(np.ceil(high)), count)
-            cells = np.arange(start, stop)
-            own.append((start, stop, np.clip(np.minimum(cells + 1, high) - np.maximum(cells, low), 0.0, 1.0)))
-        (left, right, across), (top, bottom, down) = own
-        image[top:bottom, left:right] -= np.outer(down, across).astype(np.float32)
+            cells = np.arange(int(np.floor(low)), min(int(np.ceil(high)), count))
+            shares.append((cells, np.clip(np.minimum(cells + 1, high) - np.maximum(cells, low), 0.0, 1.0)))
+        (rows, down), (columns, across) = shares
+        image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] -= np.outer(down, across).astype(np.float32)
     return np.clip(image, 0.0, 1.0)
 
 
@@ -89,18 +82,17 @@ def page_size(board: Board, paper: str = "") -> tuple[float, float]:
     """Return width and height of the page [m]: the paper's as the board lies on it better, or the smallest that does.
 
     Raises:
-        ValueError: where the board does not fit, with the largest square that would.
+        UsageError: where the board does not fit, with the largest square that would.
     """
     needed = board.extent[0] + 2 * EDGE, board.extent[1] + 2 * EDGE + RULER
-    papers = [paper] if paper else list(PAPERS)
-    for name in papers:
-        for size in (PAPERS[name], (PAPERS[name][1], PAPERS[name][0])):
-            if needed[0] <= size[0] and needed[1] <= size[1]:
-                return size
+    papers = [PAPERS[paper]] if paper else list(PAPERS.values())
+    sizes = [size for short, long in papers for size in ((short, long), (long, short))]
+    shares = [min(size[0] / needed[0], size[1] / needed[1]) for size in sizes]
+    if fitting := [size for size, share in zip(sizes, shares) if share >= 1.0]:
+        return fitting[0]
     if not paper:
         return needed
-    shares = [min(size[0] / needed[0], size[1] / needed[1]) for size in (PAPERS[paper], PAPERS[paper][::-1])]
-    raise ValueError(
+    raise UsageError(
         f"the board takes {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm with margins and ruler, larger than "
         f"{paper.upper()}; squares of {int(1e3 * board.square * max(shares) * 0.97)} mm would fit"
     )
@@ -164,14 +156,11 @@ def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tup
     for millimetre in range(round(1e3 * length) + 1):
         tall = 0.004 if millimetre % 10 == 0 else 0.003 if millimetre % 5 == 0 else 0.002
         ticks.append([left + 1e-3 * millimetre - thin / 2, base - tall, thin, tall])
+    advice = f"{board.words}, {board.dictionary}: print at 100 %, measure, put it into board.toml"
     words = [
         (left, base + 0.0035, "0"),
         (left + length - 0.006, base + 0.0035, f"{1e3 * length:.0f} mm"),
-        (
-            left + 0.008,
-            base + 0.0035,
-            f"{board.words}, {board.dictionary}: print at 100 %, measure, put it into board.toml",
-        ),
+        (left + 0.008, base + 0.0035, advice),
     ]
     return np.concatenate([boxes, ticks]), words
 
@@ -199,12 +188,12 @@ def make(
     if square < min_square:
         raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
     usual, share, across = USUAL[kind]
-    with refused_as(UsageError, ValueError, "impossible board: {}"):
-        side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
-        made = Board(kind, columns or across, rows, side, between, words or usual).checked()
-        if (count := len(corners(made))) < MIN_CORNERS:
-            raise UsageError(f"a {made.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
-        size = page_size(made, (paper or "").lower())
+    between = (share * square if marker is None else marker) / 1e3
+    stated = {"kind": kind, "columns": columns or across, "rows": rows, "square": square / 1e3, "marker": between}
+    made = parse(Board, stated | {"dictionary": words or usual}, "impossible board")
+    if (count := len(corners(made))) < MIN_CORNERS:
+        raise UsageError(f"a {made.words} has {count} corners, an image needs {MIN_CORNERS}: take more squares")
+    size = page_size(made, (paper or "").lower())
     there = out / BOARD
     if not overwrite and there.exists() and not _as_printed(out):
         raise UsageError(
@@ -229,9 +218,8 @@ def _as_printed(out: Path) -> bool:
         found, drawn = read_board(out), (out / "board.svg").read_bytes()
         sizes = []
         for paper in ("", *PAPERS):
-            with suppress(ValueError):  # a paper that it does not fit onto
+            with suppress(UsageError):  # a paper that it does not fit onto
                 sizes.append(page_size(found, paper))
-        drawings = (svg(found, size) for size in dict.fromkeys(sizes))
-        return any((one.encode() if isinstance(one, str) else one) == drawn for one in drawings)
+        return any(svg(found, size).encode() == drawn for size in dict.fromkeys(sizes))
     except (OSError, ValueError, CalibError):
         return False

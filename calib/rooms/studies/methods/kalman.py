@@ -12,7 +12,6 @@ and then P⁺ = D Dᵀ + N Nᵀ, which a covariance filter adds up, while a squa
 QR of the array [R^½ HS; 0 S] (Kaminski, Bryson & Schmidt 1971).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +21,6 @@ from calib.errors import Diverged
 
 ALPHA, BETA = 0.1, 2.0  # spread of the unscented points, and what is known of the distribution (Gaussian)
 STEP = np.sqrt(3.0)  # h of central differences, for Gaussian kurtosis
-RULES = ("ekf", "ukf", "cdkf")
-
-Step = Callable[[np.ndarray], np.ndarray]
-Linearised = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -33,7 +28,7 @@ class Filter:
     """Type of a filter: rule and form of the covariance.
 
     Attributes:
-        rule: one of `RULES`.
+        rule: ``ekf``, ``ukf`` or ``cdkf``.
         root: whether the covariance's root is kept, and not the covariance.
     """
 

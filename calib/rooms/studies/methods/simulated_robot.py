@@ -58,8 +58,7 @@ def simulate_tangents(
     from calib.simulation.loop import loop_kernels
 
     for one in plant.terms:
-        words = f"term '{one.name}' ({one.shape}): no tangents for friction that depends on load or history"
-        require(one.form.slopes, words)
+        require(one.form.slopes, f"term '{one.name}' ({one.shape}): no tangents for friction by load or history")
     n, count, c = plant.bodies.n, len(reference.t), len(columns)
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = np.arange(c)
@@ -69,16 +68,14 @@ def simulate_tangents(
     scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
     status, reached = tangent_kernels.closed_loop_tangent(
         packed(plant), (*layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
-        np.empty((0, n)), reference.period, controller.smoothing(reference.period), controller.delay, float(every),
+        reference.period, controller.smoothing(reference.period), controller.delay, float(every),
         np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
     )  # fmt: skip
     if status != loop_kernels.FINE:
         raise failure(status, reached * reference.period)
     # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
     max_slope = 1e20
-    if (
-        not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope
-    ):  # saturated torques keep the motion finite, not its slopes
+    if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:  # saturated torques keep only the motion finite
         raise Diverged(f"the loop is unstable, its slopes diverge: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))

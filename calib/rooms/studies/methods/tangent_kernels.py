@@ -368,19 +368,14 @@ def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
         dq[j, j], dv[j, n + j] = 1.0, 1.0
     if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, slopes[0]):
         return SINGULAR
-    unit = np.empty(n)
     for i in range(n):
-        for j in range(n):
-            unit[j] = 1.0 if i == j else 0.0
+        unit = np.zeros(n)
+        unit[i] = 1.0
         substitute(matrix, unit)
-        for j in range(n):
-            gain[j, i] = unit[j]
+        gain[:, i] = unit
     state = (q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms)
     status = _advance_tangent(plant, layout, memory, loads, *state)
-    for j in range(n):
-        if not abs(v[j]) < 1e6:
-            return DIVERGED
-    return status
+    return status if np.all(np.abs(v) < 1e6) else DIVERGED
 
 
 @njit(**OPTIONS)
@@ -391,30 +386,24 @@ def _command_tangent(
     """Write the tangents of the command (n, c) before saturation; feedback (n,): what it is without torque ahead."""
     own, more, ten, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
-    n, c = dwish.shape
+    n = len(dwish)
     for j in range(n):
-        for m in range(c):
-            total = gains[2, j] * dintegral[j, m] - gains[0, j] * dread[j, m] - gains[1, j] * dspeed[j, m]
-            dwish[j, m] = total + feedback[j] * relative[j, m]
+        total = gains[2, j] * dintegral[j] - gains[0, j] * dread[j] - gains[1, j] * dspeed[j]
+        dwish[j] = total + feedback[j] * relative[j]
     if model.shape[0]:
-        for j in range(n):
-            at[j], wish[j] = feedback[j] + ahead[j], 0.0
+        at[:], wish[:] = feedback + ahead, 0.0
         dynamics(tree, model, linear, read, speed, work, matrix, wish)
         bare = np.zeros_like(linear)
         order, entries, shares, owners, find = layout
         where = (read, speed, at, work, own, more, ten, by_q, by_v, columns)
         none = (np.zeros((0, 2), dtype=np.int64), np.zeros((0, 8 + n)))
         _linearise(tree, model, bare, none[0], none[1], order, entries, shares, owners, empty, np.zeros((0, 2)), *where)
+        dat[:] = 0.0
         for j in range(n):
-            for m in range(c):
-                dat[j, m] = 0.0
             for k in range(n):
                 inertia = matrix[max(j, k), min(j, k)]
-                for m in range(c):
-                    dat[j, m] += inertia * dwish[k, m] + by_q[j, k] * dread[k, m] + by_v[j, k] * dspeed[k, m]
-        for j in range(n):
-            for m in range(c):
-                dwish[j, m] = dat[j, m]
+                dat[j] += inertia * dwish[k] + by_q[j, k] * dread[k] + by_v[j, k] * dspeed[k]
+        dwish[:] = dat
         for e in range(entries.shape[0]):  # the controller's model has the drives' inertias of the plant
             if entries[e, 1] < n and find[entries[e, 2]] >= 0:
                 dwish[entries[e, 0], find[entries[e, 2]]] += shares[e] * at[entries[e, 1]]
@@ -422,7 +411,7 @@ def _command_tangent(
 
 @njit(**OPTIONS)
 def closed_loop_tangent(
-    plant, layout, model, gains, relative, reference, push, period, smoothing, late, every, q, v, count, out, dout
+    plant, layout, model, gains, relative, reference, period, smoothing, late, every, q, v, count, out, dout
 ):  # fmt: skip
     """Write the noise-free motion of `loop_kernels.closed_loop` with its tangents. Return (status, period reached).
 
@@ -436,71 +425,59 @@ def closed_loop_tangent(
     rooms, empty = _workspace(tree.shape[0], n, c), np.empty(0, dtype=np.int64)
     memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
     speed, before, integral, wish, feedback = np.zeros(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
-    tau, acting, waiting = np.empty(n), np.empty(n), np.zeros((late + 1, n))
+    tau, waiting = np.empty(n), np.zeros((late + 1, n))
     dq, dv, dspeed, dbefore = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c))
     dintegral, dwish, dtau, dwaiting = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((late + 1, n, c))
     sample = 0
     for k in range(count):
-        for j in range(n):
-            if k == 0:
-                speed[j] = v[j]
-            else:
+        if k == 0:
+            speed[:] = v
+        else:
+            for j in range(n):  # rounded as in `loop_kernels.closed_loop`
                 speed[j] += smoothing * ((q[j] - before[j]) / period - speed[j])
-                for m in range(c):
-                    dspeed[j, m] += smoothing * ((dq[j, m] - dbefore[j, m]) / period - dspeed[j, m])
-            before[j] = q[j]
-            for m in range(c):
-                dbefore[j, m] = dq[j, m]
-        command(gains, reference[0, k], reference[1, k], q, speed, integral, period, wish)
+            dspeed += smoothing * ((dq - dbefore) / period - dspeed)
+        before[:], dbefore[:] = q, dq
+        command(gains, reference[0, k], reference[1, k], q, speed, integral, period, feedback)
         for j in range(n):
-            feedback[j] = wish[j]
-            free = abs(integral[j]) < gains[5, j]
-            for m in range(c):
-                dintegral[j, m] = dintegral[j, m] - period * dq[j, m] if free else 0.0
+            if abs(integral[j]) < gains[5, j]:
+                dintegral[j] -= period * dq[j]
+            else:
+                dintegral[j] = 0.0
         _command_tangent(
             plant, layout, model, empty, gains, relative, reference[3, k], q, speed, dq, dspeed, dintegral, feedback,
             wish, dwish, work, matrix, rooms,
         )  # fmt: skip
-        for j in range(n):
-            wish[j] = feedback[j]
+        wish[:] = feedback
         if model.shape[0]:
             linearise_command(tree, model, linear, reference[3, k], q, speed, work, matrix, wish)
+        wish += reference[2, k]
+        now, old = k % (late + 1), (k + 1) % (late + 1) if k >= late else 0
         for j in range(n):
-            wish[j] += reference[2, k, j]
             held = min(max(wish[j], -gains[4, j]), gains[4, j])
             error = reference[0, k, j] - q[j]
             if held != wish[j] and error * wish[j] > 0.0:
                 integral[j] -= period * error
-                for m in range(c):
-                    dintegral[j, m] += period * dq[j, m]
-            waiting[k % (late + 1), j] = held
-            old = (k + 1) % (late + 1) if k >= late else 0
-            tau[j] = waiting[old, j]
-            for m in range(c):
-                dwaiting[k % (late + 1), j, m] = dwish[j, m] if held == wish[j] else 0.0
-            for m in range(c):
-                dtau[j, m] = dwaiting[old, j, m]
-            acting[j] = tau[j] + (push[k, j] if push.shape[0] else 0.0)
+                dintegral[j] += period * dq[j]
+            waiting[now, j], dwaiting[now, j] = held, 0.0
+            if held == wish[j]:
+                dwaiting[now, j] = dwish[j]
+        tau[:], dtau[:] = waiting[old], dwaiting[old]
         while sample < out.shape[1] and sample * every < k + 1 - 1e-9:
             part = sample * every - k
             here, fast, dhere, dfast = q.copy(), v.copy(), dq.copy(), dv.copy()
             if part >= 1e-9:
-                state = (here, fast, dhere, dfast, acting, dtau, part * period, slopes, dslopes, work, matrix, rooms)
+                state = (here, fast, dhere, dfast, tau, dtau, part * period, slopes, dslopes, work, matrix, rooms)
                 status = _advance_tangent(plant, layout, memory, loads, *state)
                 if status != FINE:
                     return status, k
-            for j in range(n):
-                out[0, sample, j], out[1, sample, j], out[2, sample, j] = here[j], fast[j], tau[j]
-                for m in range(c):
-                    one, other, last = dhere[j, m], dfast[j, m], dtau[j, m]
-                    dout[0, sample, j, m], dout[1, sample, j, m], dout[2, sample, j, m] = one, other, last
+            out[0, sample], out[1, sample], out[2, sample] = here, fast, tau
+            dout[0, sample], dout[1, sample], dout[2, sample] = dhere, dfast, dtau
             sample += 1
         if k + 1 < count:
-            state = (q, v, dq, dv, acting, dtau, period, slopes, dslopes, work, matrix, rooms)
+            state = (q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms)
             status = _advance_tangent(plant, layout, memory, loads, *state)
             if status != FINE:
                 return status, k
-        for j in range(n):
-            if not abs(v[j]) < 1e6:
-                return DIVERGED, k
+        if not np.all(np.abs(v) < 1e6):
+            return DIVERGED, k
     return FINE, count
