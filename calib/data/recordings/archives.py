@@ -5,7 +5,7 @@ Beside the names of `recording_options` an archive may hold ``joint_names`` (n t
 otherwise. An average over repeats (`calib recall`) says how noisy it is: ``variance_tau`` (or the effort's name; N, n)
 of a single sample, and the number of ``periods`` averaged. Members are decompressed one after the other and only the
 rows asked for are kept: a compressed member cannot be mapped into memory, so time grows with the file (some 200 MB/s)
-and memory with the cut.
+and memory with its largest member and the cut.
 """
 
 import lzma
@@ -118,15 +118,8 @@ class _Archive:
         with stream:
             if dtype.kind not in kinds:
                 self.fail(f"contains {dtype}, expected {'texts' if 'U' in kinds else 'numbers'}", name)
-            if fortran or not shape or rows is None:
-                rows = slice(0, shape[0] if shape else 1) if rows is None else rows
-                values = np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
-                values = values[rows] if shape else values
-            else:
-                size = dtype.itemsize * int(np.prod(shape[1:]))
-                _skip(stream, rows.start * size)
-                values = np.frombuffer(stream.read((rows.stop - rows.start) * size), dtype).reshape(-1, *shape[1:])
-            _skip(stream, 1 << 62)  # to its end: the sum that tells damage is checked there
+            values = np.frombuffer(stream.read(), dtype, prod(shape)).reshape(shape, order="F" if fortran else "C")
+        values = values[rows] if rows is not None and shape else values
         return values if exact else values.astype(float)
 
     def few(self, name: str, count: int) -> np.ndarray | None:
@@ -240,9 +233,3 @@ def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
     """Return the columns in `order`, in SI; copied only if they change."""
     values = values if order == list(range(values.shape[1])) else values[:, order]
     return read_only(values if factor == 1.0 else values * factor)
-
-
-def _skip(stream: IO[bytes], size: int) -> None:
-    """Skip `size` bytes of a stream, or the rest."""
-    while size > 0 and (got := len(stream.read(min(size, 1 << 22)))):
-        size -= got

@@ -17,14 +17,14 @@ other elements there (owner n), which the first fixed joint towards the tip then
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import files
 from calib.errors import RobotError, refuse_robot
-from calib.robot.chain import AXES, Chain, Element, Joint, random_joints
+from calib.robot.chain import AXES, Chain, Element, random_joints
 from calib.robot.formats.urdf import drive, ends
 from calib.robot.formats.urdf_tree import (
     UNLIMITED,
@@ -39,10 +39,10 @@ from calib.robot.formats.urdf_tree import (
 )
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, moving_frames
+from calib.robot.tables import LIMITS
 from calib.transforms import invert, pose, to_xyz_rpy
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-ZERO = "0 0 0"
 
 
 def put(
@@ -94,21 +94,24 @@ def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     return mass, centre, body[:6] - steiner
 
 
-def _inertial(source: str, link: Node, body: np.ndarray) -> list[tuple[int, int, str]]:
+def _inertial_parts(body: np.ndarray) -> dict[str, dict[str, str]]:
+    """Return the attributes of <origin>, <mass> and <inertia> of standard parameters (10,), by tag."""
     mass, centre, moments = centred(body)
-    place = {"xyz": " ".join(repr(float(x)) for x in centre), "rpy": ZERO}
-    values: dict[str, str] = {name: repr(float(x)) for name, x in zip(MOMENTS, moments)}
-    node = link.first("inertial")
+    inertia = {name: repr(float(x)) for name, x in zip(MOMENTS, moments)}
+    place = {"xyz": " ".join(repr(float(x)) for x in centre), "rpy": "0 0 0"}
+    return {"origin": place, "mass": {"value": repr(mass)}, "inertia": inertia}
+
+
+def _inertial(source: str, link: Node, body: np.ndarray) -> list[tuple[int, int, str]]:
+    parts, node = _inertial_parts(body), link.first("inertial")
     if node is None:
-        parts = "".join(
-            f"<{tag} " + " ".join(f'{key}="{value}"' for key, value in content.items()) + "/>"
-            for tag, content in (("origin", place), ("mass", {"value": repr(mass)}), ("inertia", values))
-        )
-        return insert_child(source, link, f"<inertial>{parts}</inertial>")
-    changes = []
-    for tag, content in (("origin", place), ("mass", {"value": repr(mass)}), ("inertia", values)):
-        changes += _child(source, node, tag, content)
-    return changes
+        inner = "".join(_tag(tag, values) for tag, values in parts.items())
+        return insert_child(source, link, f"<inertial>{inner}</inertial>")
+    return [change for tag, values in parts.items() for change in _child(source, node, tag, values)]
+
+
+def _tag(tag: str, values: Mapping[str, str]) -> str:
+    return f"<{tag} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>"
 
 
 def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tuple[int, int, str]]:
@@ -116,7 +119,7 @@ def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tu
     found = node.first(tag)
     if found is not None:
         return set_attributes(source, found, values)
-    return insert_child(source, node, f"<{tag} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>")
+    return insert_child(source, node, _tag(tag, values))
 
 
 UNCHANGED = 1e-12
@@ -152,9 +155,7 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     wanted = invert(base) @ calibrated_frames @ offsets[:, None]
     origins = _origins(tree, path, wanted[:, 0])
     origins |= _tip_origin(tree, path, nominal, calibrated, base @ links[-1, 0], base @ wanted[-1, 0])
-    changes = []
-    for name, origin in origins.items():
-        changes += _change(source, tree.joints[name], origin)
+    changes = [one for name, origin in origins.items() for one in _change(source, tree.joints[name], origin)]
     result = edited(source, changes)
     written = read_tree(result, where)
     error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
@@ -170,11 +171,8 @@ def write_new(chain: Chain) -> str:
     Constant elements are folded into the joint origins. Limits are kept; where velocity or effort is not known 1e9
     stands, since URDF demands a number. A body of unknown inertia has none. Pinocchio reads the same kinematics.
     """
-    lines = [
-        '<?xml version="1.0"?>',
-        f"<robot name={quoteattr(chain.name)}>",
-        f"  <link name={quoteattr(chain.base)}/>",
-    ]
+    root = ET.Element("robot", name=chain.name)
+    ET.SubElement(root, "link", name=chain.base)
     parent, first, before = chain.base, set(chain.moving.tolist()), np.eye(4)
     for k, element in enumerate(chain.elements):
         before = (
@@ -186,16 +184,23 @@ def write_new(chain: Chain) -> str:
         if main and element.ratio != 1.0:
             refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q, not by {element.ratio:g} q")
         child = _link_name(chain, k, element.joint, main)
-        lines += _link_lines(child, chain.inertias[element.joint] if main and chain.inertias is not None else None)
-        lines += _joint_lines(chain, element, chain.joints[element.joint], main, parent, child, before)
+        link = ET.SubElement(root, "link", name=child)
+        if main and chain.inertias is not None and chain.inertias[element.joint].any():
+            inertial = ET.SubElement(link, "inertial")
+            for tag, values in _inertial_parts(chain.inertias[element.joint]).items():
+                ET.SubElement(inertial, tag, values)
+        _add_moving_joint(root, chain, element, main, parent, child, before)
         parent, before = child, np.eye(4)
     if parent != chain.tip:
-        lines += [
-            f"  <link name={quoteattr(chain.tip)}/>",
-            f'  <joint name={quoteattr(chain.tip + "_fixed")} type="fixed">',
-        ]
-        lines += [*_placed(parent, chain.tip, before @ chain.tail), "  </joint>"]
-    return "\n".join([*lines, "</robot>"]) + "\n"
+        ET.SubElement(root, "link", name=chain.tip)
+        _add_joint(root, f"{chain.tip}_fixed", "fixed", parent, chain.tip, before @ chain.tail)
+    return '<?xml version="1.0"?>\n' + xml_text(root)
+
+
+def xml_text(root: ET.Element) -> str:
+    """Return the indented text of an XML tree."""
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode").replace(" />", "/>") + "\n"
 
 
 def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -346,18 +351,13 @@ def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int,
     xyz, rpy = to_xyz_rpy(origin)
     values = {}
     if np.abs(xyz - joint.origin[:3, 3]).max() > UNCHANGED:
-        values["xyz"] = _numbers(xyz)
+        values["xyz"] = numbers_text(xyz)
     if np.abs(origin[:3, :3] - joint.origin[:3, :3]).max() > UNCHANGED:
-        values["rpy"] = _numbers(rpy)
-    if not values:
-        return []
-    node = joint.node.first("origin")
-    if node is not None:
-        return set_attributes(source, node, values)
-    return insert_child(source, joint.node, f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>')
+        values["rpy"] = numbers_text(rpy)
+    return _child(source, joint.node, "origin", values) if values else []
 
 
-def _numbers(values: np.ndarray) -> str:
+def numbers_text(values: np.ndarray) -> str:
     """Return numbers as text in full precision (repr), values below 1e-15 as 0."""
     return " ".join("0" if abs(value) < 1e-15 else repr(value) for value in values.tolist())
 
@@ -373,47 +373,26 @@ def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
     return fallback if name == chain.base or (name == chain.tip and not last) else name
 
 
-def _placed(parent: str, child: str, origin: np.ndarray) -> list[str]:
-    xyz, rpy = to_xyz_rpy(origin)
-    return [
-        f"    <parent link={quoteattr(parent)}/>",
-        f"    <child link={quoteattr(child)}/>",
-        f'    <origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>',
-    ]
+def _add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
+    """Add a <joint> with its links and its origin (4, 4) to a URDF, and return it."""
+    joint, (xyz, rpy) = ET.SubElement(root, "joint", name=name, type=kind), to_xyz_rpy(origin)
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    ET.SubElement(joint, "origin", xyz=numbers_text(xyz), rpy=numbers_text(rpy))
+    return joint
 
 
-def _joint_lines(
-    chain: Chain, element: Element, joint: Joint, main: bool, parent: str, child: str, origin: np.ndarray
-) -> list[str]:
-    """Return the lines of a moving <joint>; a second element of a joint becomes a mimic joint."""
+def _add_moving_joint(
+    root: ET.Element, chain: Chain, element: Element, main: bool, parent: str, child: str, origin: np.ndarray
+) -> None:
+    """Add a moving <joint> to a URDF; a second element of a joint becomes a mimic joint."""
+    joint = chain.joints[element.joint or 0]
     free = not np.isfinite([joint.lower, joint.upper]).any()
     kind = "prismatic" if element.axis[0] == "t" else "continuous" if free else "revolute"
-    axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
-    ends = "" if kind == "continuous" else f'lower="{_limit(joint.lower)}" upper="{_limit(joint.upper)}" '
-    lines = [f'  <joint name={quoteattr(joint.name if main else element.name)} type="{kind}">']
-    lines += [*_placed(parent, child, origin), f'    <axis xyz="{_numbers(axis)}"/>']
-    lines += [f'    <limit {ends}velocity="{_limit(joint.velocity)}" effort="{_limit(joint.effort)}"/>']
+    node = _add_joint(root, joint.name if main else element.name, kind, parent, child, origin)
+    ET.SubElement(node, "axis", xyz=numbers_text(element.sign * np.eye(3)[AXES.index(element.axis) % 3]))
+    limits = {key: getattr(joint, key) for key in LIMITS if kind != "continuous" or key not in ("lower", "upper")}
+    written = {key: repr(float(np.clip(value, -UNLIMITED, UNLIMITED))) for key, value in limits.items()}
+    ET.SubElement(node, "limit", written)
     if not main:
-        lines += [f'    <mimic joint={quoteattr(joint.name)} multiplier="{element.ratio!r}" offset="0"/>']
-    return [*lines, "  </joint>"]
-
-
-def _limit(value: float) -> str:
-    return repr(float(np.clip(value, -UNLIMITED, UNLIMITED)))
-
-
-def _link_lines(name: str, body: np.ndarray | None) -> list[str]:
-    """Return the lines of a <link>, with its inertia about the centre of mass if known."""
-    if body is None or not body.any():
-        return [f"  <link name={quoteattr(name)}/>"]
-    mass, centre, about = centred(body)
-    moments = " ".join(f'{key}="{value!r}"' for key, value in zip(MOMENTS, about.tolist(), strict=True))
-    return [
-        f"  <link name={quoteattr(name)}>",
-        "    <inertial>",
-        f'      <origin xyz="{_numbers(centre)}" rpy="0 0 0"/>',
-        f'      <mass value="{mass!r}"/>',
-        f"      <inertia {moments}/>",
-        "    </inertial>",
-        "  </link>",
-    ]
+        ET.SubElement(node, "mimic", joint=joint.name, multiplier=repr(element.ratio), offset="0")
