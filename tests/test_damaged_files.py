@@ -18,8 +18,8 @@ from strategies import damaged
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.pose_files import read_measurements
 from calib.data.poses.pose_lists import read_poses, read_targets
-from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_files import read_recording
+from calib.data.schema import Joints
 from calib.errors import CalibError
 from calib.geometry.observability import targets_of
 from calib.identification import identify_options

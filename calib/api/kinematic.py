@@ -25,10 +25,9 @@ from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
-from calib.procedure.robot_kinds import Mechanism, stage_of
+from calib.procedure.robot_kinds import Mechanism, joints_of, stage_of
 from calib.records import plain, shaped
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import joint_kinds
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -364,8 +363,7 @@ def compensate(
             found = read_fitted(place)
     chain = found.nominal.chain
     if isinstance(targets, str | Path):
-        limits = (chain.lower, chain.upper)
-        targets = read_targets(targets, chain.joint_names, kinds=joint_kinds(chain), limits=limits)
+        targets = read_targets(targets, joints_of(chain))
     commands = compensation.compensate(
         found, Targets.of(targets), frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed,
         progress=progress_shown(progress),

@@ -74,7 +74,7 @@ def read_recording(
     Raises:
         MeasurementError: naming file, row, column and the likely cause.
     """
-    from calib.procedure.dynamic_stage.inputs import joints_of  # the dynamics' modules: none of the geometry's
+    from calib.procedure.robot_kinds import joints_of  # the dynamics' modules: none of the geometry's
 
     found = mechanism(robot)
     chain = _loaded(cast(Any, robot)).chain if found is None else found.chain

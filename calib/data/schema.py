@@ -4,6 +4,8 @@ Poses, targets, waypoints and recordings read their tables by these declarations
 `refuse`: the value first, what to do last, then how many more rows are like it; the error carries file, row and column.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, refuse_option
+from calib.records import frozen
 from calib.units import DEG
 
 
@@ -37,6 +40,39 @@ class Bounds:
 
 
 BOUNDS = Bounds()
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """Joint data of a robot for checking measurements and recordings; NaN or infinity if a limit is unknown.
+
+    Attributes:
+        names: n joint names in the robot's order.
+        kinds: URDF's joint types (``revolute``, ``continuous``, ``prismatic``).
+        lower, upper: (n,) position limits [rad or m].
+        effort: (n,) [N·m or N].
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[str, ...] | list[str] = ()
+    lower: np.ndarray = None  # type: ignore[assignment]  # set below
+    upper: np.ndarray = None  # type: ignore[assignment]  # set below
+    effort: np.ndarray = None  # type: ignore[assignment]  # set below
+
+    @staticmethod
+    def of(given: Joints | Sequence[str]) -> Joints:
+        """Return `given`, or revolute joints without limits of these names."""
+        return given if isinstance(given, Joints) else Joints(tuple(given))
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "kinds", tuple(self.kinds) or ("revolute",) * n)
+        for name in ("lower", "upper", "effort"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, frozen(np.full(n, np.nan) if value is None else value))
+            if getattr(self, name).shape != (n,):
+                refuse_option(name, f"expected {n} values, one per joint, found {getattr(self, name).shape}")
 
 
 class Rows(Protocol):

@@ -8,9 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
+from calib.data.schema import Joints
 from calib.errors import UsageError
 from calib.extensions import merged, offered
 from calib.procedure.findings import Verdict
+from calib.robot.chain import joint_kinds
 
 
 @dataclass(frozen=True)
@@ -123,3 +127,9 @@ def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: objec
         if each.name not in read and value is not False and value != getattr(plain, each.name):
             place, shown = f"{where}: " if where else "", f" '{value}'" if isinstance(value, str) else ""
             raise UsageError(f"{place}{each.name}{shown} is for serial arms only, not for this kind of robot")
+
+
+def joints_of(chain: Any) -> Joints:
+    """Return the names and limits of the joints of an arm or mechanism, for checking measurements and recordings."""
+    limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
+    return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)

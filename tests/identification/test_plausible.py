@@ -8,7 +8,8 @@ import pytest
 
 from calib.column_changes import Change, Explanation
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Joints, Recording, earlier
+from calib.data.recordings.recording import Recording, earlier
+from calib.data.schema import Joints
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import Finding, MeasurementError, finding
 from calib.identification.checks.recording_sizes import compare_sizes, signs_of

@@ -11,22 +11,13 @@ from calib.data.csv_table import Table
 from calib.data.poses.columns import POSITION, QUATERNION, SIGMA, TURNS, Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.data.schema import BOUNDS, Column, Rows, check_travel, joint_unit, max_travel, refuse
+from calib.data.schema import BOUNDS, Column, Joints, Rows, check_travel, joint_unit, max_travel, refuse
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import ANGLES, DEG
 
-Limits = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
 
-
-def check_joints(
-    q: np.ndarray,
-    sheet: Sheet,
-    columns: Sequence[str],
-    joints: Sequence[str],
-    kinds: Sequence[str] | None = None,
-    limits: Limits | None = None,
-) -> tuple[str, ...]:
-    """Check joint values (m, n) [rad or m]; `kinds` are URDF's joint types, `limits` lower and upper (n,).
+def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
+    """Check joint values (m, n) [rad or m] of a robot's joints, in the file's `columns`.
 
     Returns:
         Notes on what is odd but possible.
@@ -34,13 +25,12 @@ def check_joints(
     Raises:
         MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
     """
-    kinds, table = kinds or ["revolute"] * len(joints), sheet.table
+    joints, kinds, lower, upper, table = robot.names, robot.kinds, robot.lower, robot.upper, sheet.table
     stated = [sheet.unit(column, "joints") for column in columns]
     _check_joint_units(sheet, columns, kinds, stated)
     if len(q) > 1 and np.ptp(q, axis=0).max() < BOUNDS.min_travel:
         message = f"all {len(q)} rows have the same joint values: one pose determines no parameter"
         refuse_data(table.file, message, columns[0], int(table.rows[-1]))
-    lower, upper = np.asarray(limits if limits is not None else [np.full(len(joints), np.nan)] * 2, dtype=float)
     bounded = np.isfinite(lower) & np.isfinite(upper)
 
     def advice(j: int, other: str) -> str:
@@ -93,9 +83,7 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
             sheet.fail(f"the unit [{unit}] does not suit a {kind} joint: {advice}", name)
 
 
-def check_block(
-    block: PoseMeasurements, options: FileOptions, kinds: Sequence[str] | None = None, limits: Limits | None = None
-) -> PoseMeasurements:
+def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) -> PoseMeasurements:
     """Return a block in memory with the notes of the checks that files undergo; refuse what they refuse."""
     q, joints = np.asarray(block.q), tuple(block.joint_names)
     place = block.file or "measurements in memory"
@@ -103,7 +91,7 @@ def check_block(
     require(len(block) and q.ndim == 2 and q.shape[1] == len(joints), message, MeasurementError, place)
     table = Table(place, joints, ("",) * len(joints), tuple(q.T), block.rows)
     _check_finite(q, table, joints)
-    notes = check_joints(q, Sheet(table, replace(options, units={}, columns={})), joints, joints, kinds, limits)
+    notes = check_joints(q, Sheet(table, replace(options, units={}, columns={})), joints, replace(robot, names=joints))
     if isinstance(block, Positions):
         _check_finite(block.position, table, POSITION.names)
         POSITION.check(block.position, table, POSITION.names)

@@ -60,8 +60,7 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
-from calib.data.poses.plausible import Limits
-from calib.data.schema import refuse
+from calib.data.schema import Joints, refuse
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -194,20 +193,13 @@ def _turned(turn: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def read_measurements(
-    path: str | Path,
-    joints: Sequence[str],
-    options: FileOptions | None = None,
-    *,
-    kinds: Sequence[str] | None = None,
-    limits: Limits | None = None,
+    path: str | Path, joints: Joints | Sequence[str], options: FileOptions | None = None
 ) -> list[PoseMeasurements]:
     """Return the measurements in the file at `path` for a robot with these joints.
 
     Args:
-        joints: the robot's n joint names.
+        joints: the robot's n joints, or their names (of revolute joints without limits).
         options: names, units, kind where the header does not state it.
-        kinds: URDF's type of each joint (revolute, continuous, prismatic); all revolute by default.
-        limits: lower and upper limits, each (n,) [rad or m].
 
     Returns:
         One block.
@@ -215,15 +207,15 @@ def read_measurements(
     Raises:
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
-    options = options or FileOptions()
+    robot, options = Joints.of(joints), options or FileOptions()
     form = options.format or ("robodk" if robodk.recognises(read_header(path)[0]) else "csv")
     table, notes = None, ()
     if form in robodk.FORMS:
-        table, options, notes = robodk.FORMS[form](path, len(joints), options)
+        table, options, notes = robodk.FORMS[form](path, len(robot.names), options)
     sheet = _select_rows(Sheet(table or read_table(path), options))
-    layout = find_layout(sheet, joints)
-    q, _ = sheet.joints(joints)
-    notes = (*notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, joints, kinds, limits))
+    layout = find_layout(sheet, robot.names)
+    q, _ = sheet.joints(robot.names)
+    notes = (*notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     block = (_read_targets if layout.positions else read_groups)(sheet, layout, q)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem

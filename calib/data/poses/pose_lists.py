@@ -38,7 +38,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +53,7 @@ from calib.data.poses import plausible
 from calib.data.poses.columns import MATRIX, POSITION, QUATERNION, Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.plausible import Limits
-from calib.data.schema import BOUNDS
+from calib.data.schema import BOUNDS, Joints
 from calib.errors import MeasurementError, listing
 from calib.records import frozen, shaped
 from calib.units import ANGLES, LENGTHS
@@ -87,35 +86,28 @@ def filled_in(path: Path, joints: int) -> bool:
 
 
 def read_poses(
-    given: str | Path | ArrayLike | PoseMeasurements,
-    joints: Sequence[str],
-    options: FileOptions | None = None,
-    *,
-    kinds: Sequence[str] | None = None,
-    limits: Limits | None = None,
+    given: str | Path | ArrayLike | PoseMeasurements, joints: Joints | Sequence[str], options: FileOptions | None = None
 ) -> np.ndarray:
     """Return joint values (m, n) [rad or m] in the order of `joints`, from a CSV file, measurements or an array.
 
     Columns and checks of a file are those of measurements.
     """
+    robot = Joints.of(joints)
     if not isinstance(given, str | Path):
         q = given.q if isinstance(given, PoseMeasurements) else given
-        return shaped(q, (None, len(joints)), "joint values")
+        return shaped(q, (None, len(robot.names)), "joint values")
     sheet = Sheet(read_table(given), options or FileOptions())
-    sheet.check_names(joints)
-    q, columns = sheet.joints(joints)
+    sheet.check_names(robot.names)
+    q, columns = sheet.joints(robot.names)
     if len(q) > 1:
-        check_planned(q, sheet, columns, joints, kinds, limits)
+        check_planned(q, sheet, columns, robot)
     return q
 
 
-def check_planned(
-    q: np.ndarray, sheet: Sheet, columns: Sequence[str], joints: Sequence[str], kinds: Sequence[str] | None,
-    limits: Limits | None,
-) -> tuple[str, ...]:  # fmt: skip
+def check_planned(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
     """Return the notes of `calib.data.poses.plausible.check_joints`; a plan may repeat one pose."""
     moves = np.ptp(q, axis=0).max() > BOUNDS.min_travel
-    return plausible.check_joints(q if moves else q[:1], sheet, columns, joints, kinds, limits)
+    return plausible.check_joints(q if moves else q[:1], sheet, columns, robot)
 
 
 def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = MAX_JOINT_DIFFERENCE) -> tuple[str, ...]:
@@ -246,30 +238,26 @@ class Targets:
         return len(self.q if self.q is not None else self.position)  # type: ignore[arg-type]  # one of them is there
 
 
-def read_targets(
-    path: str | Path, joints: Sequence[str], *, kinds: Sequence[str] | None = None, limits: Limits | None = None
-) -> Targets:
+def read_targets(path: str | Path, joints: Joints | Sequence[str]) -> Targets:
     """Return the targets in the file at `path` for a robot with these joints.
 
     Args:
-        joints: the robot's n joint names.
-        kinds: URDF's type of each joint (revolute, continuous, prismatic); all revolute by default.
-        limits: lower and upper limits, each (n,) [rad or m]. Single rows may lie outside; a file of which most rows do
-            holds something else.
+        joints: the robot's n joints, or their names. Single rows may lie outside the limits; a file of which most rows
+            do holds something else.
 
     Raises:
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
-    sheet = Sheet(read_table(path), suffixes=SUFFIXES)
-    table = sheet.table
+    sheet, robot = Sheet(read_table(path), suffixes=SUFFIXES), Joints.of(joints)
+    table, joints = sheet.table, robot.names
     forms = (*joints, *(f"q_{name}" for name in joints), *(f"q{k + 1}" for k in range(len(joints))))
     position, turned = sheet.family(POSITION.names), sheet.family(QUATERNION.names) or sheet.family(MATRIX.names)
     q, columns, notes = None, (), ()
     if any(name in table for name in forms):
         q, columns = sheet.joints(joints)
         # limits count where most rows (our choice) are outside: it is the file then, not the row
-        outside = limits is not None and plausible.outside(q, *np.asarray(limits, dtype=float)).any(axis=1).mean() > 0.5
-        notes = check_planned(q, sheet, columns, joints, kinds, limits if outside else None)
+        outside = plausible.outside(q, robot.lower, robot.upper).any(axis=1).mean() > 0.5
+        notes = check_planned(q, sheet, columns, robot if outside else replace(robot, lower=None, upper=None))
     if not columns and not position and not turned:
         needed = f"joints ({', '.join(joints)}, or q1 to q{len(joints)}), or x y z with or without qx qy qz qw"
         sheet.fail(f"no targets found: expected {needed}; found {', '.join(table.header)}")

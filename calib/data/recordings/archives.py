@@ -24,7 +24,7 @@ from typing import IO, NoReturn
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recordings.recording import Joints, Recording, read_only, rows_of_cut
+from calib.data.recordings.recording import Recording, read_only, rows_of_cut
 from calib.data.recordings.recording_options import (
     KEYS_BESIDE_SERIES,
     RATES,
@@ -34,6 +34,7 @@ from calib.data.recordings.recording_options import (
     joint_order,
     one_effort,
 )
+from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require
 
 MAX_MEMBERS, MAX_BYTES = 1000, 8_000_000_000  # of an archive, and of a member (our choices)

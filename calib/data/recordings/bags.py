@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.recordings.recording import Joints, Recording
+from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_options import RecordingOptions
+from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")

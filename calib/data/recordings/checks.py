@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.recordings.recording import Joints, Recording
-from calib.data.schema import BOUNDS, check_travel, max_travel, refuse
+from calib.data.recordings.recording import Recording
+from calib.data.schema import BOUNDS, Joints, check_travel, max_travel, refuse
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import DEG
 

@@ -21,34 +21,6 @@ _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
 @dataclass(frozen=True, eq=False)
-class Joints:
-    """Joint data for checking a recording; NaN or infinity if a limit is unknown.
-
-    Attributes:
-        names: n joint names in the robot's order.
-        kinds: URDF's joint types (``revolute``, ``continuous``, ``prismatic``).
-        lower, upper: (n,) position limits [rad or m].
-        effort: (n,) [N·m or N].
-    """
-
-    names: tuple[str, ...]
-    kinds: tuple[str, ...] = ()
-    lower: np.ndarray = None  # type: ignore[assignment]  # set below
-    upper: np.ndarray = None  # type: ignore[assignment]  # set below
-    effort: np.ndarray = None  # type: ignore[assignment]  # set below
-
-    def __post_init__(self) -> None:
-        n = len(self.names)
-        object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "kinds", tuple(self.kinds) or ("revolute",) * n)
-        for name in ("lower", "upper", "effort"):
-            value = getattr(self, name)
-            object.__setattr__(self, name, frozen(np.full(n, np.nan) if value is None else value))
-            if getattr(self, name).shape != (n,):
-                refuse_option(name, f"expected {n} values, one per joint, found {getattr(self, name).shape}")
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
     """N samples of n joints from one file, as they were logged.
 

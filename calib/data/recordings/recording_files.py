@@ -17,7 +17,7 @@ from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import Ends, read_archive
 from calib.data.recordings.bags import read_bag
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Joints, Recording, earlier, named, parse_cut
+from calib.data.recordings.recording import Recording, earlier, named, parse_cut
 from calib.data.recordings.recording_options import (
     MEASURED,
     SCALES,
@@ -28,6 +28,7 @@ from calib.data.recordings.recording_options import (
     plain_stems,
     stem_of,
 )
+from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, suggestion
 from calib.files import check_regular
 

@@ -30,7 +30,8 @@ from typing import Annotated, Any
 
 from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
-from calib.data.recordings.recording import Joints, named
+from calib.data.recordings.recording import named
+from calib.data.schema import Joints
 from calib.errors import UsageError, refuse_data, refused_as, require, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 

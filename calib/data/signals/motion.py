@@ -17,9 +17,10 @@ from scipy.interpolate import CubicSpline
 from calib.config import strict
 from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.archives import read_archived_positions
-from calib.data.recordings.recording import Joints, Recording, read_only
+from calib.data.recordings.recording import Recording, read_only
 from calib.data.recordings.recording_files import read_positions
 from calib.data.recordings.recording_options import RecordingOptions
+from calib.data.schema import Joints
 from calib.data.signals import filtering
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
 from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample

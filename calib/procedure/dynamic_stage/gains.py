@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.recordings.recording import Joints, parse_cut
+from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_files import read_recording
+from calib.data.schema import Joints
 from calib.data.signals.motion import Motion, make_motion
 from calib.errors import UsageError
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains

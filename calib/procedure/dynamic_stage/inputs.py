@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Joints, Recording, earlier
+from calib.data.recordings.recording import Recording, earlier
 from calib.data.recordings.recording_files import read_recording
+from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample, with_reference
 from calib.data.signals.resampling import Resampled
@@ -21,9 +22,9 @@ from calib.identification.identify_options import FileSettings, IdentifyOptions
 from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
-from calib.procedure.robot_kinds import Mechanism
+from calib.procedure.robot_kinds import Mechanism, joints_of
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain, joint_kinds
+from calib.robot.chain import Chain
 from calib.robot.description import remarks
 from calib.robot.library import load_calibrated, resolve
 from calib.units import TORQUE
@@ -243,12 +244,6 @@ def read_motion(
 
 def _joints(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(one) for one in values)
-
-
-def joints_of(chain: Any) -> Joints:
-    """Return the names and limits of the joints of an arm or mechanism, for checking recordings."""
-    limits = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("lower", "upper", "effort"))
-    return Joints(chain.joint_names, tuple(joint_kinds(chain)), *limits)
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:

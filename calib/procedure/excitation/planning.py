@@ -19,6 +19,7 @@ from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Expect, numbers
 from calib.data.csv_table import read_header
 from calib.data.poses.pose_lists import Targets, read_poses, read_targets
+from calib.data.schema import Joints
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
@@ -73,9 +74,9 @@ def read_waypoints(
     if not isinstance(given, Path):
         targets = Targets.of(given)
     elif {"x", "x_target"} & set(read_header(given)[0]):
-        targets = read_targets(given, chain.joint_names, kinds=joint_kinds(chain))
+        targets = read_targets(given, Joints(chain.joint_names, joint_kinds(chain)))
     else:
-        targets = Targets.of(read_poses(given, chain.joint_names, kinds=joint_kinds(chain)))
+        targets = Targets.of(read_poses(given, Joints(chain.joint_names, joint_kinds(chain))))
     if targets.position is None and targets.q is not None:
         return read_poses(targets.q, chain.joint_names)
     goal = Goal(Installation(chain), 3 if targets.rotation is None else 6, lower, upper)

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.recordings.recording import Joints, Recording
+from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording
+from calib.data.schema import Joints
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, require
 from calib.folders import METRICS

@@ -16,9 +16,10 @@ from calib.extensions import needed
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.repeatability import repeated, repeated_rows
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.robot_kinds import joints_of
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection
-from calib.robot.chain import Chain, joint_kinds
+from calib.robot.chain import Chain
 from calib.robot.description import remarks
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.formats.urdf_tree import text
@@ -215,15 +216,15 @@ def read_file(
         each, chain, options: what (or a block in memory, which is checked alike), for whom, and how.
         like: blocks read before; images of the same size are taken to be by the same camera.
     """
-    path, limits, kinds = _path(each), (chain.lower, chain.upper), joint_kinds(chain)
+    path, joints = _path(each), joints_of(chain)
     own = options.for_file(path)
     if not isinstance(each, (str, Path)):
         fits = tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n
-        blocks = [check_block(each, own, kinds, limits) if fits else each]
+        blocks = [check_block(each, own, joints) if fits else each]
     elif is_image_folder(path):
-        blocks = [needed("image_folders").read_images(path, chain.joint_names, own, kinds=kinds, limits=limits)]
+        blocks = [needed("image_folders").read_images(path, joints, own)]
     else:
-        blocks = read_measurements(path, chain.joint_names, own, kinds=kinds, limits=limits)
+        blocks = read_measurements(path, joints, own)
     blocks = [needed("camera_guess").complete_camera(chain, b, like) if b.kind == IMAGES else b for b in blocks]
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only

@@ -24,6 +24,7 @@ from calib.procedure.measuring.prediction import table as outlook_table
 from calib.procedure.measuring.prediction import write as write_prediction
 from calib.procedure.measuring.run import Drivable, Exchange, Run, RunSettings, drivable
 from calib.procedure.measuring.run import lines as ways
+from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from poses.candidates import draw_candidates
@@ -149,7 +150,7 @@ def choose(
     before = value = None
     notes = list(limits.notes)
     if existing is not None:
-        q = read_poses(existing, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
+        q = read_poses(existing, joints_of(chain))
         before = jacobian(q)
         value = observability(before, index) or None
         if not is_feasible(space, q).all():

@@ -32,6 +32,7 @@ from calib.procedure.dynamic_stage.identify import Assessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
+from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.records import read_json
 from calib.robot.chain import Chain
@@ -126,7 +127,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     """
     chain, options = load_calibrated(session.fit.path).chain, options_of(session)
     own = options.file_settings(str(path))
-    recording = read_recording(str(path), inputs.joints_of(chain), own.recording)
+    recording = read_recording(str(path), joints_of(chain), own.recording)
     rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)  # as identification takes it
     sensors = ", and sensors behind the gears" if recording.tau_link is not None else ""
     notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]

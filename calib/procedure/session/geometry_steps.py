@@ -19,6 +19,7 @@ from calib.data.poses import IMAGES
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pose_lists import MAX_JOINT_DIFFERENCE, check_against, filled_in, read_poses, write_poses
+from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import needed
 from calib.folders import write_staged
@@ -192,7 +193,7 @@ def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     path = session.path(f"2-poses/{name}.csv")
     if not session.settings.poses.plan or not path.exists():
         return None
-    return read_poses(path, chain.joint_names, kinds=joint_kinds(chain))
+    return read_poses(path, Joints(chain.joint_names, joint_kinds(chain)))
 
 
 def arrive(session: Session, say: Say) -> list[str]:

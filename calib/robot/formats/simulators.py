@@ -39,7 +39,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
     ends = [one[:3, 3] for one in (*placed[1:], chain.tail)]
     for number, k in enumerate(chain.driven.tolist()):
         element, name = chain.elements[k], joint_name(chain, k)
-        parent = ET.SubElement(parent, "body", name=f"{name}_body", **_placed(placed[number]))
+        parent = ET.SubElement(parent, "body", {"name": f"{name}_body", **_placed(placed[number])})
         if bodies[number].any():
             mass, centre, (xx, xy, xz, yy, yz, zz) = centred(bodies[number])
             full = numbers_text(np.array([xx, yy, zz, xy, xz, yz]))
@@ -60,7 +60,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
         if np.linalg.norm(ends[number]) > 1e-3:
             shape = {"type": "capsule", "fromto": f"0 0 0 {numbers_text(ends[number])}", "size": "0.03"}
             ET.SubElement(parent, "geom", shape, contype="0", conaffinity="0", rgba="0.6 0.6 0.6 1")
-    ET.SubElement(parent, "site", name=f"{chain.tip}_tip", **_placed(chain.tail))
+    ET.SubElement(parent, "site", {"name": f"{chain.tip}_tip", **_placed(chain.tail)})
     root.extend([ties] if len(ties) else [])
     return xml_text(root)
 

@@ -23,11 +23,12 @@ from calib import files
 from calib.data.poses.measurements import Poses, Positions
 from calib.data.poses.pose_lists import read_poses
 from calib.data.recordings.recording import Recording
+from calib.data.schema import Joints
 from calib.dynamics.rigid_body import gravity_torques
 from calib.geometry.installation import Installation, see
 from calib.records import shaped
 from calib.robot.calibrated import evaluate
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
 from calib.rooms.cells.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 
@@ -166,10 +167,10 @@ def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Genera
 
 def planned_poses(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
     """Yield the pose lists planned by the session in `folder` for an arm: number, name when measured, q (m, n)."""
-    kinds = [joint.kind for joint in arm.joints]
+    joints = Joints(arm.joint_names, joint_kinds(arm))
     for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
         if (path := folder / f"2-poses/{plan}.csv").exists():
-            yield number, name, read_poses(path, arm.joint_names, kinds=kinds)
+            yield number, name, read_poses(path, joints)
 
 
 def write_measured(measured: Positions, path: str | Path, degrees: bool = True) -> Path:

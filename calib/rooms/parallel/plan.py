@@ -16,9 +16,8 @@ import numpy as np
 from calib.api.motions import MotionPlan
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
-from calib.procedure.dynamic_stage.inputs import joints_of
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
-from calib.procedure.robot_kinds import refuse_unread
+from calib.procedure.robot_kinds import joints_of, refuse_unread
 from calib.records import shaped
 from calib.rooms.parallel.excite import actuator_bounds, read_model, write_motion
 from calib.rooms.parallel.loop_fit import read_coordinates, read_rows

@@ -12,6 +12,7 @@ import numpy as np
 from calib.config import read_toml
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.pose_lists import read_poses
+from calib.data.schema import Joints
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError, refuse_option, require
 from calib.geometry import installation
@@ -171,7 +172,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(meshes),
         tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
         tuple(
-            (path.stem, read_poses(path, chain.joint_names, kinds=joint_kinds(chain)))
+            (path.stem, read_poses(path, Joints(chain.joint_names, joint_kinds(chain))))
             for path in plans
             if chain and not is_run(path)
         ),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from measured_rows import JOINTS, POSE
+from measured_rows import POSE, within
 
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pose_files import read_measurements
@@ -17,7 +17,7 @@ SIGMAS = f"{XYZ},sigma_x,sigma_y,sigma_z"
 
 def refused(path, words, row=None, column=None, options=None, **more):
     with pytest.raises(MeasurementError, match=words) as error:
-        read_measurements(path, JOINTS, options, **more)
+        read_measurements(path, within(**more), options)
     assert str(error.value.file) == str(path)
     assert (error.value.row, error.value.column) == (row, column)
     assert str(path) in str(error.value)
@@ -155,10 +155,10 @@ def test_a_spoiled_file_is_refused_at_its_cell(write, good, header, spoil, words
     refused(write(header, spoil(good)), words, row, column, **more)
 
 
-@pytest.mark.parametrize("limits", [None, WIDE])
+@pytest.mark.parametrize("limits", [(None, None), WIDE])
 def test_degrees_under_a_rad_header(write, good, limits):
     rows = [[*np.rad2deg(row[:3]), *row[3:]] for row in good]
-    first = next(i for i, row in enumerate(rows) if abs(row[0]) > (6.6 if limits is None else 3))
+    first = next(i for i, row in enumerate(rows) if abs(row[0]) > (3 if limits is WIDE else 6.6))
     refused(write(POSE, rows), r"looks like deg; if so, name the column 'q1 \[deg\]'", first + 1, "q1", limits=limits)
 
 
@@ -166,14 +166,14 @@ def test_a_pose_outside_the_joint_limits(write, good):
     path = write(POSE, put(5, 1, 3.2)(good))
     words = "3.2 rad is outside the limits -3 to 3 rad of elbow: .*check_limits = false"
     refused(path, words, 6, "q2", limits=WIDE)
-    (block,) = read_measurements(path, JOINTS, FileOptions(check_limits=False), limits=WIDE)
+    (block,) = read_measurements(path, within(WIDE), FileOptions(check_limits=False))
     assert any("elbow is outside its limits" in note for note in block.notes)
 
 
 def test_swapped_joint_columns_show_in_the_limits(write, good):
     rows = [[row[0], 0.3 * abs(row[1]) - 2.9, *row[2:]] for row in good]
     limits = ([-2.9, -3.0, -2.9], [2.9, 0.1, 2.9])
-    assert len(read_measurements(write(POSE, rows), JOINTS, limits=limits)[0]) == 10
+    assert len(read_measurements(write(POSE, rows), within(limits))[0]) == 10
     first = next(i for i, row in enumerate(good) if row[0] > 0.1) + 1
     path = write(POSE.replace("q1,q2", "q2,q1"), rows)
     refused(path, "outside the limits -3 to 0.1 rad of elbow.*are joint columns swapped", first, "q2", limits=limits)

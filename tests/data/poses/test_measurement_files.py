@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from measured_rows import JOINTS, POSE
+from measured_rows import POSE, within
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.columns import MATRIX
@@ -12,7 +12,7 @@ from calib.errors import MeasurementError
 
 
 def read(path, options=None, **more):
-    (block,) = read_measurements(path, JOINTS, options, **more)
+    (block,) = read_measurements(path, within(**more), options)
     return block
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from calib.data.poses.measurements import Planes
 from calib.data.poses.pose_lists import check_against, read_poses, write_poses
+from calib.data.schema import Joints
 from calib.errors import CalibError, MeasurementError
 
 NAMES = ("a", "b", "c", "d")
@@ -23,7 +24,7 @@ def measured(q, rows=None):
 def test_round_trip(tmp_path, plan, unit):
     kinds = ("prismatic", "revolute", "revolute", "continuous")
     path = write_poses(tmp_path / "poses.csv", plan, NAMES, unit=unit, kinds=kinds)
-    np.testing.assert_allclose(read_poses(path, NAMES, kinds=kinds), plan, rtol=1e-11)
+    np.testing.assert_allclose(read_poses(path, Joints(NAMES, kinds)), plan, rtol=1e-11)
     assert path.read_text().splitlines()[0] == ("a,b,c,d" if unit == "rad" else "a,b [deg],c [deg],d [deg]")
 
 
@@ -42,7 +43,7 @@ def test_one_pose_is_a_list_too(tmp_path):
 def test_limits_hold_for_read_lists(tmp_path, plan):
     path = write_poses(tmp_path / "poses.csv", plan, NAMES)
     with pytest.raises(MeasurementError, match="outside the limits -1 to 1 rad of a"):
-        read_poses(path, NAMES, limits=([-1] * 4, [1] * 4))
+        read_poses(path, Joints(NAMES, (), [-1] * 4, [1] * 4))
 
 
 def test_as_planned_in_any_order(plan):

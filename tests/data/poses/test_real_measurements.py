@@ -8,6 +8,7 @@ import pytest
 
 from calib.data.poses.fit_options import FileOptions, Sigma
 from calib.data.poses.pose_files import joint_columns, read_measurements
+from calib.data.schema import Joints
 
 
 def load(data: Path, file: str, urdf: str, names: list[str] | None = None, options: FileOptions | None = None):
@@ -17,7 +18,7 @@ def load(data: Path, file: str, urdf: str, names: list[str] | None = None, optio
     spans = [joints[name].find("limit") for name in names]
     limits = tuple([float(span.get(side, "nan")) for span in spans if span is not None] for side in ("lower", "upper"))
     kinds = [joints[name].get("type", "") for name in names]
-    (block,) = read_measurements(path, names, options, kinds=kinds, limits=(limits[0], limits[1]))
+    (block,) = read_measurements(path, Joints(tuple(names), kinds, *map(np.array, limits)), options)
     return block
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
+from calib.data.schema import Joints
 from calib.errors import MeasurementError, UsageError
 
 

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.recordings.recording import Joints, Recording, parse_cut
+from calib.data.recordings.recording import Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
+from calib.data.schema import Joints
 from calib.errors import MeasurementError, UsageError
 
 LIMITS = {"lower": np.full(3, -3.0), "upper": np.full(3, 3.0), "effort": np.full(3, 100.0)}

@@ -26,7 +26,7 @@ from calib.data.csv_table import Table, read_table
 from calib.data.poses import BOARD, CORNERS, JOINTS, plausible
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.plausible import Limits
+from calib.data.schema import Joints
 from calib.errors import CalibError, MeasurementError, UsageError, counted, listing, require
 from calib.rooms.camera.board import Board, corners, read_board
 from calib.rooms.camera.image_findings import coverage_words
@@ -39,30 +39,28 @@ Progress = Callable[[int, int, str], None]
 
 def read_images(
     path: str | Path,
-    joints: Sequence[str],
+    joints: Joints | Sequence[str],
     options: FileOptions | None = None,
     *,
-    kinds: Sequence[str] | None = None,
-    limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> Pixels:
     """Return the measurements of a folder of images for a robot with these joints.
 
     Args:
         path: of the folder.
-        joints, kinds, limits: as `calib.data.poses.pose_files.read_measurements`.
+        joints: as `calib.data.poses.pose_files.read_measurements`.
         options: see there; [camera] is about images.
         progress: called with (done, total, image).
 
     Raises:
         MeasurementError: where a file is missing or cannot be, or no three images are of use.
     """
-    path, options = Path(path), options or FileOptions()
+    path, robot, options = Path(path), Joints.of(joints), options or FileOptions()
     board = read_own_board(path)
     table = joint_table(path)
     sheet = Sheet(table, options)
-    q, columns = sheet.joints(joints)
-    notes = list(plausible.check_joints(q, sheet, columns, joints, kinds, limits))
+    q, columns = sheet.joints(robot.names)
+    notes = list(plausible.check_joints(q, sheet, columns, robot))
     found = find_corners(path, board, table.texts("image"), progress)
     names = table.texts("image")
     rows, said = _usable(names, found, path)
