@@ -6,6 +6,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     commands               typer apps of `calib`
     topics, schemas        of `calib formats`: see `calib.procedure.formats`
     methods                of identification: tuples of `calib.identification.methods.method.Method`
+    loop_results           function: problem, estimate → `calib.identification.loop.LoopResults`
+    track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
     image_folders          a module: `read_images` reads a folder of images as a block of measurements

@@ -23,7 +23,7 @@ HOMES = {
         "calib.dynamics.shape_kernels",
         "calib.rooms.parallel.mechanism.closure_kernels",
         "calib.robot.capsule_kernels",
-        "calib.simulation.loop.loop_kernels",
+        "calib.rooms.closed_loop.loop_kernels",
         "calib.rooms.studies.methods.tangent_kernels",
     ],
     "yourdfpy": ["calib.robot.formats.simulators"],

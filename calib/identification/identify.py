@@ -17,9 +17,10 @@ from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
+from calib.extensions import needed
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.methods.bias import LoopDisagreement, LoopTest, compare_with_loop, disagreement
+from calib.identification.loop import LoopResults
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
@@ -57,8 +58,7 @@ class Identification(Generic[Model]):
         condition: of the base parameters' observation matrix, as it is and with columns of unit norm.
         prior: prior of the base parameters; None if unused.
         ripples: gear ripple above the identification band, by joint; not part of the estimate's covariance.
-        bias: test of least squares for bias by the simulated closed loop, where a loop is stated.
-        unlike: how recorded torques contradict an estimate that relies on the stated loop; None if they do not.
+        loop: results of simulating the recordings' closed loop, where one is stated.
     """
 
     dynamics: Dynamics[Model]
@@ -71,8 +71,7 @@ class Identification(Generic[Model]):
     condition: tuple[float, float]
     prior: Prior | None = None
     ripples: tuple[Ripple, ...] = ()
-    bias: LoopTest = field(default_factory=LoopTest)
-    unlike: LoopDisagreement | None = None
+    loop: LoopResults = field(default_factory=LoopResults)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,7 +193,7 @@ def identify_model(
     friction = friction.fitted(found.estimate.sigma[base.b :])
     if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
-    bias = compare_with_loop(problem, found)
+    loop = LoopResults() if settings.loop is None else needed("loop_results")(problem, found)
     richer = model.with_terms(*friction.terms) if _sees_drives(model) else model
     dynamics = Dynamics(richer, np.concatenate([base.to_standard(values[: base.b]), values[base.b :]]))
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)
@@ -202,10 +201,7 @@ def identify_model(
     say("essential parameters")
     gone = _essential(found, settings)
     condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
-    unlike = disagreement(problem, found, bias)
-    return Identification(
-        dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, bias, unlike
-    )
+    return Identification(dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, loop)
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:

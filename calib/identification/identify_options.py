@@ -65,7 +65,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     [gain_identification]            # torque = gain x current, from runs without and with a payload of known mass
     unloaded = "run.npz"             # recordings of the command line, or other files
     loaded = "run_load.npz"
-    [loop]                           # the closed loop they came from: see calib.identification.loop.loop_settings
+    [loop]                           # the closed loop they came from: see calib.identification.loop
     controller = "identify"
     [constraints]                    # what parameters must satisfy, for the methods pc-*
     signs = true                     # inertia and friction of drives are not negative

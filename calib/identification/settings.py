@@ -16,7 +16,7 @@ from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
 from calib.identification.friction.friction_ladder import NAMES
-from calib.identification.loop.loop_settings import LoopSettings, check_loop
+from calib.identification.loop import LoopSettings, check_loop
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.robot.chain import Chain

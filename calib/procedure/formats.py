@@ -21,7 +21,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "options": ("the TOML file of calib fit --options", ("calib.data.poses.fit_options",)),
     "identify-options": (
         "the TOML file of calib identify --options",
-        ("calib.identification.identify_options", "calib.identification.loop.loop_settings"),
+        ("calib.identification.identify_options", "calib.identification.loop"),
     ),
     "identified": (
         "the folder that calib identify writes",

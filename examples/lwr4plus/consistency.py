@@ -45,7 +45,7 @@ from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference
 from calib.workers import workers
 
 PAYLOAD = "8"

@@ -39,14 +39,14 @@ from calib.dynamics.torque_rows import BOTH, LINK, MODELS, MOTOR, TorqueRows
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, absorb, empty
+from calib.identification.loop import Controller
 from calib.identification.rows import Case, make_case, observe
 from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots, lwr4plus
 from calib.rooms.cells.known_robots import random_fourier
-from calib.simulation.loop.closed_loop import Plant, Sensing, feed_forward, simulate, tracking_error
-from calib.simulation.loop.controllers import Controller, pd
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference, pd
+from calib.rooms.closed_loop.simulation import Plant, Sensing, feed_forward, simulate, tracking_error
 from calib.transforms import pose
 
 PAYLOAD = "8"

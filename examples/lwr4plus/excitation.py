@@ -53,7 +53,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
 from trajectories.design.optimise import design

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, log_axis, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference
 
 
 def paths(chain: Chain, motions: dict[str, Reference]) -> Figure:

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference
 
 SHARE = 0.9  # of the limits of position, velocity and torque
 INSIDE = np.linspace(0.0, 1.0, 60)

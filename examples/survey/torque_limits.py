@@ -13,9 +13,9 @@ import sys
 import numpy as np
 
 from calib.rooms.cells import known_robots
+from calib.rooms.closed_loop.simulation import Sensing, simulate
 from calib.rooms.studies.conditions import read_study
 from calib.rooms.studies.experiment import set_up
-from calib.simulation.loop.closed_loop import Sensing, simulate
 
 
 def main() -> None:

@@ -12,13 +12,13 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.identification.loop.loop_recordings import Loop
-from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
 from calib.identification.rows import make_case
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier
-from calib.simulation.loop.closed_loop import Sensing, simulate
+from calib.rooms.closed_loop.instrumental import identify_instrumental
+from calib.rooms.closed_loop.loop_recordings import Loop
+from calib.rooms.closed_loop.simulation import Sensing, simulate
 
 PLANT = known_robots.plant("tx40", coupled=True)
 MODEL = known_robots.model(PLANT)

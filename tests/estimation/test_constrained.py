@@ -5,9 +5,9 @@ import pytest
 
 from calib.errors import CalibError, NotConverged, Unidentifiable
 from calib.estimation.constrained import Definite, contradicting, from_free, restricted, within
-from calib.estimation.instrumental_variables import instrument, projected
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect, combine
+from calib.rooms.closed_loop.instrumental_variables import instrument, projected
 
 
 def problem(seed: int, p: int = 8, count: int = 100):

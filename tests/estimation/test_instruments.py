@@ -5,8 +5,8 @@ import pytest
 import scipy.signal
 
 from calib.errors import Unidentifiable
-from calib.estimation.instrumental_variables import exogeneity, instrument, iv, settled, strength
 from calib.estimation.linear import ols
+from calib.rooms.closed_loop.instrumental_variables import exogeneity, instrument, iv, settled, strength
 
 TRUTH = np.array([2.0, -1.0, 0.5])
 

@@ -13,11 +13,11 @@ from without_figures import run
 
 from calib.errors import CalibError, UsageError
 from calib.identification import identify_options
-from calib.identification.loop import loop_settings
+from calib.identification import loop as loop_settings
 from calib.identification.possible import information
 from calib.rooms.cells import known_robots
-from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
+from calib.rooms.closed_loop import controllers
+from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
 
 RATE, EVERY = 1000.0, 4
 KP, KD = np.array([4000.0, 3000.0, 500.0]), np.array([200.0, 150.0, 25.0])
@@ -35,7 +35,7 @@ def plant() -> Plant:
 
 
 @cache
-def motion(seed: int) -> references.Reference:
+def motion(seed: int) -> controllers.Reference:
     limit = np.full(3, 1.5)
     return known_robots.random_fourier(-limit, limit, np.full(3, 3.0), 16.0, RATE, 10, acceleration=15.0, seed=seed)
 
@@ -224,7 +224,7 @@ def test_every_key_of_the_loop_is_documented_and_read():
         {"loop": {"controller": "cascade", "position": 40, "velocity": [9.0, 5.0, 1.0], "reset": 0.1, "delay": 2}}
     ).settings.loop
     assert found is not None
-    made = found.stated_controller(3)
+    made = controllers.stated_controller(found, 3)
     np.testing.assert_allclose(made.kp, np.array([9.0, 5.0, 1.0]) * (40 + 10))
     np.testing.assert_allclose(made.ki, np.array([9.0, 5.0, 1.0]) * 400)
     assert made.delay == 2

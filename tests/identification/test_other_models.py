@@ -10,7 +10,7 @@ import pytest
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, UsageError
 from calib.identification.identify import chain_states, identify, identify_model
-from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.loop import LoopSettings
 from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
 

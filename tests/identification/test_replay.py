@@ -10,12 +10,12 @@ from without_figures import run
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
-from calib.identification.loop import replay as replays
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import Case, make_case
 from calib.rooms.cells import known_robots
-from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, replayed_error, simulate
+from calib.rooms.closed_loop import controllers
+from calib.rooms.closed_loop import replay as replays
+from calib.rooms.closed_loop.simulation import Plant, replayed_error, simulate
 
 PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]))
 
@@ -25,7 +25,7 @@ def plant() -> Plant:
 
 
 @cache
-def recorded() -> tuple[references.Reference, np.ndarray, Case]:
+def recorded() -> tuple[controllers.Reference, np.ndarray, Case]:
     """Return what was asked, what pushed, what came of it and the case; torques without noise."""
     limit = np.full(3, 1.2)
     asked = known_robots.random_fourier(-limit, limit, np.full(3, 2.5), 12.0, 1000.0, 8, acceleration=10.0, seed=3)
@@ -49,7 +49,7 @@ def test_the_replay_tells_how_the_true_robot_would_track(share):
     found = replays.replay(planted.arm(), dynamics, case, predicted, PD)
     motion = case.motion
     start = round(motion.t[0] * 1000)
-    followed = references.Reference(motion.t, motion.q, motion.v, motion.a)
+    followed = controllers.Reference(motion.t, motion.q, motion.v, motion.a)
     own = push[start : start + len(motion)]
     for name, ahead in ((replays.FEEDBACK, None), (replays.IDENTIFIED, predicted)):
         true = replayed_error(plant(), PD, followed, ahead, own)
@@ -80,7 +80,7 @@ def test_a_model_of_no_possible_robot_is_replayed_with_inertia_added_and_that_to
     assert found.inertia_added[2] > 0.0
     motion = case.motion
     start = round(motion.t[0] * 1000)
-    followed = references.Reference(motion.t, motion.q, motion.v, motion.a)
+    followed = controllers.Reference(motion.t, motion.q, motion.v, motion.a)
     true = replayed_error(plant(), PD, followed, predicted, push[start : start + len(motion)])
     np.testing.assert_allclose(found.rms[replays.IDENTIFIED], true, rtol=0.33)
     sound = replays.replay(planted.arm(), Dynamics(planted.model(), planted.truth()), case, predicted, PD)

@@ -11,13 +11,13 @@ from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
-from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.loop import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import make_case, observe
 from calib.robot import mdh
 from calib.rooms.cells import known_robots
-from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.rooms.closed_loop import controllers
+from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 
 RATE = 700.0
 ROWS = [
@@ -39,7 +39,7 @@ def robot() -> tuple[Plant, IdentificationModel, bases.Base]:
 
 
 @cache
-def motion(rate: float = RATE) -> references.Reference:
+def motion(rate: float = RATE) -> controllers.Reference:
     limit = np.array([1.5, 0.6])
     return known_robots.random_fourier(-limit, limit, np.full(2, 3.0), 5.0, rate, 8, acceleration=20.0, seed=5)
 

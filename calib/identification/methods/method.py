@@ -21,9 +21,7 @@ from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, empty, retriangulate
-from calib.identification.loop.loop_recordings import ClosedLoops
-from calib.identification.loop.loop_settings import LoopSettings
-from calib.identification.methods.instrumental import Instrumental
+from calib.identification.loop import LoopSettings
 from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.prior import Prior
 from calib.identification.rows import Case, ObservationRows, pool, triangulate
@@ -129,8 +127,6 @@ class MethodEstimate:
         simulations: number of closed-loop simulations.
         seconds: computing time.
         failure: reason for a missing solution, and advice.
-        instrumental: further results of the simulated closed loop, for a method that simulates.
-        loops: the simulated closed loops.
         held: the constrained estimate, for a method with constraints.
         alone: whether only values and covariance describe it, because least squares of `pooled` differs.
     """
@@ -147,8 +143,6 @@ class MethodEstimate:
     simulations: int = 0
     seconds: float = 0.0
     failure: Unidentifiable | NotConverged | None = None
-    instrumental: Instrumental | None = None
-    loops: ClosedLoops | None = None
     held: Held | None = None
     alone: bool = False
 
@@ -175,18 +169,14 @@ class MethodEstimate:
         """Return triangles on which least squares gives this estimate, with std and inflation (g,), for tests."""
         if self.alone:
             return _standing_for(self.estimate), np.ones(1), np.ones(1)
-        if self.instrumental is None:
-            if self.beforehand is None:
-                return self.pooled, self.std, self.inflation
-            known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))  # one more group of rows
-            data = replace(
-                self.pooled, factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
-                rows=frozen([*self.pooled.rows, len(self.beforehand)], int),
-            )  # fmt: skip
-            return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
-        own = self.instrumental
-        data = own.problem.testable(own.fit, own.std)
-        return data, np.ones(1), np.array([own.inflation])
+        if self.beforehand is None:
+            return self.pooled, self.std, self.inflation
+        known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))  # one more group of rows
+        data = replace(
+            self.pooled, factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
+            rows=frozen([*self.pooled.rows, len(self.beforehand)], int),
+        )  # fmt: skip
+        return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
 
 
 def _standing_for(estimate: Estimate) -> Triangles:
@@ -241,9 +231,7 @@ class Method(ABC):
         return f"{self.name:10} {self.description} ({self.source}){needs}{tuned}"
 
 
-def attempted(
-    method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate], loops: ClosedLoops | None = None
-) -> MethodEstimate:
+def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
     """Return the result of `run` on a problem with its computing time; a failure is returned as a status."""
     began = time.perf_counter()
     try:
@@ -251,7 +239,5 @@ def attempted(
     except (Unidentifiable, NotConverged) as error:
         status = next(own for kind, own in _STATUS if isinstance(error, kind))
         nothing = np.full(problem.pooled.groups, np.nan)
-        found = MethodEstimate(
-            method, status, None, problem.pooled, nothing, nothing, failure=error, loops=loops
-        )  # fmt: skip
+        found = MethodEstimate(method, status, None, problem.pooled, nothing, nothing, failure=error)
     return replace(found, seconds=time.perf_counter() - began)

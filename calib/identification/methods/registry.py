@@ -6,12 +6,9 @@ from calib.errors import UsageError, one_of
 from calib.extensions import offered
 from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OLS, PC_WLS, TLS, WLS
 from calib.identification.methods.method import Method
-from calib.identification.methods.simulated import DIDIM, IV, PC_DIDIM, PC_IV
 
 METHODS: Mapping[str, Method] = {
-    one.name: one
-    for group in ((OLS, WLS, IRLS, TLS, IV, DIDIM, PC_OLS, PC_WLS, PC_IRLS, PC_IV, PC_DIDIM), *offered("methods"))
-    for one in group
+    one.name: one for group in ((OLS, WLS, IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS), *offered("methods")) for one in group
 }
 VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from calib.folders import (
     write_staged,
 )
 from calib.identification.gains import GainRecord
-from calib.identification.methods.instrumental import Instrumental
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
@@ -168,8 +167,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
     write_covariance(folder / COVARIANCE, found.names, covariance)
     geometry_tables.write(outcome, folder)
-    if (instrumental := found.bias.found) is not None:
-        files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, _instrumental_rows(instrumental))
+    if found.loop.table:
+        files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, found.loop.table)
     held = found.fitted.held is not None and found.fitted.held.solution.binding.any()
     if found.prior is not None or held:  # else estimate and covariance say it all
         information.write(found, folder)
@@ -210,15 +209,6 @@ def read_torques(path: Path) -> dict[str, np.ndarray]:
     table = read_table(path)
     found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}
     return {name.rstrip("_"): one for name, one in found.items() if one is not None} if found["v"] is not None else {}
-
-
-def _instrumental_rows(found: Instrumental) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of both estimates of the standard model, one for each parameter."""
-    estimate = found.fit.estimate
-    columns = (estimate.values, estimate.sigma, found.ordinary.estimate.values, found.shift)
-    explained = 100.0 * found.strength.partial_r2
-    for name, unit, *numbers in zip(estimate.names, estimate.units, *columns, explained):
-        yield name, unit, *map(float, numbers)
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
-from calib.errors import CalibError, Finding, finding
+from calib.errors import Finding, finding
+from calib.extensions import offered
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
-from calib.identification.loop.replay import Replay, replay
-from calib.identification.methods.bias import LoopDisagreement
+from calib.identification.loop import Controller, LoopDisagreement, Replay
 from calib.identification.possible.solve import Contradiction, contradiction
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import Case
@@ -52,11 +52,9 @@ from calib.procedure.dynamic_stage.verdict import (
 )
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
-from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE, without_gains
 
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
-MAX_REPLAYS = 3  # recordings that are replayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +203,9 @@ def assess(
     say("tracking with the model fed forward")
     relative = inputs.unit != TORQUE
     amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
-    replays, failure = track(inputs, dynamics, found.predictions, findings.controller) if not relative else ({}, "")
+    replays, failure = {}, ""
+    for track in () if relative else offered("track"):
+        replays, failure = track(inputs, dynamics, found.predictions, findings.controller)
     if any(one.inertia_added.any() for one in replays.values()):
         use = lines_of([finding("prediction-not-simulation")])
         verdict = replace(verdict, reason="; ".join([verdict.reason, *use]))
@@ -223,31 +223,6 @@ def assess(
         **vars(found), verdict=verdict, warnings=tuple(said), noticed=noticed, tracking=replays,
         tracking_failure=failure,
     )  # fmt: skip
-
-
-def track(
-    inputs: IdentificationInputs,
-    dynamics: Dynamics,
-    predictions: Mapping[str, np.ndarray],
-    controller: Controller | None = None,
-) -> tuple[dict[str, Replay], str]:
-    """Return replays of unseen recordings (else of a training recording) by name, or why there are none.
-
-    Args:
-        predictions: case name → torques by the model.
-        controller: that was identified, where the loop's is not stated; see `calib.identification.loop.replay`.
-    """
-    chain, loop = inputs.chain, inputs.options.settings.loop
-    chosen = inputs.unseen[:MAX_REPLAYS] or inputs.cases[:1]
-    try:
-        read = (
-            None if loop is None else controller if loop.controller == "identify" else loop.stated_controller(chain.n)
-        )
-        rate = None if read is None or loop is None else loop.rate
-        replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
-        return {one.name: replace(one, unseen=bool(inputs.unseen)) for one in replays}, ""
-    except CalibError as error:
-        return {}, str(error)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -292,13 +267,12 @@ def judged(
     say = progress or (lambda words: None)
     wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
     carried, geometries = _carry(inputs, found, say)
-    loops = found.bias.loops
     say("errors on held-out time")
     errors = learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
         resting_parameters(found), (), model_findings(inputs.cases, found),
-        None if loops is None else loops.controller, errors and errors.discrepancy,
-        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.unlike,
+        found.loop.controller, errors and errors.discrepancy,
+        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.loop.disagreement,
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
     return IdentificationOutcome(

@@ -15,13 +15,11 @@ import numpy as np
 from calib.data.signals.motion import Motion
 from calib.errors import Finding
 from calib.estimation.essential import EliminationStep
-from calib.estimation.instrumental_variables import ExogeneityTest
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
-from calib.identification.loop.replay import Replay
-from calib.identification.methods.bias import LoopTest
+from calib.identification.loop import LoopMetrics, Replay
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import Binding
 from calib.identification.rows import Case
@@ -30,7 +28,6 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.records import Array, Number
-from calib.simulation.loop.controllers import Controller
 
 SCHEMA, UNSEEN_SCHEMA = 3, 2  # of metrics.json, and of unseen/report.json
 MAX_POINTS = 400  # samples per curve of the certificate (our choice)
@@ -84,56 +81,6 @@ class ConstraintMetrics:
     names: tuple[str, ...]
     binding: tuple[Binding, ...]
     postures_binding: int
-
-
-@dataclass(frozen=True, eq=False)
-class LoopMetrics:
-    """Results of a test of an estimate with instruments from a simulated loop.
-
-    Attributes:
-        failure: why there are no instruments.
-        notes: of the loops.
-        instruments: the method that simulates; `beside`: whether the estimate is another method's.
-        rounds: simulations until it settled.
-        durbin_wu_hausman: whether least squares is biased.
-        largest_shift_sigma: of a parameter from least squares.
-        cragg_donald, instruments_weak, least_partial_r2: how strong the instruments are.
-        distance_percent, simulated_torque_error_percent, strays_times: (n,) see `Instrumental`.
-        valid, explains: whether the instruments may be trusted, and explain as much as the model.
-        controller: that was simulated; of its torque, `controller_explains_percent` (n,) where it was identified.
-    """
-
-    failure: str = ""
-    notes: tuple[str, ...] = ()
-    instruments: str = ""
-    beside: bool = False
-    rounds: int = 0
-    durbin_wu_hausman: ExogeneityTest | None = None
-    largest_shift_sigma: float = 0.0
-    cragg_donald: Number = 0.0
-    instruments_weak: bool = False
-    least_partial_r2: float = 0.0
-    distance_percent: Array = ()  # type: ignore[assignment]
-    simulated_torque_error_percent: Array = ()  # type: ignore[assignment]
-    strays_times: Array = ()  # type: ignore[assignment]
-    valid: bool = True
-    explains: bool = True
-    controller: Controller | None = None
-    controller_explains_percent: Array | None = None
-
-    @classmethod
-    def of(cls, bias: LoopTest, beside: bool) -> LoopMetrics | None:
-        """Return the metrics of a test by simulation; None if no loop was stated."""
-        found, loops = bias.found, bias.loops
-        notes = () if loops is None else loops.notes
-        if found is None or loops is None:
-            return cls(bias.failure, notes) if bias.failure or notes else None
-        identified, strength = loops.identified, found.strength
-        return cls(
-            "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
-            strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
-            found.stray, found.valid, found.explains, loops.controller, identified and identified.explained,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -226,7 +173,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         unit=inputs.unit,
         switched_off=found.friction.off,
         drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
-        loop=LoopMetrics.of(found.bias, found.fitted.instrumental is None),
+        loop=found.loop.metrics,
         constraints=held and ConstraintMetrics(held.constraints.names, held.binding, held.postures),
         filters={case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
         geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),

@@ -13,7 +13,7 @@ from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.errors import Finding, finding
 from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes, compare_sizes, signs_of
 from calib.identification.checks.torque_lag import Lag
-from calib.identification.methods.bias import LoopDisagreement
+from calib.identification.loop import LoopDisagreement
 from calib.identification.possible.solve import Contradiction
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.findings import level_of, limit, settle

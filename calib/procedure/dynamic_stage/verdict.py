@@ -183,8 +183,8 @@ def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
 
 def model_findings(cases: Sequence[Case], found: Identification) -> tuple[Finding, ...]:
     """Return the findings on the model and its training motion, independent of unseen motion."""
-    loop = found.bias.findings(found.fitted.instrumental is not None)
-    return *parameter_findings(found), *loop, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)
+    own = (*parameter_findings(found), *found.loop.findings)
+    return *own, *_unmodelled(found), *_elastic(cases), *_slow_bias(cases, found)
 
 
 def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:

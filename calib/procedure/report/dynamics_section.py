@@ -9,14 +9,23 @@ import numpy as np
 
 from calib.errors import UsageError
 from calib.folders import read_estimate
-from calib.identification.loop.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay
-from calib.identification.methods.bias import MAX_SHIFT_SIGMAS
+from calib.identification.loop import (
+    CAD,
+    DAMPING,
+    FEEDBACK,
+    FLOOR,
+    FREQUENCY,
+    IDENTIFIED,
+    MAX_SHIFT_SIGMAS,
+    LoopMetrics,
+    Replay,
+)
 from calib.identification.scores import Score, relative_error_sigma
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.metrics import LoopMetrics, ModelMetrics, UnseenReport
+from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
 from calib.procedure.report import page
 from calib.records import read_rows, typed_rows

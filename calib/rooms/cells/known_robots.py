@@ -13,11 +13,11 @@ import numpy as np
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.identification.loop import Controller
 from calib.records import shaped
 from calib.robot import description, library
-from calib.simulation.loop.closed_loop import Plant
-from calib.simulation.loop.controllers import Controller, pd
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference, pd
+from calib.rooms.closed_loop.simulation import Plant
 
 
 def _fourier(

@@ -25,7 +25,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
-from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.loop import Controller, LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.identification.rows import Case, make_case, observe
@@ -35,10 +35,9 @@ from calib.rooms.cells import known_robots
 from calib.rooms.cells.cell import SimulatedInstrument, measure
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.cells.virtual_cells import perturbed_cell, rigid
+from calib.rooms.closed_loop.controllers import Reference
+from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
 from calib.rooms.studies.conditions import Condition
-from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, feed_forward, simulate
-from calib.simulation.loop.controllers import Controller
-from calib.simulation.loop.references import Reference
 
 # our choices
 MOTION_TRIES, HARMONICS = 20, 12  # motions to take the best of; harmonics of each

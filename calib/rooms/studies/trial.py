@@ -12,9 +12,9 @@ from calib.identification.methods.method import EstimateStatus, MethodEstimate
 from calib.identification.methods.registry import VERSIONS, method_named
 from calib.identification.prediction import Dynamics, predict
 from calib.rooms.cells import known_robots
+from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 from calib.rooms.studies.conditions import Condition
 from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
 FOUND = EstimateStatus.FOUND.value
 NOT_RECORDED, FAILED = "not recorded", "failed"  # beside `EstimateStatus`: the true robot, or the method, raised

@@ -12,17 +12,15 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
-from calib.estimation import instrumental_variables
-from calib.identification.loop.controller import identify_controller
-from calib.identification.loop.loop_recordings import Loop
-from calib.identification.methods import instrumental
-from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
 from calib.identification.rows import make_case
 from calib.robot import mdh
 from calib.rooms.cells import known_robots
-from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.rooms.closed_loop import controllers, instrumental, instrumental_variables
+from calib.rooms.closed_loop.identified_controller import identify_controller
+from calib.rooms.closed_loop.instrumental import identify_instrumental
+from calib.rooms.closed_loop.loop_recordings import Loop
+from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 
 RATE, EVERY = 2000.0, 4
 ROWS = [
@@ -46,7 +44,7 @@ def arm(v0: float = 0.5) -> tuple[Plant, IdentificationModel, bases.Base]:
 
 
 @cache
-def motion() -> references.Reference:
+def motion() -> controllers.Reference:
     limit = np.full(2, 1.8)
     return known_robots.random_fourier(-limit, limit, np.full(2, 4.0), 10.0, RATE, 12, acceleration=25.0, seed=5)
 
@@ -226,7 +224,7 @@ def test_what_cannot_be_done_is_said():
 
 
 def test_instruments_that_do_not_excite_a_parameter_are_named():
-    still = references.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])
+    still = controllers.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])
     run = simulate(arm()[0], PD, still, Sensing(1e-5, every=EVERY))
     recording = Recording(run.t, run.measured, run.tau, "torque", ("joint1", "joint2"))
     case = make_case("half", make_motion(recording, FilterOptions(cutoff=50.0, band=20.0, clock="stamps")))

@@ -18,12 +18,12 @@ from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import IdentifyOptions
-from calib.identification.loop.replay import Replay
 from calib.identification.scores import PredictionErrors, RelativeErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.report import charts, dynamics_figures, dynamics_section, page
 from calib.robot.calibrated import CalibratedChain
+from calib.rooms.closed_loop.replay import Replay
 from calib.units import motion_units
 
 

@@ -13,9 +13,9 @@ from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots
-from calib.simulation.loop import controllers
-from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop import controllers
+from calib.rooms.closed_loop.controllers import Reference
+from calib.rooms.closed_loop.simulation import Plant, Sensing, forward_dynamics, simulate
 from calib.transforms import displace
 
 HIGH = np.array([2.0, 1.2, 1.2, 2.0, 1.5, 2.0])
@@ -261,7 +261,7 @@ def test_the_truths_are_those_of_the_library():
 
 
 def test_the_better_model_tracks_better():
-    from calib.simulation.loop.closed_loop import tracking_error
+    from calib.rooms.closed_loop.simulation import tracking_error
 
     plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion()
     rough = replace(plant, parameters=1.2 * plant.parameters)

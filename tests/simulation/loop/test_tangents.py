@@ -10,9 +10,9 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.errors import CalibError, NotConverged
 from calib.rooms.cells import known_robots
+from calib.rooms.closed_loop import controllers
+from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate
 from calib.rooms.studies.methods.simulated_robot import simulate_tangents
-from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
 RATE = 1000.0
 SHAPES = [
@@ -36,7 +36,7 @@ def odd() -> Plant:
     return Plant(bodies_of(chain), terms, np.concatenate([inertial.ravel(), amounts]))
 
 
-def motion(n: int) -> references.Reference:
+def motion(n: int) -> controllers.Reference:
     limit = np.full(n, 0.8)
     return known_robots.random_fourier(-limit, limit, np.full(n, 2.0), 0.6, RATE, acceleration=30.0, seed=3)
 
@@ -101,7 +101,7 @@ def test_what_has_no_tangents_says_so():
         simulate_tangents(held, known_robots.controller("tx40"), reference, np.array([0]))
 
 
-def short() -> references.Reference:
+def short() -> controllers.Reference:
     return known_robots.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 0.2, 5000.0)
 
 

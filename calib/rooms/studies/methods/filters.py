@@ -22,13 +22,13 @@ import numpy as np
 
 from calib.errors import CalibError, CannotSimulate, Diverged, require
 from calib.estimation.linear import LinearFit
-from calib.identification.loop.loop_recordings import low_passed
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import Case, segments
+from calib.rooms.closed_loop.loop_recordings import low_passed
+from calib.rooms.closed_loop.simulation import forward_dynamics
 from calib.rooms.studies.methods.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.rooms.studies.methods.simulated_robot import BelievedRobot, Stepper, believed_robot, start_of, stepper
-from calib.simulation.loop.closed_loop import forward_dynamics
 
 NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider ones are no robots
 

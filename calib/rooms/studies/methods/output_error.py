@@ -23,10 +23,12 @@ from calib.estimation import nonlinear
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.estimation.whiteness import scatter
-from calib.identification.loop.loop_recordings import ClosedLoops, close_loops, low_passed, simulated_samples
 from calib.identification.methods.least_squares import WLS
-from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.rows import thinned
+from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops, low_passed, simulated_samples
+from calib.rooms.closed_loop.simulated import attempted_in_loop
+from calib.rooms.closed_loop.simulation import Sensing, simulate
 from calib.rooms.studies.methods.simulated_robot import (
     BelievedRobot,
     believed_robot,
@@ -34,7 +36,6 @@ from calib.rooms.studies.methods.simulated_robot import (
     simulate_tangents,
     start_of,
 )
-from calib.simulation.loop.closed_loop import Sensing, simulate
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class _OutputError(Method):
             return replace(plain, method=self.name)
         bodies = serial_arm(problem, self.name).bodies
         loops = close_loops(bodies, problem.cases, problem.decimator, problem.loop, problem.cad)
-        return attempted(self.name, problem, lambda: self._estimate(problem, plain, loops), loops)
+        return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, loops))
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, loops: ClosedLoops) -> MethodEstimate:
         task = _Comparison(problem, believed_robot(problem, self.name), loops, self.torques)
@@ -87,7 +88,7 @@ class _OutputError(Method):
             raise NotConverged(f"{self.name}: {found.status.value} ({step:.2g} standard deviations from rest)", fit)
         return replace(
             plain, method=self.name, status=EstimateStatus.FOUND, solution=fit, std=std if self.torques else plain.std,
-            iterations=count, simulations=task.count[0], beforehand=None, loops=loops, alone=True,
+            iterations=count, simulations=task.count[0], beforehand=None, alone=True,
         )  # fmt: skip
 
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, UsageError, refused_as, require
+from calib.identification.loop import Controller
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.rows import Case
 from calib.records import frozen, shaped
-from calib.simulation.loop.closed_loop import LOWER, Packed, Plant, body_rows, failure, layout_of, packed, sample_ticks
-from calib.simulation.loop.controllers import Controller
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference
+from calib.rooms.closed_loop.simulation import LOWER, Packed, Plant, body_rows, failure, layout_of, packed, sample_ticks
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +48,14 @@ def simulate_tangents(
         columns: (c,) indices of the parameters.
         every: control periods per sample.
         relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
-            (`calib.identification.loop.loop_recordings.Loop.design`); None: they stay.
+            (`calib.rooms.closed_loop.loop_recordings.Loop.design`); None: they stay.
 
     Raises:
         CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
         NotConverged: where the loop is unstable.
     """
+    from calib.rooms.closed_loop import loop_kernels
     from calib.rooms.studies.methods import tangent_kernels
-    from calib.simulation.loop import loop_kernels
 
     for one in plant.terms:
         require(one.form.slopes, f"term '{one.name}' ({one.shape}): no tangents for friction by load or history")
@@ -67,7 +67,7 @@ def simulate_tangents(
     model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
     scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
     status, reached = tangent_kernels.closed_loop_tangent(
-        packed(plant), (*layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
+        packed(plant), (*layout_of(plant), find), model, controller.rows, scale, reference.sampled(controller.ahead),
         reference.period, controller.smoothing(reference.period), controller.delay, float(every),
         np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
     )  # fmt: skip
@@ -99,7 +99,7 @@ class Stepper:
         Raises:
             CannotSimulate, Diverged: naming the first point that cannot be followed.
         """
-        from calib.simulation.loop import loop_kernels
+        from calib.rooms.closed_loop import loop_kernels
 
         q, v, gain = np.array(q), np.array(v), np.empty((q.shape[1], q.shape[1]))
         order, entries, shares, owners, _ = self.layout
@@ -113,8 +113,8 @@ class Stepper:
         self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float, columns: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return q, v (n,) a period later, M⁻¹ (n, n), and slopes (2 n, 2 n + columns) by q, v and parameters."""
+        from calib.rooms.closed_loop import loop_kernels
         from calib.rooms.studies.methods import tangent_kernels
-        from calib.simulation.loop import loop_kernels
 
         n = len(q)
         q, v, gain = np.array(q), np.array(v), np.empty((n, n))

@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 
 from calib.dynamics.kernels import OPTIONS
-from calib.simulation.loop.loop_kernels import (
+from calib.rooms.closed_loop.loop_kernels import (
     DIVERGED,
     FINE,
     MAX_STEPS,

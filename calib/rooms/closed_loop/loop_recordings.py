@@ -16,13 +16,12 @@ from calib.data.signals.filtering import Decimator, border, curvature, low_pass,
 from calib.data.signals.motion import ROWS, Motion
 from calib.dynamics.bodies import Bodies
 from calib.errors import CalibError, NotConverged, UsageError, refuse_data
-from calib.identification.loop.controller import IdentifiedController, identify_controller
-from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.loop import Controller, LoopSettings
 from calib.identification.rows import Case, segments
 from calib.records import frozen
-from calib.simulation.loop.closed_loop import Plant, SimulatedRun, feed_forward
-from calib.simulation.loop.controllers import Controller
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference, completed, stated_controller
+from calib.rooms.closed_loop.identified_controller import IdentifiedController, identify_controller
+from calib.rooms.closed_loop.simulation import Plant, SimulatedRun, feed_forward
 
 DEGREES = 180.0 / np.pi
 
@@ -32,8 +31,8 @@ class Loop:
     """The closed loop in which a recording was made.
 
     Attributes:
-        controller: stated, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
-            true bandwidth suffices.
+        controller: stated, identified from the log (`calib.rooms.closed_loop.identified_controller`) or guessed: a
+            third of the true bandwidth suffices.
         reference: at the controller's rate, in the recording's time, over its whole duration.
         every: control periods per recorded sample, not necessarily an integer.
         design: (n,) inertia for which the gains are stated [kg m²]; the simulated robot then gets gains times
@@ -211,7 +210,7 @@ def _controller(
     case, reference = longest
     n = case.motion.n
     if loop.controller != "identify":
-        return loop.stated_controller(n), None, ()
+        return stated_controller(loop, n), None, ()
     motion = case.motion
     band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
     found = identify_controller(
@@ -227,7 +226,7 @@ def _controller(
             found,
         )
     note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {shown}"
-    return loop.completed(found.controller, n), found, (note,)
+    return completed(found.controller, loop, n), found, (note,)
 
 
 def _fed_forward(

@@ -1,14 +1,45 @@
 """Methods that simulate the closed loop of a recording: instrumental variables, and DIDIM."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError
-from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
-from calib.identification.loop.loop_settings import LoopSettings
-from calib.identification.methods.instrumental import identify_instrumental
+from calib.estimation.triangles import Triangles
+from calib.identification.loop import LoopSettings
 from calib.identification.methods.least_squares import CONSISTENT, CONSTRAINED, WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
+from calib.rooms.closed_loop.instrumental import Instrumental, identify_instrumental
+from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LoopEstimate(MethodEstimate):
+    """Result of a method that simulates the closed loop.
+
+    Attributes:
+        loops: the simulated closed loops.
+        instrumental: further results of instrumental variables; None for other methods, and after a failure.
+    """
+
+    loops: ClosedLoops
+    instrumental: Instrumental | None = None
+
+    def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
+        """Return triangles on which least squares gives this estimate, with std and inflation (g,), for tests."""
+        if (own := self.instrumental) is None:
+            return super().testable()
+        return own.problem.testable(own.fit, own.std), np.ones(1), np.array([own.inflation])
+
+
+def attempted_in_loop(
+    method: str, problem: IdentificationProblem, loops: ClosedLoops, run: Callable[[], MethodEstimate]
+) -> LoopEstimate:
+    """Return the result of `run` on a problem with its loops and computing time; a failure is returned as a status."""
+    found = attempted(method, problem, run)
+    return found if isinstance(found, LoopEstimate) else LoopEstimate(**vars(found), loops=loops)
 
 
 @dataclass(frozen=True)
@@ -16,7 +47,7 @@ class _Simulated(Method):
     """A method that simulates the closed loop.
 
     Attributes:
-        instruments: its use of the simulated motion, see `calib.identification.methods.instrumental.ROUNDS`;
+        instruments: its use of the simulated motion, see `calib.rooms.closed_loop.instrumental.ROUNDS`;
             "": by the loop's settings.
     """
 
@@ -39,13 +70,13 @@ class _Simulated(Method):
         found = self.beside(problem, plain)
         return replace(found, seconds=plain.seconds + found.seconds)
 
-    def beside(self, problem: IdentificationProblem, plain: MethodEstimate) -> MethodEstimate:
+    def beside(self, problem: IdentificationProblem, plain: MethodEstimate) -> LoopEstimate:
         """Return the estimate, starting from the least-squares estimate `plain`."""
         model, loop = problem.model, problem.loop
         if loop is None or not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
             raise UsageError("instruments from simulation support motor torques only")
         loops = close_loops(model.bodies, problem.cases, problem.decimator, loop, problem.cad)
-        return attempted(self.name, problem, lambda: self._estimate(problem, plain, model, loop, loops), loops)
+        return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, model, loop, loops))
 
     def _estimate(
         self, problem: IdentificationProblem, plain: MethodEstimate, model: IdentificationModel, loop: LoopSettings,
@@ -56,11 +87,12 @@ class _Simulated(Method):
             inertia=loop.per_joint("inertia", model.n) if loop.inertia else None, positive=loop.positive,
             constraints=problem.constrained if self.takes_constraints else None,
         )  # fmt: skip
-        return replace(
+        result = replace(
             plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
             simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
-            instrumental=found, loops=loops, held=found.constrained,
+            held=found.constrained,
         )  # fmt: skip
+        return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": found})
 
 
 IV = _Simulated(
@@ -82,3 +114,4 @@ PC_IV, PC_DIDIM = (
     )
     for one, source in ((IV, "Janot & Wensing 2021"), (DIDIM, "Leboutet et al. 2021"))
 )  # fmt: skip
+METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)

@@ -22,7 +22,7 @@ so that the model's part shows. All of this is our choice; the judgement itself 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -30,47 +30,15 @@ from scipy.interpolate import CubicSpline
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm, added_inertia, standard
 from calib.dynamics.rigid_body import mass_matrix
-from calib.errors import require
-from calib.identification.loop.loop_recordings import periods_per_sample, take
+from calib.errors import CalibError, require
+from calib.identification.loop import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Controller, Replay
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case, segments
-from calib.records import Array, stored
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.robot.chain import Chain
-from calib.simulation.loop.closed_loop import Plant, feed_forward, replayed_error
-from calib.simulation.loop.controllers import Controller, pd
-from calib.simulation.loop.references import Reference
-
-FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
-FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
-
-
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """Tracking errors of the simulated robot on a recorded motion, as a record.
-
-    Attributes:
-        name: name of the recording.
-        seconds: duration of the replayed part.
-        controller: the feedback; `stated`: whether the user stated it.
-        terms_left_out: terms of the model that cannot be simulated; their torque is part of the disturbance.
-        inertia_added: (n,) inertia added to make the simulated robot consistent [kg m² or kg].
-        rms: kind of feedforward → (n,) rms of q - q_r [rad or m].
-        unseen: whether this motion was not used in the fit.
-    """
-
-    name: str
-    seconds: float
-    controller: Controller | None
-    stated: bool
-    terms_left_out: tuple[str, ...]
-    inertia_added: Array
-    rms: Mapping[str, Array]
-    unseen: bool = False
-
-    @stored
-    def feedback_over_model(self) -> float:
-        """Tracking error of feedback alone over that with the model fed forward, geometric mean over the joints."""
-        return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
+from calib.rooms.closed_loop.controllers import Reference, pd, stated_controller
+from calib.rooms.closed_loop.loop_recordings import periods_per_sample, take
+from calib.rooms.closed_loop.simulation import Plant, feed_forward, replayed_error
 
 
 def replay(
@@ -84,7 +52,7 @@ def replay(
         dynamics: the identified model, of motor torques (or of both).
         predicted: (N, rows) its torques along the case.
         controller: the feedback; None: the default. Torques it adds by itself are not taken.
-        rate: of the controller [Hz]; None: see `calib.identification.loop.loop_recordings.periods_per_sample`.
+        rate: of the controller [Hz]; None: see `calib.rooms.closed_loop.loop_recordings.periods_per_sample`.
 
     Raises:
         CalibError: where the rows are not the motors', or the loop is unstable.
@@ -183,3 +151,25 @@ def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference
 def _default(robot: Plant, reference: Reference) -> Controller:
     omega, inertia = 2.0 * np.pi * FREQUENCY, robot.inertia_diagonal(reference.q[::200])
     return pd(omega**2 * inertia, 2.0 * DAMPING * omega * inertia)
+
+
+def track(
+    inputs: IdentificationInputs, dynamics: Dynamics, predictions: Mapping[str, np.ndarray],
+    controller: Controller | None = None,
+) -> tuple[dict[str, Replay], str]:  # fmt: skip
+    """Return replays of unseen recordings (else of a training recording) by name, or why there are none.
+
+    Args:
+        predictions: case name → torques by the model.
+        controller: that was identified, where the loop's is not stated.
+    """
+    chain, loop, max_replays = inputs.chain, inputs.options.settings.loop, 3
+    chosen = inputs.unseen[:max_replays] or inputs.cases[:1]
+    try:
+        if loop is None or loop.controller != "identify":
+            controller = loop and stated_controller(loop, chain.n)
+        rate = None if controller is None or loop is None else loop.rate
+        replays = (replay(chain, dynamics, case, predictions[case.name], controller, rate) for case in chosen)
+        return {one.name: replace(one, unseen=bool(inputs.unseen)) for one in replays}, ""
+    except CalibError as error:
+        return {}, str(error)

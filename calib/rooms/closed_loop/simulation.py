@@ -25,9 +25,9 @@ from calib.dynamics.bodies import Bodies, upright_turn
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
+from calib.identification.loop import Controller
 from calib.records import frozen, shaped
-from calib.simulation.loop.controllers import Controller
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference
 
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
@@ -143,7 +143,7 @@ def simulate(
         CalibError: where the inertia is not positive definite, or friction too stiff for the rate.
         NotConverged: where the loop is unstable.
     """
-    from calib.simulation.loop import loop_kernels
+    from calib.rooms.closed_loop import loop_kernels
 
     sensing = Sensing() if sensing is None else sensing
     n, count = plant.bodies.n, len(reference.t)
@@ -162,7 +162,7 @@ def simulate(
     out = np.empty((5, len(tick), n))
     model = np.empty((0, 0)) if controller.model is None else body_rows(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
-        *packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
+        *packed(plant), model, controller.rows, reference.sampled(controller.ahead), drawn["sigma_q"],
         np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
         controller.smoothing(reference.period), controller.delay, float(sensing.every), q, v, out,
     )  # fmt: skip
@@ -193,7 +193,7 @@ def forward_dynamics(
     Raises:
         CalibError: where the inertia is not positive definite.
     """
-    from calib.simulation.loop import loop_kernels
+    from calib.rooms.closed_loop import loop_kernels
 
     q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
     out, count = np.empty_like(q), len(plant.parameters)
@@ -293,7 +293,7 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
 
 def failure(status: int, time: float, where: str | None = None) -> NotConverged:
     """Return the error for a failure status at `time` [s], or at `where`."""
-    from calib.simulation.loop import loop_kernels
+    from calib.rooms.closed_loop import loop_kernels
 
     place = f"at {time:.4g} s " if where is None else where
     if status == loop_kernels.SINGULAR:

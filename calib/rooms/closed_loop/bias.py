@@ -9,17 +9,17 @@ torques must side against the loop as well, beside simulated motion, which is fr
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from calib.errors import CalibError, Finding, finding
-from calib.identification.loop.loop_recordings import ClosedLoops
-from calib.identification.methods.instrumental import Instrumental
+from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, MethodEstimate
-from calib.identification.methods.simulated import IV
-
-MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
+from calib.rooms.closed_loop.instrumental import Instrumental
+from calib.rooms.closed_loop.loop_recordings import ClosedLoops
+from calib.rooms.closed_loop.simulated import IV, LoopEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +53,13 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
     """
     if problem.loop is None:
         return LoopTest()
-    if estimate.instrumental is None:
+    found = estimate if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None else None
+    if found is None:
         try:
-            estimate = IV.beside(problem, estimate)
+            found = IV.beside(problem, estimate)
         except CalibError as error:
             return LoopTest(failure=str(error))
-    return LoopTest(estimate.instrumental, estimate.loops, "" if estimate.found else str(estimate.failure))
+    return LoopTest(found.instrumental, found.loops, "" if found.found else str(found.failure))
 
 
 def _weakness(found: Instrumental) -> list[Finding]:
@@ -105,26 +106,6 @@ def _blurred(test: LoopTest) -> list[Finding]:
 SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choice)
 
 
-@dataclass(frozen=True)
-class LoopDisagreement:
-    """Comparison of an estimate that relies on the stated loop with one that does not.
-
-    Attributes:
-        method, beside: methods of the two estimates.
-        parameter, sigmas: the parameter with the largest difference, and that in combined standard deviations.
-        left, beside_left: by torque row, unexplained share of the torque in the band, for each estimate [%].
-        factor: by torque row, torque by the first estimate over that by the other.
-    """
-
-    method: str
-    beside: str
-    parameter: str
-    sigmas: float
-    left: tuple[float, ...]
-    beside_left: tuple[float, ...]
-    factor: tuple[float, ...]
-
-
 def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
     """Return how recorded torques contradict an output-error estimate; None if they do not, or for another method.
 
@@ -133,7 +114,7 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
         found: the estimate.
         test: result of instruments; least squares replaces it if absent.
     """
-    if not (found.found and found.alone and found.loops is not None):
+    if not (found.found and found.alone and isinstance(found, LoopEstimate)):
         return None
     own, instruments = found.estimate, test.found
     max_beside_instruments = 1.2  # times the torque that instruments leave unexplained (our choice)
@@ -162,3 +143,35 @@ def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray)
     factors = problem.pooled.factors[:, :, :-1]
     mine, theirs = factors @ own, factors @ other
     return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))
+
+
+def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
+    """Return the results of simulating the closed loop beside an estimate of a problem."""
+    test = compare_with_loop(problem, estimate)
+    taken = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
+    return LoopResults(
+        _metrics(test, not taken), tuple(test.findings(taken)), () if test.found is None else _table(test.found),
+        test.loops and test.loops.controller, disagreement(problem, estimate, test),
+    )  # fmt: skip
+
+
+def _metrics(test: LoopTest, beside: bool) -> LoopMetrics | None:
+    """Return the metrics of a test by simulation; None if no loop was stated."""
+    found, loops = test.found, test.loops
+    notes = () if loops is None else loops.notes
+    if found is None or loops is None:
+        return LoopMetrics(test.failure, notes) if test.failure or notes else None
+    identified, strength = loops.identified, found.strength
+    return LoopMetrics(
+        "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
+        strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
+        found.stray, found.valid, found.explains, loops.controller, identified and identified.explained,
+    )  # fmt: skip
+
+
+def _table(found: Instrumental) -> tuple[tuple[Any, ...], ...]:
+    """Return the rows of both estimates of the standard model, one for each parameter."""
+    estimate = found.fit.estimate
+    columns = (estimate.values, estimate.sigma, found.ordinary.estimate.values, found.shift)
+    explained = 100.0 * found.strength.partial_r2
+    return tuple(zip(estimate.names, estimate.units, *(one.tolist() for one in (*columns, explained))))

@@ -14,9 +14,9 @@ import numpy as np
 
 from calib.data.signals.filtering import border, low_pass
 from calib.errors import MeasurementError
+from calib.identification.loop import Controller
 from calib.records import frozen, shaped
-from calib.simulation.loop.controllers import Controller, pd
-from calib.simulation.loop.references import Reference
+from calib.rooms.closed_loop.controllers import Reference, pd
 
 BAND = 20.0  # [Hz] the usual bandwidth of an industrial position loop
 ORDERS = (0, 1)  # of a PD; more for a controller with memory, at the price of noise

@@ -28,7 +28,8 @@ from calib.estimation.triangles import (
     retriangulate,
     solve_triangle,
 )
-from calib.records import Number, shaped, stored
+from calib.identification.loop import ExogeneityTest
+from calib.records import shaped
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,30 +54,6 @@ class InstrumentStrength:
     @property
     def weak(self) -> bool:
         return self.cragg_donald < 10.0
-
-
-@dataclass(frozen=True)
-class ExogeneityTest:
-    """Test of the hypothesis that W is uncorrelated with the noise, hence least squares unbiased.
-
-    Attributes:
-        statistic: F of the augmented regression.
-        degrees: of freedom, numerator and denominator.
-        p: probability of a larger statistic if the claim is true.
-    """
-
-    statistic: Number
-    degrees: tuple[float, float]
-    p: float
-
-    @stored
-    def least_squares_biased(self) -> bool:
-        """Whether the test rejects least squares at the default level of `biased`."""
-        return self.biased()
-
-    def biased(self, level: float = 0.01) -> bool:
-        """Return whether the test rejects least squares at this level: use IV."""
-        return self.p < level
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,16 +25,17 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
-from calib.estimation import instrumental_variables
-from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
-from calib.identification.loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
+from calib.identification.loop import ExogeneityTest
 from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, hold, make_constraints
 from calib.identification.rows import Case, ObservationRows, observe, pool, triangulate
 from calib.records import frozen
-from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
+from calib.rooms.closed_loop import instrumental_variables
+from calib.rooms.closed_loop.instrumental_variables import Instruments, InstrumentStrength
+from calib.rooms.closed_loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
+from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
 
 MAX_ROUNDS = 10  # iterations; 3 to 6 are usual
 MAX_FOLLOWING = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
@@ -67,7 +68,7 @@ class Round:
 
     Attributes:
         change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see
-            `calib.estimation.instrumental_variables.settled`.
+            `calib.rooms.closed_loop.instrumental_variables.settled`.
         residual: standard deviation of the weighted residuals.
         retreats: number of step halvings until the parameters could be simulated.
     """

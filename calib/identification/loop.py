@@ -1,0 +1,323 @@
+"""Settings of the closed loop in which recordings were made: table [loop] of the options file.
+
+Instrumental variables (method iv) simulate that loop; with another method and a [loop], the same simulation tests
+whether least squares is biased. Gains are what the joints feel, torque per position error on the joint side::
+
+    [loop]
+    controller = "pd"                # pd, cascade, or identify: gains read from the logs (ARX, see below)
+    kp = [12000.0, 4500.0]           # pd: [N m/rad], one per joint or one for all; kd [N m s/rad], ki [N m/(rad s)]
+    kd = [90.0, 28.0]
+    position = [40.0, 40.0]          # cascade P-PI: P [1/s], velocity K [N m s/rad], reset Ti [s] (none: P-P)
+    velocity = [90.0, 28.0]
+    reset = 0.05
+    share = 1.0                      # of the reference's velocity that the velocity loop sees
+    rate = 5000.0                    # of the controller [Hz], whole multiple of the log's or not; default: the log's,
+                                     # or the least multiple of it that is 1 kHz or more
+    delay = 1                        # control periods from measurement to torque
+    limit = [130.0, 60.0]            # saturation [N m]
+    windup = 0.1                     # largest integral of the error [rad s]
+    velocity_cutoff = 200.0          # low-pass of the measured velocity [Hz]
+    reference_velocity = "derivative"  # of q_ref at the instant; or "difference": over the period before it
+    feedforward = "none"             # none; cad: the robot's own inertias; recording: column tau_ff
+    reference = "recording"          # the column q_ref (q_des, q_cmd, …); or a file, see below
+    design = [1.2, 1.5]              # inertias for which the gains are stated [kg m²], if they follow the estimate
+    inertia = [0.4, 0.5]             # of the robot the simulation starts from [kg m²]; default kd² / (2 kp)
+    instruments = "iv"               # iv, or didim: the simulated motion alone
+    positive = ["Ia1", "Fv1"]        # base parameters that must not be negative
+    band = 20.0                      # identify: up to which frequency [Hz] the gains are read
+    integral = false                 # identify: look for ki too
+
+In the simulated controller the measured velocity is a backward difference, (q_k - q_k-1) · rate, and so half a period
+late, then low-passed at velocity_cutoff; the reference's is q_ref's derivative at instant k (of a cubic spline through
+the logged samples), on time. A controller that takes the backward difference of q_ref as well needs
+``reference_velocity = "difference"``: else methods that rest on the loop (cloe, clie) find kd / (2 rate) too much
+inertia. The position error is q_ref,k - q_k, the torque is held over the period after `delay` more of them.
+
+A reference of its own is a table (CSV) or an archive (npz) with stamps and q_ref or q, no torques; its clock is the
+recording's: both count from their first sample. ``[files."run.csv"] reference = "run_ref.csv"`` states one per
+recording, relative to the options file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any
+
+import numpy as np
+
+from calib.config import strict
+from calib.config_types import Flag, Name, Names, OneOf, Positive, Real, Spread, Whole
+from calib.errors import Finding, UsageError, require
+from calib.records import Array, Number, Unbounded, frozen, stored
+
+MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
+FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
+FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
+
+CONTROLLERS = ("pd", "cascade", "identify")
+SPEEDS = ("derivative", "difference")
+AHEAD = ("none", "cad", "recording")
+INSTRUMENTS = ("iv", "didim")
+NEEDED = {"pd": ("kp", "kd"), "cascade": ("position", "velocity"), "identify": ()}
+OWNED = {"pd": ("kp", "kd", "ki"), "cascade": ("position", "velocity", "reset"), "identify": ("band", "integral")}
+
+
+GAIN = "a number above 0, or a list with one per joint"
+OTHER = "a number not below 0, or a list with one per joint"
+Gains = Annotated[tuple[Annotated[float, Real(above=0, words=GAIN)], ...], Spread(words=GAIN)]
+Gains0 = Annotated[tuple[Annotated[float, Real(least=0, words=OTHER)], ...], Spread(words=OTHER)]
+Bounds = Annotated[tuple[Annotated[float, Real(above=0, infinite=True, words=GAIN)], ...], Spread(words=GAIN)]
+
+
+@strict
+@dataclass(frozen=True)
+class LoopSettings:
+    """Settings of the loop; the module documents each key. Tuples contain one value, or one per joint."""
+
+    controller: Annotated[str, OneOf(CONTROLLERS)]
+    kp: Gains = ()
+    kd: Gains0 = ()
+    ki: Gains0 = (0.0,)
+    position: Gains = ()
+    velocity: Gains = ()
+    reset: Bounds = (np.inf,)
+    share: Annotated[float, Real(above=0, most=1.0)] = 1.0
+    rate: Annotated[float, Real(above=0, most=1e5, unit="Hz")] | None = None
+    delay: Annotated[int, Whole(0, 100, " of control periods,")] = 0
+    limit: Bounds = (np.inf,)
+    windup: Bounds = (np.inf,)
+    velocity_cutoff: Positive | None = None
+    reference_velocity: Annotated[str, OneOf(SPEEDS)] = "derivative"
+    feedforward: Annotated[str, OneOf(AHEAD)] = "none"
+    reference: Name = "recording"
+    design: Gains = ()
+    inertia: Gains = ()
+    instruments: Annotated[str, OneOf(INSTRUMENTS)] = "iv"
+    positive: Names = ()
+    band: Positive = 20.0
+    integral: Flag = False
+
+    def check_lengths(self, n: int) -> None:
+        """Raise an error for a list whose length is neither 1 nor n.
+
+        Raises:
+            UsageError: with the key.
+        """
+        for key in (one.name for one in fields(self) if isinstance(getattr(self, one.name), tuple)):
+            if key != "positive" and getattr(self, key):
+                self.per_joint(key, n)
+
+    def per_joint(self, key: str, n: int) -> np.ndarray:
+        """Return the values (n,) of a key that has one value or n."""
+        found = getattr(self, key)
+        if len(found) not in (1, n):
+            raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
+        return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()
+
+
+def check_loop(table: Any) -> Any:
+    """Return the parsed table [loop] unchanged after a check that its gains fit its controller.
+
+    Raises:
+        ValueError: for a missing controller, gains of another controller, or missing gains.
+    """
+    kind = table.get("controller") if isinstance(table, Mapping) else ""
+    if kind is None:
+        raise ValueError(f"'controller' is missing; expected one of {', '.join(CONTROLLERS)}")
+    if not isinstance(kind, str) or kind not in OWNED:
+        return table
+    for other, keys in OWNED.items():
+        wrong = [key for key in keys if key in table and key not in OWNED[kind]]
+        if wrong:
+            raise ValueError(f"'{wrong[0]}' belongs to controller '{other}', found controller '{kind}'")
+    for key in NEEDED[kind]:
+        if key not in table:
+            raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; '{key}' is missing")
+    if kind == "identify" and table.get("share", 1.0) != 1.0:
+        raise ValueError("share: not supported with controller = 'identify', which assumes share = 1")
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A sampled controller for n joints.
+
+    Attributes:
+        kp, kd, ki: (n,) [N m/rad, N m s/rad, N m/(rad s)], or the like for a prismatic joint; for computed torque
+            [1/s², 1/s, 1/s³].
+        share: (n,) share of the reference velocity in the velocity loop: 1 in a PD, less in some cascades.
+        limit: (n,) torque limit.
+        windup: (n,) limit of the error's integral [rad s].
+        ahead: (N, n) feedforward torque at the reference's instants; None for none.
+        model: (10 B,) standard parameters of the controller's own model (computed torque); None for none.
+        delay: control periods from measurement to torque.
+        cutoff: cut-off of the low-pass on the measured velocity [Hz]; None for none.
+    """
+
+    kp: Array
+    kd: Array
+    ki: Array
+    share: Array
+    limit: Unbounded
+    windup: Unbounded
+    ahead: Array | None = None
+    model: Array | None = None
+    delay: int = 0
+    cutoff: float | None = None
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.kp))
+        for name in ("kp", "kd", "ki", "share", "limit", "windup"):
+            value = np.broadcast_to(np.asarray(getattr(self, name), dtype=float), (n,))
+            object.__setattr__(self, name, frozen(np.array(value)))
+        require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid")
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Controller values (6, n) in the layout of the kernel."""
+        return np.array([self.kp, self.kd, self.ki, self.share, self.limit, self.windup])
+
+    def smoothing(self, period: float) -> float:
+        """Return the weight of a new velocity sample in the low-pass."""
+        return 1.0 if self.cutoff is None else float(1.0 - np.exp(-2.0 * np.pi * self.cutoff * period))
+
+    def scaled(self, factor: np.ndarray | float) -> Controller:
+        """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
+        return replace(self, kp=self.kp * factor, kd=self.kd * factor, ki=self.ki * factor)
+
+    def slower(self, factor: float) -> Controller:
+        """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
+        return replace(self, kp=self.kp / factor**2, kd=self.kd / factor, ki=self.ki / factor**3)
+
+    def with_feedforward(self, ahead: np.ndarray) -> Controller:
+        """Return the controller with a feedforward torque (N, n) added."""
+        return replace(self, ahead=frozen(ahead))
+
+
+@dataclass(frozen=True)
+class ExogeneityTest:
+    """Test of the hypothesis that W is uncorrelated with the noise, hence least squares unbiased.
+
+    Attributes:
+        statistic: F of the augmented regression.
+        degrees: of freedom, numerator and denominator.
+        p: probability of a larger statistic if the claim is true.
+    """
+
+    statistic: Number
+    degrees: tuple[float, float]
+    p: float
+
+    @stored
+    def least_squares_biased(self) -> bool:
+        """Whether the test rejects least squares at the default level of `biased`."""
+        return self.biased()
+
+    def biased(self, level: float = 0.01) -> bool:
+        """Return whether the test rejects least squares at this level: use IV."""
+        return self.p < level
+
+
+@dataclass(frozen=True, eq=False)
+class LoopMetrics:
+    """Results of a test of an estimate with instruments from a simulated loop.
+
+    Attributes:
+        failure: why there are no instruments.
+        notes: of the loops.
+        instruments: the method that simulates; `beside`: whether the estimate is another method's.
+        rounds: simulations until it settled.
+        durbin_wu_hausman: whether least squares is biased.
+        largest_shift_sigma: of a parameter from least squares.
+        cragg_donald, instruments_weak, least_partial_r2: how strong the instruments are.
+        distance_percent, simulated_torque_error_percent, strays_times: (n,) see `Instrumental`.
+        valid, explains: whether the instruments may be trusted, and explain as much as the model.
+        controller: that was simulated; of its torque, `controller_explains_percent` (n,) where it was identified.
+    """
+
+    failure: str = ""
+    notes: tuple[str, ...] = ()
+    instruments: str = ""
+    beside: bool = False
+    rounds: int = 0
+    durbin_wu_hausman: ExogeneityTest | None = None
+    largest_shift_sigma: float = 0.0
+    cragg_donald: Number = 0.0
+    instruments_weak: bool = False
+    least_partial_r2: float = 0.0
+    distance_percent: Array = ()  # type: ignore[assignment]
+    simulated_torque_error_percent: Array = ()  # type: ignore[assignment]
+    strays_times: Array = ()  # type: ignore[assignment]
+    valid: bool = True
+    explains: bool = True
+    controller: Controller | None = None
+    controller_explains_percent: Array | None = None
+
+
+@dataclass(frozen=True)
+class LoopDisagreement:
+    """Comparison of an estimate that relies on the stated loop with one that does not.
+
+    Attributes:
+        method, beside: methods of the two estimates.
+        parameter, sigmas: the parameter with the largest difference, and that in combined standard deviations.
+        left, beside_left: by torque row, unexplained share of the torque in the band, for each estimate [%].
+        factor: by torque row, torque by the first estimate over that by the other.
+    """
+
+    method: str
+    beside: str
+    parameter: str
+    sigmas: float
+    left: tuple[float, ...]
+    beside_left: tuple[float, ...]
+    factor: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResults:
+    """Results of simulating the recordings' closed loop beside an estimate; empty where no loop is stated.
+
+    Attributes:
+        metrics: as ``metrics.json`` stores them; None without a loop.
+        findings: on the loop, the instruments, and the bias of least squares.
+        table: rows of ``instrumental.csv``.
+        controller: that was simulated.
+        disagreement: how recorded torques contradict an estimate that relies on the stated loop; None if they do not.
+    """
+
+    metrics: LoopMetrics | None = None
+    findings: tuple[Finding, ...] = ()
+    table: tuple[tuple[Any, ...], ...] = ()
+    controller: Controller | None = None
+    disagreement: LoopDisagreement | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Tracking errors of the simulated robot on a recorded motion, as a record.
+
+    Attributes:
+        name: name of the recording.
+        seconds: duration of the replayed part.
+        controller: the feedback; `stated`: whether the user stated it.
+        terms_left_out: terms of the model that cannot be simulated; their torque is part of the disturbance.
+        inertia_added: (n,) inertia added to make the simulated robot consistent [kg m² or kg].
+        rms: kind of feedforward → (n,) rms of q - q_r [rad or m].
+        unseen: whether this motion was not used in the fit.
+    """
+
+    name: str
+    seconds: float
+    controller: Controller | None
+    stated: bool
+    terms_left_out: tuple[str, ...]
+    inertia_added: Array
+    rms: Mapping[str, Array]
+    unseen: bool = False
+
+    @stored
+    def feedback_over_model(self) -> float:
+        """Tracking error of feedback alone over that with the model fed forward, geometric mean over the joints."""
+        return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
