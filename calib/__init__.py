@@ -26,11 +26,12 @@ if TYPE_CHECKING:
     from calib.api.kinematic import GeometryFit, JointCommands, PoseSelection, compensate, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
-    from calib.api.sessions import new_session, run_sessions
     from calib.errors import CalibError
     from calib.identification.identify_options import IdentifySettings
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
+    from calib.procedure.session.commands import new_session
+    from calib.procedure.session.fleet import run_sessions
     from calib.robot.calibrated import CalibratedChain
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
@@ -40,7 +41,8 @@ _HOMES = {
     "api.motions": ("design_excitation", "plan_motion", "ExcitationDesign", "MotionPlan"),
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
     "api.exporting": ("validate", "export"),
-    "api.sessions": ("new_session", "run_sessions"),
+    "procedure.session.commands": ("new_session",),
+    "procedure.session.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),

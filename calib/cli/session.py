@@ -39,11 +39,9 @@ def new(
         poses: poses to choose for the fit
         validation: poses to measure for validation only, not fitted; 0 for none
     """
-    from calib.api.sessions import new_session
-    from calib.procedure.robot_kinds import stage_of
+    from calib.procedure.session.commands import new_session
     from calib.procedure.session.questions import checked
 
-    stage_of(given.robot, "a guided session")
     if dynamics_only:
         words = f"--dynamics-only measures nothing; the instrument is {given.instrument}"
         require(given.instrument in (None, "none"), words, UsageError)
@@ -141,13 +139,14 @@ def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
     """
     import time
 
-    from calib.api.sessions import run_sessions
     from calib.procedure.session import fleet
 
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
     with reporting() as (say, progress):
         progress(f"running {len(folders)} sessions")
-        for outcome in run_sessions(folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"):
+        for outcome in fleet.run_sessions(
+            folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"
+        ):
             outcomes.append(outcome)
             say(outcome.line())
             progress(f"{len(outcomes)} of {len(folders)} sessions")

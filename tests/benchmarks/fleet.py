@@ -9,11 +9,10 @@ import time
 from pathlib import Path
 
 from calib.procedure.session import fleet, steps
-from calib.procedure.session.commands import begin
-from calib.procedure.session.folder import locked
+from calib.procedure.session.commands import new_session
+from calib.procedure.session.folder import locked, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.virtual_cells import virtual_cell
-from calib.workers import workers
 
 ROBOTS = ("ur5", "ur10e", "panda", "tx40")
 
@@ -25,7 +24,7 @@ def quiet(words: str) -> None:
 def prepare(folder: Path, number: int) -> None:
     """Make a session whose measurements are there and whose steps are all to be made."""
     robot = ROBOTS[number % len(ROBOTS)]
-    session = begin(folder, robot, "cmm", seed=number, dynamics=False)
+    session = open_session(new_session(folder, robot, "cmm", seed=number, dynamics=False))
     with locked(session, quiet):
         steps.run_next(session, quiet, quiet, "benchmark")
     demo.simulate_measurements(session, virtual_cell(robot, number), number)
@@ -35,8 +34,8 @@ def prepare(folder: Path, number: int) -> None:
 def timed(folders: list[Path], processes: int) -> tuple[float, list[float | None]]:
     """Return wall seconds and the calibrated errors [mm]."""
     started = time.perf_counter()
-    with workers(processes) as crew:
-        outcomes = sorted(fleet.run(folders, crew, "benchmark"), key=lambda one: one.folder)
+    found = fleet.run_sessions(folders, workers=processes, command="benchmark")
+    outcomes = sorted(found, key=lambda one: one.folder)
     print(fleet.summary(outcomes, time.perf_counter() - started))
     return time.perf_counter() - started, [one.calibrated for one in outcomes]
 

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sessions import edit, quiet
+from sessions import begin, edit, quiet
 from typer.main import get_command
 from without_figures import DRAWING
 
 from calib import cli
 from calib.errors import CalibError
 from calib.procedure.session import steps
-from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, locked, open_session
 
 COMMAND = get_command(cli.app)

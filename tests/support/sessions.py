@@ -1,8 +1,10 @@
 """Sessions driven from tests: go on in silence, edit a file."""
 
 from pathlib import Path
+from typing import Any
 
 from calib.procedure.session import steps
+from calib.procedure.session.commands import new_session
 from calib.procedure.session.folder import Session, locked, open_session
 
 
@@ -14,6 +16,11 @@ def go_on(session: Session, plots: bool = False) -> steps.State | None:
     """Run a session as far as it goes; figures take most of the time, so that a test has to ask for them."""
     with locked(session, quiet):
         return steps.run_next(open_session(session.folder, plots), quiet, quiet)
+
+
+def begin(folder: Path, robot: str, instrument: str, poses: int = 40, validation: int = 20, **keys: Any) -> Session:
+    """Make a session and open it."""
+    return open_session(new_session(folder, robot, instrument, poses=poses, validation=validation, **keys))
 
 
 def edit(path: Path, old: str, new: str) -> None:

@@ -12,6 +12,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from calib.arguments import checked
 from calib.config import parse
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
@@ -25,6 +26,7 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.report import page
+from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
 from calib.procedure.session.folder import UNSEEN, VERDICT, WAYS, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
@@ -185,27 +187,43 @@ class _Stop:
     verdict: str = ""
 
 
-def begin(
-    folder: Path, robot: str, instrument: str, poses: int = 40, validation: int = 20, seed: int = 0, *,
-    base: str = "", tip: str = "", tool: Sequence[float] | None = None,
-    limits: Path | Mapping[str, Any] | None = None, dynamics: bool = True, motion: Mapping[str, Any] | None = None,
-) -> Session:  # fmt: skip
-    """Make a session in the new folder `folder`, after checking that the robot can be read.
+@checked
+def new_session(
+    folder: str | Path,
+    robot: str | Path,
+    instrument: str,
+    *,
+    poses: int = 40,
+    validation: int = 20,
+    tool: Sequence[float] | None = None,
+    limits: str | Path | Mapping[str, Any] | None = None,
+    dynamics: bool = True,
+    base: str = "",
+    tip: str = "",
+    seed: int = 0,
+    **motion: Any,
+) -> Path:
+    """Create the folder of a guided session for a robot, like `calib new`.
 
     Args:
-        robot: see `calib.robot.library`.
-        instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`; ``none``: the geometry is not fitted.
-        poses, validation: how many to choose.
-        seed: of everything random.
-        base, tip: of a URDF, empty for its own.
+        folder: new.
+        robot, base, tip: as of `calib.load`.
+        instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose``, ``other-position``, or
+            ``none``: dynamics alone, the robot's description taken as calibrated.
+        poses, validation: how many to choose for the fit, and to measure and never fit.
         tool: (3,) where the target roughly sits in the tip's frame [m].
-        limits: a file of limits, copied, that both poses and motions keep; or its tables.
+        limits: TOML file that both poses and motions keep (``calib formats limits``), or its tables.
         dynamics: identify the dynamics, too.
-        motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
+        seed: of everything random.
+        motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
+
+    Returns:
+        The folder; its ``session.toml`` says how the session goes on.
 
     Raises:
-        UsageError: for an invalid value of a key of ``session.toml``.
+        UsageError: where the folder is in use, or a value is none of these.
     """
+    stage_of(robot, "a guided session")
     device, source = instrument_named(instrument), resolve(robot)
     words = "neither geometry nor dynamics are requested: choose an instrument, or identify the dynamics"
     require(dynamics or device.measures != NOTHING, words, UsageError)
@@ -213,21 +231,23 @@ def begin(
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name, "created": "", "seed": seed, "fit": {},
-        "robot": {"file": source.name, "given": robot, "base": base, "tip": tip},
+        "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip},
         "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
         "poses": {"fit": poses, "validation": validation, "constraints": named},
-        "dynamics": {"wanted": dynamics, "limits": named, **(motion or {})},
+        "dynamics": {"wanted": dynamics, "limits": named, **motion},
     }  # fmt: skip
-    return create(folder, source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))
+    create(Path(folder), source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))
+    return Path(folder)
 
 
 def _limits(
-    stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
+    stated: str | Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
     """Return the files to copy (name -> content) for the stated, checked limits, and the name of the limits file."""
     if stated is None:
         return {}, ""
-    if isinstance(stated, Path):
+    if not isinstance(stated, Mapping):
+        stated = Path(stated)
         if motions:
             read_motion_limits(stated, chain, source)
         read_limits(stated, targets_of(chain), source)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,12 +12,14 @@ from rich.table import Table
 from rich.text import Text
 
 from calib import bug_reports, files
+from calib.arguments import checked
 from calib.errors import CalibError, TaskLost, UsageError, complaint, require
 from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
 from calib.procedure.session.folder import SETTINGS
 from calib.procedure.session.steps import DONE
 from calib.workers import Workers
+from calib.workers import workers as opened
 
 LOG = "run.log"
 WAITS, FAILED = "waits", "failed"  # what a session comes to, or `DONE`
@@ -61,13 +63,14 @@ class FleetRow:
         return f"{self.folder}: {', '.join(words)}"
 
 
-def folders_of(given: Sequence[Path]) -> list[Path]:
-    """Return the folders of sessions, given as folders or as their ``session.toml``.
+def folders_of(given: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return the folders of sessions, given as folders or as their ``session.toml``, one or several.
 
     Raises:
         UsageError: for a duplicate, or an empty list.
     """
-    found = [path.parent if path.name == SETTINGS else path for path in given]
+    paths = [Path(each) for each in ([given] if isinstance(given, (str, Path)) else given)]
+    found = [path.parent if path.name == SETTINGS else path for path in paths]
     real = [path.resolve() for path in found]
     twice = [path for path, own in zip(found, real) if real.count(own) > 1]
     if twice:
@@ -76,20 +79,41 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     return found
 
 
-def run(folders: Sequence[Path], workers: Workers, command: str, plots: bool = True) -> Iterator[FleetRow]:
-    """Run every session as far as possible, and yield each outcome when its session ends.
+@checked
+def run_sessions(
+    folders: str | Path | Sequence[str | Path],
+    *,
+    workers: str | int = 1,
+    plots: bool = True,
+    command: str = "calib.run_sessions",
+) -> Iterator[FleetRow]:
+    """Run sessions as far as possible, and yield the outcome of each; failures do not stop the others.
 
     Args:
-        folders: of the sessions.
-        workers: where they run; on other machines the folders must have the same paths.
-        command: for their records.
+        folders: of the sessions, or their ``session.toml``; one or several.
+        workers: local processes, or the address of a Dask scheduler.
         plots: whether figures are drawn.
+        command: for the sessions' records.
+
+    Returns:
+        Rows as sessions end: ``folder``, ``state`` (done, waits or failed), ``verdict``; ``print`` says what to do now.
+
+    Raises:
+        UsageError: for a session that is named twice, or where none is.
     """
-    sent = folders if workers.here else [folder.absolute() for folder in folders]
-    for number, outcome in workers.completed(partial(run_one, command=command, plots=plots), sent):
-        name = str(folders[number])
-        lost = isinstance(outcome, TaskLost)
-        yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
+    return run(folders_of(folders), opened(workers), command, plots)
+
+
+def run(
+    folders: Sequence[Path], workers: AbstractContextManager[Workers], command: str, plots: bool = True
+) -> Iterator[FleetRow]:
+    """Run every session, and yield each outcome; on workers of other machines the folders must have the same paths."""
+    with workers as crew:
+        sent = folders if crew.here else [folder.absolute() for folder in folders]
+        for number, outcome in crew.completed(partial(run_one, command=command, plots=plots), sent):
+            name = str(folders[number])
+            lost = isinstance(outcome, TaskLost)
+            yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
 
 
 def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> FleetRow:

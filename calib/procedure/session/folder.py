@@ -27,9 +27,7 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import socket
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -41,8 +39,8 @@ from calib import files
 from calib.config import parse
 from calib.config_types import Text
 from calib.data.poses import CORNERS, is_image_folder
-from calib.errors import CalibError, SessionError, command_line, refused_as
-from calib.folders import CERTIFICATE, METRICS, PARAMETERS
+from calib.errors import SessionError, command_line, refused_as
+from calib.folders import CERTIFICATE, METRICS, PARAMETERS, write_staged
 from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
@@ -197,9 +195,7 @@ def _is_measured(path: Path) -> bool:
     return path.suffix == ".csv" if path.is_file() else is_image_folder(path)
 
 
-def create(
-    folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path | str] | None = None
-) -> Session:
+def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path | str]) -> None:
     """Make a session folder, completely or not at all.
 
     Args:
@@ -214,35 +210,22 @@ def create(
     target = f"1-robot/robot{robot_file.suffix}"
     created = datetime.now().astimezone().isoformat(timespec="seconds")
     settings = replace(settings, created=created, robot=replace(settings.robot, file=target))
-    staging = folder.parent / f".{folder.name}.part"
-    try:
+    wanted, measured = settings.dynamics.wanted, settings.instrument.measures != NOTHING
+
+    def fill(staging: Path) -> None:
+        for name in (*(FOLDERS if measured else FOLDERS[:1]), *(DYNAMIC if wanted else ()), EXPORT[wanted]):
+            (staging / name).mkdir()
+        for name, source in {**copied, target: robot_file, SETTINGS: written(settings)}.items():
+            files.write(staging / name, source.read_bytes() if isinstance(source, Path) else source)
+        if folder.exists():
+            folder.rmdir()
+
+    with refused_as(SessionError, OSError, f"cannot make {folder}: {{}}; nothing was written"):
         if (folder / SETTINGS).exists():
             raise SessionError(f"{folder} is already a session; go on with: {command_line('next', folder)}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise SessionError(f"{folder} is not empty; give a new folder")
-        shutil.rmtree(staging, ignore_errors=True)
-        wanted, measured = settings.dynamics.wanted, settings.instrument.measures != NOTHING
-        for name in (*(FOLDERS if measured else FOLDERS[:1]), *(DYNAMIC if wanted else ()), EXPORT[wanted]):
-            (staging / name).mkdir(parents=True)
-        for name, source in (copied or {}).items():
-            (staging / name).parent.mkdir(parents=True, exist_ok=True)
-            if isinstance(source, Path):
-                shutil.copyfile(source, staging / name)
-            else:
-                files.write(staging / name, source)
-        shutil.copyfile(robot_file, staging / target)
-        text = written(settings)
-        parse(SessionSettings, tomllib.loads(text), str(folder / SETTINGS), SessionError)
-        files.write(staging / SETTINGS, text)
-        if folder.exists():
-            folder.rmdir()
-        os.replace(staging, folder)
-    except (OSError, CalibError) as error:
-        shutil.rmtree(staging, ignore_errors=True)
-        if isinstance(error, CalibError):
-            raise
-        raise SessionError(f"cannot make {folder}: {error.strerror or error}; nothing was written") from error
-    return open_session(folder)
+        write_staged(folder, (), fill)
 
 
 def _no_session(folder: Path) -> str:

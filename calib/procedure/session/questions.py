@@ -129,7 +129,7 @@ def with_answer(given: Answers, question: Question, text: str) -> Answers:
 
 
 def checked(given: Answers) -> dict[str, Any]:
-    """Return the arguments of `calib.api.sessions.new_session` from checked answers.
+    """Return the arguments of `calib.procedure.session.commands.new_session` from checked answers.
 
     Raises:
         UsageError: for an invalid answer.

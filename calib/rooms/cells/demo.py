@@ -4,7 +4,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from calib.geometry import installation
 from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import dynamics_steps, steps
-from calib.procedure.session.commands import begin
+from calib.procedure.session.commands import asks, new_session
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
 from calib.records import read_lines
 from calib.robot import calibrated, library
@@ -86,15 +86,17 @@ def run(
         )
         dynamics = False
     motion = MOTION if dynamics else {}
-    begun = partial(begin, folder, robot, instrument, FIT, VALIDATION, seed, dynamics=dynamics, motion=motion)
+    begin = partial(
+        new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
+    )
     if instrument == "camera":
         seen = seen_by_camera(cell)
         cell = seen.cell
         with limits_of(seen) as limits:
-            session = begun(limits=limits)
+            begin(limits=limits)
     else:
-        session = begun()
-    session = replace(session, plots=plots)
+        begin()
+    session = open_session(folder, plots)
     say(f"the cell: {cell.note}")
     with locked(session):
         waiting = steps.run_next(session, say, progress, "calib demo")
@@ -113,8 +115,6 @@ def run(
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     """Return the engineer's instructions, and the command that simulates them."""
-    from calib.procedure.session.commands import asks
-
     folder = session.folder
     return (
         *asks(session, waiting),

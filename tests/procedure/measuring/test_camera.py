@@ -7,6 +7,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from sessions import begin
 
 from calib.cli import run
 from calib.data.poses.measurements import Distances
@@ -16,7 +17,7 @@ from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.pose_limits import read_limits
-from calib.procedure.session.commands import begin, go_on
+from calib.procedure.session.commands import go_on
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.questions import cell_tables
 from calib.robot.calibrated import Deflection
@@ -91,7 +92,7 @@ def test_a_camera_as_told_is_held_against_its_view_or_said_not_to_be(cell, tmp_p
         }  # fmt: skip
         whole, part = cell_tables(**told), cell_tables(**{**told, "lens": "unknown", "stands": None})
         for name, tables in (("whole", whole), ("part", part)):
-            begin(tmp_path / name, "lwr4plus", "camera", 30, 10, 0, limits=tables, dynamics=False)
+            begin(tmp_path / name, "lwr4plus", "camera", 30, 10, limits=tables, dynamics=False)
     carried, stands = (from_xyz_rpy(**whole["camera"][key])[:3, 2] for key in ("carried", "stands"))
     np.testing.assert_allclose([carried, stands], [[0, 0, 1], [0, 0, -1]], atol=1e-5)
     seen, blind = (read_limits(tmp_path / name / "limits.toml", arm) for name in ("whole", "part"))
@@ -153,7 +154,7 @@ def shots(cell, q, seed, folder):
 @pytest.mark.slow
 def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
     with camera.limits_of(cell) as path:
-        begin(tmp_path / "s", "lwr4plus", "camera", 30, 10, 0, limits=path, dynamics=False)
+        begin(tmp_path / "s", "lwr4plus", "camera", 30, 10, limits=path, dynamics=False)
     said: list[str] = []
     stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
     asked = " ".join(stop.lines)

@@ -2,9 +2,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from sessions import edit, go_on
+from sessions import begin, edit, go_on
 
-from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.virtual_cells import virtual_cell

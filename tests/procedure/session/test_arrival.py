@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sessions import begin
 
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import take
 from calib.errors import Finding, MeasurementError, UsageError
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.session.answers import CAMERA, Answers
-from calib.procedure.session.commands import begin
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of, check_file, drift, readback
@@ -48,9 +48,7 @@ def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:
 
 
 def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:
-    session = begin(
-        tmp_path / "cell", "lwr4plus", "cmm", 5, 0, motion={"payloads": {"loaded": 3.28}, "torques": "both"}
-    )
+    session = begin(tmp_path / "cell", "lwr4plus", "cmm", 5, 0, payloads={"loaded": 3.28}, torques="both")
     for name in ("training.csv", "training_loaded.csv"):
         session.path(f"7-recorded/{name}").write_text("t\n")
     found = options_of(session)

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sessions import edit, go_on
+from sessions import begin, edit, go_on
 
 from calib import cli
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
 from calib.procedure.session import commands, steps
-from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
 from calib.rooms.cells.truth import torque_errors

@@ -9,14 +9,13 @@ import numpy as np
 import pinocchio as pin
 import planted_motion as planted
 import pytest
-from sessions import go_on
+from sessions import begin, go_on
 from without_figures import run
 
 from calib.errors import NotConverged
 from calib.procedure.export import delivery as export
 from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.session import steps
-from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session
 from calib.robot import description
 
@@ -30,7 +29,7 @@ def recorded(folder: Path, what: str) -> Session:
     The second one is held out.
     """
     robot = description.write(folder / "planted.toml", planted.arm())
-    session = begin(folder / "cell", str(robot), "none", motion=MOTION)
+    session = begin(folder / "cell", str(robot), "none", **MOTION)
     one, two = planted.motion(0), planted.motion(1)
     t = np.concatenate([one[0], one[0][-1] + 1.0 + two[0]])
     q, v, a = (np.concatenate(pair) for pair in zip(one[1:], two[1:]))

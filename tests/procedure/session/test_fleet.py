@@ -3,6 +3,7 @@
 import pickle
 import shutil
 from collections.abc import Callable, Generator, Iterable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from without_figures import run
 
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import fleet, steps
-from calib.workers import Workers, workers
+from calib.workers import Workers
 
 
 @pytest.fixture
@@ -41,8 +42,7 @@ def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -
 def test_a_failing_verdict_is_code_1(cells: Path) -> None:
     path = cells / "a/5-validation/metrics.json"
     path.write_text(path.read_text().replace('"verdict": "', '"verdict": "fail", "was": "'))
-    with workers() as crew:
-        assert [one.code for one in fleet.run([cells / "a", cells / "c"], crew, "test")] == [1, 0]
+    assert [one.code for one in fleet.run_sessions([cells / "a", cells / "c"], command="test")] == [1, 0]
 
 
 def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +60,7 @@ def test_a_robot_whose_process_dies_is_one_that_failed(cells: Path) -> None:
         yield 1, function(*given), None
         yield 0, None, TaskLost("task 1 is lost: 3 processes died of it")
 
-    found = list(fleet.run([cells / "c", cells / "d"], Workers(stream), "test"))
+    found = list(fleet.run([cells / "c", cells / "d"], nullcontext(Workers(stream)), "test"))
     assert [(one.folder, one.state, one.code) for one in found] == [(str(cells / x), "failed", 2) for x in "dc"]
     assert "3 processes died" in found[1].words and "is lost" not in found[0].words
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sessions import begin
 
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import torque_rows
@@ -15,7 +16,6 @@ from calib.errors import SessionError, UsageError
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.settings import (
     DynamicsSection,
