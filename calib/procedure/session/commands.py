@@ -16,7 +16,7 @@ from calib.arguments import checked
 from calib.config import parse
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
-from calib.errors import SessionError, UsageError, command_line, require
+from calib.errors import UsageError, command_line, require
 from calib.extensions import needed
 from calib.folders import CERTIFICATE, SESSION
 from calib.geometry.observability import targets_of
@@ -28,7 +28,17 @@ from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.folder import UNSEEN, VERDICT, WAYS, Session, create, locked, open_session, read_state
+from calib.procedure.session.folder import (
+    POSES,
+    UNSEEN,
+    VERDICT,
+    WAYS,
+    Session,
+    create,
+    locked,
+    open_session,
+    read_state,
+)
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import NOTHING, SessionSettings
@@ -41,133 +51,85 @@ from calib.robot.tables import dumps
 
 def asks(session: Session, state: State) -> tuple[str, str]:
     """Return two lines: the task at the robot, and the file to provide with its format."""
-    if state.kind == WAITING and state.step.name in ("record", "predict"):
-        return _play(session, state.step.name), _log(session, state.step.name)
-    if state.kind == WAITING and state.step.name in ("measure", "validate"):
-        name = "poses" if state.step.name == "measure" else "validation"
-        target = "measured.csv" if name == "poses" else UNSEEN
-        both = name == "poses" and not session.brought("validation")
-        return _at_the_robot(session, name, both), _form(session, target, both)
-    again = f"put it into {session.folder} and run {command_line('next', session.folder)} again"
-    return f"step {state.step.name} needs {state.words}", again
+    step, again = state.step.name, command_line("next", session.folder)
+    if state.kind == WAITING and step in ("record", "predict"):
+        task, file = _to_record(session, step)
+    elif state.kind == WAITING and step in ("measure", "validate"):
+        task, file = _to_measure(session, step)
+    else:
+        return f"step {step} needs {state.words}", f"put it into {session.folder} and run {again} again"
+    return task, f"Bring {file}; then: {again}"
 
 
-def _at_the_robot(session: Session, name: str, both: bool) -> str:
-    path = session.path(f"2-poses/{name}.csv")
-    if session.settings.instrument.measures == IMAGES:
-        return _take_images(session, path, both)
-    what = "pose" if session.settings.instrument.measures == "pose" else "position"
-    device = session.settings.instrument.name
-    if not session.settings.poses.plan or not path.exists():
-        return f"Measure the target's {what} with the {device} at poses all over the workspace."
-    ways = session.path(f"2-poses/{WAYS}")
-    order = f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
-    return (
-        f"Drive the {len(read_table(path))} poses of {path}{order if name == 'poses' and ways.exists() else ''}"
-        f"{_and_validation(session) if both else ''}, let the arm settle, measure the "
-        f"target's {what} with the {device} and log the joint angles read back. At the end, measure the "
-        "first three again to check for drift "
-        "(optional, into drift.csv)."
-    )
-
-
-def _take_images(session: Session, path: Path, both: bool) -> str:
-    """Return the instruction for taking images."""
-    where = "poses all over the workspace, with the board near, far and tilted"
-    if session.settings.poses.plan and path.exists():
-        where = f"the {len(read_table(path))} poses of {path}{_and_validation(session) if both else ''}"
-    return (
-        f"Drive {where}; at each let the arm settle for a second, take an image of the board (fixed focus, zoom and "
-        "exposure; images neither rotated nor scaled), and log the joint angles read back."
-    )
-
-
-def _and_validation(session: Session) -> str:
-    """Return the text on the validation poses, so that both lists are measured in one visit."""
-    path = session.path(f"2-poses/{UNSEEN}")
-    if not session.settings.poses.validation or not path.exists():
-        return ""
-    return f" and, into a separate file, the {len(read_table(path))} of {path} (never fitted)"
-
-
-def _form(session: Session, target: str, both: bool) -> str:
-    joints = _chain(session).joint_names
-    if session.settings.instrument.measures == IMAGES:
-        return _form_of_images(session, joints, target, both)
-    full = session.settings.instrument.measures == "pose"
+def _to_measure(session: Session, step: str) -> tuple[str, str]:
+    """Return what to measure at the robot, and the files of measurements or images to provide."""
+    settings, joints = session.settings, chain_of(session).joint_names
+    device, images = settings.instrument, settings.instrument.measures == IMAGES
+    lists = [POSES] if step == "measure" else [UNSEEN]
+    if step == "measure" and settings.poses.validation and not session.brought("validation"):
+        lists.append(UNSEEN)  # both are measured in one visit
+    sets = []
+    for path in (session.path(f"2-poses/{name}") for name in lists if settings.poses.plan):
+        if path.exists():
+            noun, unseen = "" if sets else "poses ", " (never fitted)" if sets else ""
+            sets.append(f"the {len(read_table(path))} {noun}of {path}{unseen}")
+    if sets and lists[0] == POSES and not images and (ways := session.path(f"2-poses/{WAYS}")).exists():
+        sets[0] += f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
+    where = " and, into a separate file, ".join(sets) or "poses all over the workspace"
+    files = [str(session.path("3-measured") / ("measured.csv" if name == POSES else UNSEEN)) for name in lists]
+    if images:
+        spread = "" if sets else ", with the board near, far and tilted"
+        return (
+            f"Drive {where}{spread}; at each let the arm settle for a second, take an image of the board (fixed focus, "
+            "zoom and exposure; images neither rotated nor scaled), and log the joint angles read back.",
+            f"{' and '.join(file.removesuffix('.csv') for file in files)}: images, joints.csv (image, {joints[0]} "
+            f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
+            "if the lens is known (calib formats images)",
+        )
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
-    quaternion = ", qx, qy, qz, qw" if full else ""
-    files = [str(session.path("3-measured") / target)]
-    if both and session.settings.poses.validation:
-        files.append(str(session.path(f"3-measured/{UNSEEN}")))
-    each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
-    return f"{each}; then: {command_line('next', session.folder)}"
-
-
-def _form_of_images(session: Session, joints: tuple[str, ...], target: str, both: bool) -> str:
-    """Return the instruction on where to put images, joint values and the description of the board."""
-    names = [target, *([UNSEEN] if both and session.settings.poses.validation else [])]
-    folders = " and ".join(str(session.path("3-measured") / Path(name).stem) for name in names)
+    turned = ", qx, qy, qz, qw" if device.measures == "pose" else ""
     return (
-        f"Bring {folders}: images, joints.csv (image, {joints[0]} [deg] … {joints[-1]} [deg]; one row per image), "
-        "board.toml (calib board makes boards), and camera.yaml if the lens is known (calib formats images); then: "
-        f"{command_line('next', session.folder)}"
+        f"Drive {where}, let the arm settle, measure the target's {device.measures} with the {device.name} and log "
+        "the joint angles read back. At the end, measure the first three again to check for drift (optional, into "
+        "drift.csv).",
+        f"{' and '.join(files)}, one row per pose: {columns}{turned} (calib formats measurements)",
     )
 
 
-def _play(session: Session, step: str) -> str:
-    """Return the instruction for playing and logging the motions."""
-    section = session.settings.dynamics
-    names = _motions(session, step)
-    if not section.plan:
-        return "Record two motions of all joints: one for training, and a different one for validation."
+def _to_record(session: Session, step: str) -> tuple[str, str]:
+    """Return which motions to play, and the logs to provide."""
+    section, joints = session.settings.dynamics, chain_of(session).joints
+    names = [] if step == "predict" or session.brought("training") else ["training"]
+    names += ["validation"] if section.validation and not session.brought("unseen") else []
     file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never used for training)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
     again = f" Then repeat it with {loads} on the flange, and put the label into the file's name." if loads else ""
-    return (
-        f"Play {motions}{unseen}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at "
-        "its "
-        "first row. Before that, play it at a low override to check for collisions. Log joint positions and "
-        "torques "
+    task = (
+        f"Play {motions}{unseen}, the motion {section.repeats} times each, at {section.rate:g} Hz, from rest at its "
+        "first row. Before that, play it at a low override to check for collisions. Log joint positions and torques "
         f"all the time.{again if step == 'record' else ''}"
     )
-
-
-def _motions(session: Session, step: str) -> list[str]:
-    """Return the names of the motions that are not recorded yet."""
-    names = [] if step == "predict" or session.brought("training") else ["training"]
-    return names + (["validation"] if session.settings.dynamics.validation and not session.brought("unseen") else [])
-
-
-def _log(session: Session, step: str) -> str:
-    chain = _chain(session)
-    torques = session.settings.dynamics.torques
-    first, last = chain.joint_names[0], chain.joint_names[-1]
-    unit = ["N" if joint.kind == "prismatic" else "Nm" for joint in chain.joints]
-    place = ["m" if joint.kind == "prismatic" else "deg" for joint in chain.joints]
-    columns = [f"q_{first} [{place[0]}] to q_{last} [{place[-1]}]"]
-    if torques != "link":
-        columns.append(f"tau_{first} [{unit[0]}] to tau_{last} [{unit[-1]}]")
-    if torques != "motor":
-        columns.append(f"tau_link_{first} to tau_link_{last} (the sensors')")
-    files = " and ".join(str(session.path(f"7-recorded/{name}.csv")) for name in _motions(session, step))
-    return (
-        f"Bring {files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS "
-        "bags "
-        f"work, too (calib formats recordings); then: {command_line('next', session.folder)}"
+    if not section.plan:
+        task = "Record two motions of all joints: one for training, and a different one for validation."
+    (first, place, force), (last, to_place, to_force) = (
+        (one.name, *UNITS[one.kind]) for one in (joints[0], joints[-1])
     )
-
-
-def _chain(session: Session) -> Chain:
-    try:
-        return chain_of(session)
-    except Exception as error:
-        raise SessionError(f"the robot cannot be read: {error}") from error
+    columns = [f"q_{first} [{place}] to q_{last} [{to_place}]"]
+    if section.torques != "link":
+        columns.append(f"tau_{first} [{force}] to tau_{last} [{to_force}]")
+    if section.torques != "motor":
+        columns.append(f"tau_link_{first} to tau_link_{last} (the sensors')")
+    files = " and ".join(str(session.path(f"7-recorded/{name}.csv")) for name in names)
+    return task, (
+        f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS bags "
+        "work, too (calib formats recordings)"
+    )
 
 
 Say = Callable[[str], None]
+UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}  # of a log: positions and torques
 LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
 HEAD = "# The cell, as stated to calib new; calib formats limits lists the possible keys.\n"

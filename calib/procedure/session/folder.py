@@ -48,7 +48,6 @@ from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFol
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
 from calib.records import plain
 from calib.robot.calibrated import ROBOT
-from calib.robot.chain import Chain
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
@@ -115,9 +114,10 @@ class Session:
         """Return the path of the file that a key of ``session.toml`` names; None if the key is empty."""
         return self.path(name) if name else None
 
-    def links(self, chain: Chain) -> tuple[str | None, str | None]:
-        """Return base and tip link with which the robot's file yields this chain; None, None without a URDF."""
-        return (chain.base, chain.tip) if self.robot_file.suffix == ".urdf" else (None, None)
+    @property
+    def links(self) -> dict[str, str | None]:
+        """The arm's first and last link as given to `calib new`; None: as the robot's file says."""
+        return {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
 
     @property
     def robot_file(self) -> Path:

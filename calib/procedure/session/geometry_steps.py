@@ -65,14 +65,13 @@ def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[
     """Choose poses as set in ``session.toml``, and write them, the run through them, and predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
-    base, tip = session.links(chain)
     sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
     choice = SelectionSettings(
         kind=_seen_as(instrument.measures), tools=(instrument.tool,), index=section.index, method=section.method,
         sigmas=sigmas if instrument.sigma_position else None, seed=settings.seed,
     )  # fmt: skip
     chosen = selection.choose(
-        robot_file, section.fit, choice, constraints=session.named(section.constraints), base=base, tip=tip,
+        robot_file, section.fit, choice, constraints=session.named(section.constraints), **session.links,
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
     said = any(words.startswith(VIEW_UNCHECKED) for words in chosen.unchecked)
@@ -134,9 +133,7 @@ Say = Callable[[str], None]
 
 def chain_of(session: Session) -> Chain:
     """Return the nominal arm of the session's robot."""
-    robot = session.settings.robot
-    options = _options_of(session)
-    return inputs.load_robot(session.robot_file, None, options, robot.base or None, robot.tip or None)[0]
+    return inputs.load_robot(session.robot_file, None, _options_of(session), **session.links)[0]
 
 
 def _options_of(session: Session) -> FitOptions:
@@ -168,8 +165,7 @@ def describe(session: Session, say: Say) -> list[str]:
     files.write(session.path(SUMMARY), "\n".join(lines) + "\n")
     if session.geometric:
         return [lines[0]]
-    robot = session.settings.robot
-    known = load_calibrated(session.robot_file, robot.base or None, robot.tip or None)
+    known = load_calibrated(session.robot_file, **session.links)
     session.fit.path.mkdir(exist_ok=True)
     calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
     return [lines[0], "nothing is measured: the described geometry is used"]
@@ -292,11 +288,12 @@ def _fit_settings(session: Session) -> FitSettings:
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the robot with the fit's measurements, and with validation files if asked for."""
-    chain = chain_of(session)
-    base, tip = session.links(chain)
+    chain, links = chain_of(session), session.links
+    if session.robot_file.suffix == ".urdf":  # whatever joints the files' columns name
+        links = {"base": chain.base, "tip": chain.tip}
     return inputs.gather(
         session.robot_file, session.brought("measured"), validate, options=_options_of(session),
-        settings=_fit_settings(session), base=base, tip=tip,
+        settings=_fit_settings(session), **links,
     )  # fmt: skip
 
 

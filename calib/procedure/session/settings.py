@@ -3,7 +3,7 @@
 Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
@@ -11,7 +11,6 @@ from textwrap import wrap
 from typing import Annotated, Any, get_type_hints
 
 import tomlkit
-from tomlkit.items import Comment, Trivia
 
 from calib.config import described, parse, read_toml, strict
 from calib.config_types import (  # fmt: skip
@@ -268,43 +267,25 @@ def default_keys(section: str) -> dict[str, Any]:
 
 def written(settings: SessionSettings) -> str:
     """Return the text of ``session.toml`` with these settings, every key with its comment."""
-    document = tomlkit.document()
-    for line in _HEAD:
-        document.add(tomlkit.comment(line))
-    document.add("schema", tomlkit.item(settings.schema))
-    _fill(document, settings)
-    return tomlkit.dumps(document)
+    head = [*(f"# {line}" for line in _HEAD), f"schema = {settings.schema}"]
+    return "\n".join([*head, *_lines(settings)]) + "\n"
 
 
-def _fill(table: Any, section: Any) -> None:
-    """Add the keys of a section to a table of the document, comments aligned in one column, tables last."""
-    words = described(type(section))
+def _lines(section: Any, place: str = "") -> Iterator[str]:
+    """Yield the lines of a section, the comments of its keys aligned in one column, its tables last."""
+    words, tables = described(type(section)), []
     for key in fields(section):
         value, about = getattr(section, key.name), words.get(key.name, "")
         if is_dataclass(value) or isinstance(value, Mapping):
-            inner = tomlkit.table()
-            if about:
-                inner.comment(about)
-                inner.trivia.comment_ws = "  "
-            if is_dataclass(value):
-                _fill(inner, value)
-            else:
-                inner.update(value)
-            table.add(tomlkit.nl())
-            table.add(key.name, inner)
+            head = f"[{place}{key.name}]"
+            inner = _lines(value, f"{key.name}.") if is_dataclass(value) else tomlkit.dumps(value).splitlines()
+            tables += ["", f"{head}  # {about}" if about else head, *inner]
         elif key.name != "schema":
-            _add(table, key.name, tomlkit.item(list(value) if isinstance(value, tuple) else value), about)
-
-
-def _add(table: Any, key: str, item: Any, about: str) -> None:
-    """Add a key with its comment after it; a long comment is wrapped into lines below."""
-    first, *rest = wrap(about, WIDTH - COLUMN) or [""]
-    if first:
-        item.comment(first)
-        item.trivia.comment_ws = " " * max(2, COLUMN - 2 - len(f"{key} = {item.as_string()}"))
-    table.add(key, item)
-    for line in rest:
-        table.add(Comment(Trivia(indent=" " * (COLUMN - 2), comment=f"# {line}")))
+            entry = f"{key.name} = {tomlkit.item(value).as_string()}"
+            first, *rest = wrap(about, WIDTH - COLUMN) or [""]
+            yield f"{entry:<{COLUMN - 3}} # {first}" if first else entry
+            yield from (f"{'':{COLUMN - 2}}# {line}" for line in rest)
+    yield from tables
 
 
 def example() -> str:

@@ -10,9 +10,11 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from calib.errors import SessionError
 from calib.files import fingerprint
@@ -260,32 +262,20 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
 
 def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Return a text on the differences between two sets of fingerprints."""
-    changed = [name for name in now if name in before and not _same(name, before[name], now[name])]
-    added = [name for name in sorted(set(now) - set(before)) if not _same(name, "{}", now[name])]
-    gone = sorted(set(before) - set(now))
-    parts = [f"{name} has changed" for name in changed]
-    parts += [f"{name} is new" for name in added] + [f"{name} is gone" for name in gone]
-    return ", ".join(parts)
+    changed = [name for name in now if _value(name, before.get(name, "{}")) != _value(name, now[name])]
+    parts = [f"{name} {'has changed' if name in before else 'is new'}" for name in changed]
+    return ", ".join([*parts, *(f"{name} is gone" for name in sorted(before.keys() - now))])
 
 
-def _same(name: str, before: str, now: str) -> bool:
-    """Return whether two fingerprints are equal; settings by value (3 equals 3.0, a missing key is its default).
-
-    A single key that was not there is ``{}`` before.
-    """
-    if before == now or not name.startswith(SETTINGS):
-        return before == now
+def _value(name: str, mark: str) -> Any:
+    """Return a fingerprint in comparable form; settings as values (3 equals 3.0), a missing key (``{}``) as default."""
+    if not name.startswith(SETTINGS):
+        return mark
     section, _, key = name.removeprefix(f"{SETTINGS} [").partition("]")
-    try:
-        values = [json.loads(mark) for mark in (before, now)]
-    except ValueError:
-        return False
-    if key:
-        values = [{} if mark == "{}" else {key.strip(): value} for mark, value in zip((before, now), values)]
-    if not all(isinstance(value, dict) for value in values):
-        return values[0] == values[1]
-    defaults = default_keys(section)
-    return defaults | values[0] == defaults | values[1]
+    value = json.loads(mark)
+    if key and mark != "{}":
+        value = {key.strip(): value}
+    return default_keys(section) | value if isinstance(value, dict) else value
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
@@ -338,19 +328,5 @@ def forget(session: Session, step: SessionStep) -> None:
 
 def _move_export(session: Session) -> None:
     """Rename the folder of the export after dynamics were switched on or off in ``session.toml``."""
-    before, now = session.path(EXPORT[not session.dynamic]), session.path(session.export)
-    if (now.is_dir() and any(now.iterdir())) or not before.is_dir():
-        return
-    recorded = read_state(session)
-    if now.is_dir():
-        now.rmdir()
-    os.replace(before, now)
-
-    def renamed(marks: Mapping[str, str]) -> dict[str, str]:
-        return {name.replace(f"{before.name}/", f"{now.name}/", 1): mark for name, mark in marks.items()}
-
-    made = {
-        name: replace(entry, inputs=renamed(entry.inputs), outputs=renamed(entry.outputs))
-        for name, entry in recorded.steps.items()
-    }
-    session.write_state(StateFile(made, recorded.running))
+    with suppress(OSError):  # the other folder is missing, or this one has files
+        os.replace(session.path(EXPORT[not session.dynamic]), session.path(session.export))
