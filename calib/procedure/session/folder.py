@@ -115,7 +115,7 @@ class Session:
         return self.path(name) if name else None
 
     @property
-    def links(self) -> dict[str, str | None]:
+    def links(self) -> dict[str, Any]:
         """The arm's first and last link as given to `calib new`; None: as the robot's file says."""
         return {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
 
