@@ -39,9 +39,14 @@ LEVER = 0.3  # what a turn counts as [m/rad] (our choice, as the next two)
 
 def misfit(arm: np.ndarray, seen: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
     """Return the distances (m,) [m] between B_i and S A_i X at the target; rotations count with a lever [m]."""
-    predicted = station @ arm @ tool
+    distance, turn = _apart(station @ arm @ tool, seen)
+    return np.hypot(distance, lever * turn)
+
+
+def _apart(predicted: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance (m,) [m] and the angle (m,) [rad] between poses (m, 4, 4)."""
     turn = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ seen[:, :3, :3]).magnitude()
-    return np.hypot(np.linalg.norm(predicted[:, :3, 3] - seen[:, :3, 3], axis=1), lever * turn)
+    return np.linalg.norm(predicted[:, :3, 3] - seen[:, :3, 3], axis=1), turn
 
 
 def average_pose(poses: np.ndarray) -> np.ndarray:
@@ -163,9 +168,7 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
     """
     seen = from_quaternion(position, quaternion)
     station, tool = place_pose(arm, seen)
-    predicted = station @ arm @ tool
-    turned = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ seen[:, :3, :3]).magnitude()
-    distance = np.linalg.norm(predicted[:, :3, 3] - position, axis=1)
+    distance, turned = _apart(station @ arm @ tool, seen)
     spread = float(np.sqrt(np.sum(np.var(position, axis=0))))
     return float(np.degrees(np.median(turned))), float(np.median(distance)) / max(spread, 1e-9)
 

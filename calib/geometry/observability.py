@@ -7,12 +7,11 @@ processes.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import Poses, Positions
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, Unidentifiable, UsageError, finding, one_of, require
 from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.geometry.installation import Installation, see
@@ -275,7 +274,7 @@ def observation(
 def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
     """Return the noise-free measurements of one target."""
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
-    common: dict[str, Any] = {"tool_names": (cell.tool_names[number],), "station": cell.station_names[0]}
-    if full:
-        return Poses(q, cell.chain.joint_names, poses[:, :3, 3], to_quaternion(poses), **common)
-    return Positions(q, cell.chain.joint_names, poses[:, :3, 3], **common)
+    return PoseMeasurements.of(
+        q, poses[:, :3, 3], to_quaternion(poses) if full else None, joint_names=cell.chain.joint_names,
+        tool_names=(cell.tool_names[number],), station=cell.station_names[0],
+    )  # fmt: skip

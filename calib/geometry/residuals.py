@@ -173,46 +173,35 @@ def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     return result
 
 
-@parts.register
-def _plane(measured: Planes, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """Plane residual: r = -n · (p - mean), n the normal of the fitted plane of each group."""
+@parts.register(Planes)
+@parts.register(Bars)
+def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """Residual against a plane (normal n) or a ball-bar centre c fitted to each group.
+
+    Planes: r = -n · (p - mean). Bars: r = L - |p - c|.
+    """
+    flat = isinstance(measured, Planes)
     value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
-    groups = np.unique(measured.group)
-    for group in groups:
+    groups, counts = np.unique(measured.group, return_counts=True)
+    for group in groups[counts > 3]:  # three points lie on a plane, and three lengths meet in a centre, anyway
         rows = np.flatnonzero(measured.group == group)
-        if len(rows) < 4:  # three points lie on a plane whatever the arm
-            continue
-        points = seen.point[:, rows] - seen.point[:, rows].mean(axis=1, keepdims=True)
-        axes = np.linalg.svd(points, full_matrices=False)[0]
-        value[rows] = -axes[:, 2] @ points
-        nuisance = np.column_stack([np.ones(len(rows)), points.T @ axes[:, :2]])
-        slope[:, rows] = _project(np.einsum("i,fim->fm", axes[:, 2], jacobian[:, :3, rows]), nuisance)
+        points = seen.point[:, rows]
+        if flat:
+            points = points - points.mean(axis=1, keepdims=True)
+            axes = np.linalg.svd(points, full_matrices=False)[0]
+            value[rows] = -axes[:, 2] @ points
+            unit, nuisance = axes[:, 2:], np.column_stack([np.ones(len(rows)), points.T @ axes[:, :2]])
+        else:
+            away = points - _sphere_centre(points, measured.distance[rows])[:, None]
+            length = np.linalg.norm(away, axis=0)
+            value[rows] = measured.distance[rows] - length
+            unit, nuisance = away / length, (away / length).T
+        along = np.einsum("im,fim->fm", np.broadcast_to(unit, points.shape), jacobian[:, :3, rows])
+        slope[:, rows] = _project(along, nuisance)
     sigma = None if measured.sigma is None else measured.sigma[None]
-    return [Part("plane", value[None], slope[:, None], sigma, _unknowns(measured), np.arange(len(measured)))]
-
-
-@parts.register
-def _bar(measured: Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """Ball-bar residual: r = L - |p - c|, c the fitted centre of each group."""
-    value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
-    groups = np.unique(measured.group)
-    for group in groups:
-        rows = np.flatnonzero(measured.group == group)
-        if len(rows) < 4:  # three lengths always meet in a centre
-            continue
-        points, lengths = seen.point[:, rows], measured.distance[rows]
-        away = points - _sphere_centre(points, lengths)[:, None]
-        unit = away / np.linalg.norm(away, axis=0)
-        value[rows] = lengths - np.linalg.norm(away, axis=0)
-        slope[:, rows] = _project(np.einsum("im,fim->fm", unit, jacobian[:, :3, rows]), unit.T)
-    sigma = None if measured.sigma is None else measured.sigma[None]
-    return [Part("distance", value[None], slope[:, None], sigma, _unknowns(measured), np.arange(len(measured)))]
-
-
-def _unknowns(measured: Planes | Bars) -> int:
-    """Return the number of eliminated unknowns of planes or centres: three each, or all numbers of a small group."""
-    _, counts = np.unique(measured.group, return_counts=True)
-    return int(np.minimum(counts, 3).sum())
+    unknowns = int(np.minimum(counts, 3).sum())  # all numbers of a smaller group
+    label = "plane" if flat else "distance"
+    return [Part(label, value[None], slope[:, None], sigma, unknowns, np.arange(len(measured)))]
 
 
 def _sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:

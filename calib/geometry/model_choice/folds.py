@@ -42,16 +42,20 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     """
     stations = list(dict.fromkeys(block.station for block in measured if block.has_instrument))
     if len(stations) >= 2 and all(block.has_instrument for block in measured):
-        count = min(len(stations), 2 * FOLDS)
-        members = tuple(np.full(len(b), stations.index(b.station) % count) for b in measured)
-        return Folds("stations", count, members)
-    files = list(dict.fromkeys(block.file for block in measured))
-    if len(files) >= 2 and not stations:
-        count = min(len(files), 2 * FOLDS)
-        return Folds("files", count, tuple(np.full(len(b), files.index(b.file) % count) for b in measured))
+        return _folds_of("stations", [block.station for block in measured], measured)
+    if not stations and len({block.file for block in measured}) >= 2:
+        return _folds_of("files", [block.file for block in measured], measured)
     if len(measured) == 1 and isinstance(measured[0], Sockets) and (fixtures := _fixtures(measured[0])) is not None:
         return fixtures
     return region_folds(measured, seed=seed)
+
+
+def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasurements]) -> Folds:
+    """Return folds that hold out the blocks of one name each; several names share a fold if there are too many."""
+    each = list(dict.fromkeys(names))
+    count = min(len(each), 2 * FOLDS)
+    members = [np.full(len(block), each.index(name) % count) for block, name in zip(measured, names)]
+    return Folds(kind, count, tuple(members))
 
 
 def divide(

@@ -124,44 +124,28 @@ class Comparison:
 
 
 def compare(
-    nominal: Installation,
-    calibrated: Installation,
-    blocks: Sequence[PoseMeasurements],
-    frames: str,
-    proves: bool = True,
-    seed: int = 0,
-    *,
-    alone: Installation | None = None,
-    shares_frames: bool = False,
+    cells: Sequence[Installation], blocks: Sequence[PoseMeasurements], frames: str, proves: bool = True, seed: int = 0
 ) -> Comparison:
-    """Return the errors of both arms on some rows, and of the calibrated geometry `alone` (`without_corrections`)."""
-    cells = nominal, calibrated
-    one, two = (errors(cell, blocks) for cell in cells)
-    first, second = (pair_errors(cell, blocks, seed=seed) for cell in cells)
-    rigid = None if alone is None else errors(alone, blocks)
-    corners: Any = [room(cell, blocks) for room in offered("reprojection") for cell in cells]
+    """Return the errors on some rows of the nominal and the calibrated arm, and of a third one, the URDF alone."""
+    (one, two, *alone), both = [errors(cell, blocks) for cell in cells], (cells[0], cells[1])
+    first, second = (pair_errors(cell, blocks, seed=seed) for cell in both)
+    corners: Any = tuple(room(cell, blocks) for room in offered("reprojection") for cell in both)
     return Comparison(
-        tuple(blocks), cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, repeated_poses(cells, blocks), None if None in corners else tuple(corners) or None,
+        tuple(blocks), both, (one, two), (first, second), pose_count(blocks), frames, proves,
+        alone=alone[0] if alone else None, repeated=repeated_poses(both, blocks),
+        reprojection=None if None in corners else corners or None,
     )  # fmt: skip
 
 
 def compare_unseen(
-    nominal: Installation,
-    calibrated: Installation,
-    unseen: Unseen,
-    settings: Settings,
-    seed: int = 0,
-    alone: Installation | None = None,
-    expected: ErrorModel | None = None,
+    cells: Sequence[Installation], unseen: Unseen, settings: Settings, seed: int, expected: ErrorModel | None
 ) -> Comparison:
-    """Return the errors of both arms on unseen rows; base and tool placement are refitted if these rows need it."""
+    """Return the errors of the arms on unseen rows; base and tool placement are refitted if these rows need it."""
     block, settled, thin = unseen.block, True, None
     if unseen.own_frames:
-        placed = [placed_on(cell, block, settings) for cell in (nominal, calibrated)]
-        nominal, calibrated = (each.cell for each in placed)
-        alone = None if alone is None else placed_on(alone, block, settings).cell
-        settled = all(each.solution.status.good for each in placed)
+        placed = [placed_on(cell, block, settings) for cell in cells]
+        cells = [each.cell for each in placed]
+        settled = all(each.solution.status.good for each in placed[:2])
         numbers, fitted = sum(piece.part.value.size for piece in placed[1].pieces), len(placed[1].free)
         words = "base and tool placement refitted on these rows"
         if not settled:
@@ -173,22 +157,14 @@ def compare_unseen(
         words = "those of the fit"
     else:
         words = f"those of the fit, station '{block.station}'" if block.has_instrument else "tool of the fit"
-    found = compare(
-        nominal, calibrated, [block], words, settled and thin is None and not unseen.seen, seed, alone=alone,
-        shares_frames=not (unseen.own_frames or unseen.held_out),
-    )  # fmt: skip
+    found = compare(cells, [block], words, settled and thin is None and not unseen.seen, seed)
     sizes, intervals = found.errors[1].position, None
     if expected is not None and isinstance(block, Positions) and sizes is not None:
-        sigma = expected.sigma_on(calibrated, block, unseen.own_frames)
-        intervals = _intervals(expected, block, sigma, sizes)
-    return replace(found, settled=settled, placed_by=thin, intervals=intervals)
-
-
-def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes: np.ndarray) -> Intervals:
-    """Return the error sizes (m,) [m] on rows, with σ (m,) [m] and interval predicted by an error model."""
-    beyond = np.atleast_2d(outside(block.q, expected.learnt))
-    names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
-    return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)
+        sigma, beyond = expected.sigma_on(cells[1], block, unseen.own_frames), outside(block.q, expected.learnt)
+        names = tuple(name for name, out in zip(block.joint_names, np.any(beyond, axis=0)) if out)
+        intervals = Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.any(beyond, axis=1), names)
+    shares = not (unseen.own_frames or unseen.held_out)
+    return replace(found, settled=settled, placed_by=thin, intervals=intervals, shares_frames=shares)
 
 
 def interval_cells(found: Comparison) -> np.ndarray:

@@ -259,11 +259,7 @@ def compensate(
     reached = _within(left, tolerance) & inside(q0)
     singular = inverse.conditions(after, q0) < SINGULAR
     beyond = np.zeros(q.shape, bool) if fitted.learnt is None else np.atleast_2d(outside(q, fitted.learnt))
-    found = (
-        _extrapolated(one.chain, out) if good else _missed(one.chain, *row)
-        for good, out, *row in zip(reached, beyond, q0, q, left, singular)
-    )
-    reason = tuple("" if each is None else sentence(each) for each in found)
+    reason = tuple(_reason(one.chain, *row) for row in zip(reached, beyond, q0, q, left, singular))
     say("sigmas")
     sigma, expected = _predicted_sigmas(fitted, q, frame, tool, after)
     if count == 3:
@@ -331,22 +327,22 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
     return (sizes[:, 0] <= tolerance[0]) & ~(sizes[:, 1] > tolerance[1])
 
 
-def _missed(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool) -> Finding:
-    """Return the finding why a target is not reached, from the remaining errors (2,) [m, rad]."""
+def _reason(
+    chain: Chain, reached: bool, beyond: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray,
+    singular: bool,
+) -> str:  # fmt: skip
+    """Return why a target is not reached, from the remaining errors (2,) [m, rad]; else which joints extrapolate."""
+    if reached:
+        names = [name for name, out in zip(chain.joint_names, beyond) if out]
+        return sentence(finding("command-extrapolates", joints=names)) if names else ""
     rest = {"left": left[0], "turn": None if np.isnan(left[1]) else left[1]}
     for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
         if not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
-            return finding("target-outside-limits", joint=name, value=value, low=low, high=high)
+            return sentence(finding("target-outside-limits", joint=name, value=value, low=low, high=high))
     if at := [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]:
-        return finding("at-limit", joints=at, **rest)
+        return sentence(finding("at-limit", joints=at, **rest))
     code = "near-singularity" if singular and left[0] < ASTRAY else "out-of-reach"
-    return finding(code, most=MAX_CORRECTION, **rest)
-
-
-def _extrapolated(chain: Chain, beyond: np.ndarray) -> Finding | None:
-    """Return the finding on joints (n,) of a command that are outside the measured range."""
-    names = [name for name, out in zip(chain.joint_names, beyond) if out]
-    return finding("command-extrapolates", joints=names) if names else None
+    return sentence(finding(code, most=MAX_CORRECTION, **rest))
 
 
 def _predicted_sigmas(

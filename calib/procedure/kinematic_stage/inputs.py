@@ -104,7 +104,7 @@ def gather(
     else:
         earlier = calibrated.read(source) if source.suffix == ".toml" else None
     blocks = _named(
-        [(path, block) for path, each in zip(files, measured) for block in _loaded(each, chain, options)],
+        [(path, block) for path, each in zip(files, measured) for block in read_file(each, chain, options)],
         options, settings.stations, settings.tools,
     )  # fmt: skip
     unseen: dict[str, Unseen] = {}
@@ -137,7 +137,7 @@ def with_unseen(
     unseen, notes, fit = dict(given.unseen), list[str](), given.fit
     files = {Path(block.file).resolve() for block in fit}
     for each in validate:
-        for block in _loaded(each, given.chain, options, fit):
+        for block in read_file(each, given.chain, options, fit):
             again = _path(each).resolve() in files
             if again:
                 notes.append(f"{block.file} is also a fit file: its errors are not those of unseen poses")
@@ -229,14 +229,7 @@ def read_file(
     for block in blocks:
         check_scale(block, chain)  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
-    return blocks
-
-
-def _loaded(
-    each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
-) -> list[PoseMeasurements]:
-    """Return the blocks of `read_file` with the arm's gravity torques."""
-    return [replace(block, torque=gravity_of(chain, block.q)) for block in read_file(each, chain, options, like)]
+    return [replace(block, torque=gravity_of(chain, block.q)) for block in blocks]
 
 
 def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:

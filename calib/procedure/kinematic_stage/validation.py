@@ -257,11 +257,12 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
         settings: of the fit, as asked for; the loss is the one that the fit chose.
         wanted: the model asked for, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
-    both, settings = (arms.nominal, arms.calibrated), settings.combine(loss=findings.loss or settings.loss)
+    settings = settings.combine(loss=findings.loss or settings.loss)
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
-    fitted = compare(*both, inputs.fit, "fitted on these rows", False, wanted.seed, alone=alone)
+    cells = [each for each in (arms.nominal, arms.calibrated, alone) if each is not None]
+    fitted = compare(cells, inputs.fit, "fitted on these rows", False, wanted.seed)
     validation = {
-        name: compare_unseen(*both, unseen, settings, wanted.seed, alone, arms.expected)
+        name: compare_unseen(cells, unseen, settings, wanted.seed, arms.expected)
         for name, unseen in inputs.unseen.items()
     }
     judged = judge_deliverables(fitted, validation, findings, wanted)
