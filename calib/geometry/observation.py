@@ -17,11 +17,11 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import UsageError, require
 from calib.geometry.installation import FRAME_AXES, Installation, Seen, see
 from calib.geometry.residuals import Part, parts
-from calib.robot import calibrated
 from calib.robot.calibrated import evaluate, extra_displacements, target_elements
 from calib.robot.kinematics import element_jacobian
 from calib.transforms import displace
 
+TERM_UNITS = {"torque": "/(N m)", "joint": "/rad"}
 KINDS = ("arm", "station", "tool", "optics", "deflection")
 
 
@@ -76,7 +76,7 @@ def layout(cell: Installation) -> ParameterLayout:
         names=(*cell.chain.names, *frames, *cell.optics.names, *cell.deflection.names(cell.chain)),
         units=(
             *cell.chain.units, *(units * (len(frames) // 6)), *cell.optics.units,
-            *(_unit(element_units, term) for term in terms),
+            *(element_units[t.element] + TERM_UNITS.get(t.basis, "") for t in terms),
         ),
         kinds=tuple(np.repeat(KINDS, layout_counts(cell)).tolist()),
         moving=tuple((len(cell.chain.elements) + len(frames) + cell.optics.moving).tolist()),
@@ -88,10 +88,6 @@ def families(cell: Installation) -> np.ndarray:
     table, moving = layout(cell), {e.name for e in cell.chain.elements if e.joint is not None}
     arm = ["offset" if name in moving else unit for name, unit in zip(cell.chain.names, cell.chain.units)]
     return np.array([*arm, *table.kinds[len(arm) :]])
-
-
-def _unit(units: dict[str, str], term: calibrated.Term) -> str:
-    return units[term.element] + {"torque": "/(N m)", "joint": "/rad"}.get(term.basis, "")
 
 
 def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.errors import UsageError, refuse_data
+from calib.errors import UsageError, one_of, refuse_data
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
@@ -64,11 +64,6 @@ class GeometricFit:
     blocks: list[Block]
     pieces: list[Piece]
     prior: np.ndarray | None = None
-
-    @property
-    def calibrated(self) -> CalibratedChain:
-        """Calibrated robot of a fit without joint corrections; for a fit with corrections see `calibrated_chain`."""
-        return calibrated_chain(self)
 
     def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
         """Return (file, row, label, size in robust sigmas, size [m or rad]) of outlier rows, worst first.
@@ -161,16 +156,8 @@ class Settings:
     limit: int = 300
     passes: int = 3
 
-    def combine(self, **changes: object) -> Settings:
-        """Return settings with some fields changed.
-
-        Raises:
-            UsageError: for a loss that does not exist.
-        """
-        result = replace(self, **changes)  # type: ignore[arg-type]
-        if result.loss not in ("auto", *robust.LOSSES):
-            raise UsageError(f"unknown loss '{result.loss}'; expected auto, {', '.join(robust.LOSSES)}")
-        return result
+    def __post_init__(self) -> None:
+        one_of(self.loss, ("auto", *robust.LOSSES), "loss", UsageError)
 
 
 class Weigher:

@@ -17,6 +17,7 @@ from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import bodies_of
 from calib.errors import RobotError
+from calib.geometry.weighing import calibrated_chain
 from calib.identification.identify import identify
 from calib.identification.settings import IdentificationSettings
 from calib.identification.uncertainty import geometry_uncertainty
@@ -201,7 +202,7 @@ def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
     cell = lwr4plus_cell(hidden=0.0)
     measured: PoseMeasurements = measure(cell, random_joints(cell.nominal, 40, 1), 2)
     found = fit(install(cell.nominal, [measured]), [measured])
-    calibrated.write(tmp_path, found.calibrated)
+    calibrated.write(tmp_path, calibrated_chain(found))
     read = calibrated.read(tmp_path).covariance
     assert read is not None
     sigma = dict(zip(found.estimate.names, found.estimate.sigma))

@@ -110,20 +110,12 @@ class FoldStatistics:
             squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
         return UnseenErrors(np.array(squares), self.rows)
 
-    def error_rigid(self) -> float:
-        """Return the rms error on held-out rows of the geometry alone [m]."""
-        return self.error(np.array([], dtype=int)).rms
-
     def ridges(self, terms: np.ndarray) -> np.ndarray:
         """Return each term's most probable prior standard deviation over all rows; 0 for a term switched off."""
         width = np.ones(int(self.groups.max(initial=-1)) + 1)
         own = self.coordinates.groups[self._columns(terms)[self.rigid :]]
         width[own] = (self._widths(terms) / self.coordinates.sizes[self._columns(terms)])[self.rigid :]
         return width[self.groups[terms]] * self.sizes[terms]
-
-    def alive(self, terms: np.ndarray) -> int:
-        """Return the number of terms that the data do not switch off."""
-        return int(np.sum(self.ridges(terms) > 0.0))
 
     def _columns(self, terms: np.ndarray) -> np.ndarray:
         return np.flatnonzero(np.isin(self.coordinates.groups, [-1, *self.groups[terms]]))

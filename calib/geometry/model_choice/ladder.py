@@ -75,6 +75,7 @@ def _turning(chain: Chain, places: list[tuple[str, int]], max_order: int) -> lis
 
 
 MODELS = CHOICES[1:]
+NONE = np.array([], dtype=int)
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
 # by name: from a chain, and whether gravity torques are known, to terms
 EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
@@ -185,7 +186,7 @@ def select_model(
     """
     one_of(model, ("auto", *MODELS), "model", UsageError)
     climber = _Climber(
-        cell, measured, settings or Settings(), np.array([], dtype=int) if fixed is None else fixed, prior,
+        cell, measured, settings or Settings(), NONE if fixed is None else fixed, prior,
         folds or transfer_folds(measured, seed), progress or (lambda done, total, what: None), seed,
     )  # fmt: skip
     climber.rigid(model)
@@ -240,7 +241,7 @@ class _Climber:
                 cell, self.measured, np.setdiff1d(candidates, self.fixed), settings=self.settings,
                 drawn=drawn, prior=self.prior,
             )  # fmt: skip
-            unseen = self._statistics(found, ()).error_rigid()
+            unseen = self._statistics(found, ()).error(NONE).rms
             better = unseen < error * (1.0 - MIN_GAIN)
             kept = better if model == "auto" else name == last
             note = "" if better else "no better on unseen rows"
@@ -300,8 +301,7 @@ class _Climber:
             place: indices of each effect's terms among those of the statistics.
         """
         kept: list[str] = []
-        none = np.array([], dtype=int)
-        error = statistics.error(none)
+        error = statistics.error(NONE)
         while waiting := [name for name in place if name not in kept]:
             tried = {}
             where = {name: np.concatenate([place[other] for other in [*kept, name]]) for name in waiting}
@@ -376,5 +376,5 @@ class _Climber:
 
 def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:
     """Return the ladder step of an effect with error `rms` [m] on unseen rows; it is kept if `note` is empty."""
-    shrunk = statistics.alive(where)
+    shrunk = int(np.sum(statistics.ridges(where) > 0.0))  # terms that the data do not switch off
     return ModelStep(f"+ {effect}", statistics.rigid + shrunk, 1e3 * rms, not note, note, shrunk)

@@ -113,7 +113,7 @@ def run(
         NotConverged: where the chosen model's fit did not come to an end.
     """
     options, wanted, say = options or FitOptions(), wanted or FitSettings(), progress or (lambda words: None)
-    settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    settings = Settings(wanted.loss or options.loss, options.loss_scale)
     asked, seed = wanted.model or options.model, wanted.seed
     if selection is not None:
         selection.check_robot(inputs.chain.joint_names)
@@ -141,7 +141,7 @@ def run(
         robust = climb("geometry", settings=replace(settings, loss="cauchy"))
         rigid_misfit = gross_rows(found, robust, long) or rigid_misfit
     say("comparing on unseen poses")
-    settings = settings.combine(loss=found.loss)
+    settings = replace(settings, loss=found.loss)
     rigid = found.rigid_fit(inputs.fit, settings)
     named = named_outliers(found.fit)
     notes = [
@@ -165,7 +165,7 @@ def run(
 def assessed(outcome: T, inputs: Inputs) -> T:
     """Return an outcome with a new verdict on the unseen rows of `inputs`; nothing is fitted."""
     wanted, options, fits = outcome.settings, outcome.options, outcome.selection
-    settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    settings = Settings(wanted.loss or options.loss, options.loss_scale)
     arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
     result = assess(arms, inputs, outcome.findings, settings, replace(wanted, model=wanted.model or options.model))
     return replace(outcome, inputs=inputs, assessment=result)

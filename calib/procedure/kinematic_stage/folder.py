@@ -5,14 +5,14 @@ A fit's folder is written whole, beside its place, then moved there. Nothing els
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from calib import files
-from calib.errors import UsageError
+from calib.errors import UsageError, refused_as
 from calib.folders import (
     CERTIFICATE,
     COVARIANCE,
@@ -27,13 +27,15 @@ from calib.folders import (
 )
 from calib.geometry import installation
 from calib.geometry.error_model import ErrorModel
+from calib.geometry.first_guess import install
+from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
-from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
+from calib.procedure.kinematic_stage.validation import Arms, Assessment, write_errors
 from calib.records import read_json, read_record, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
@@ -109,11 +111,13 @@ class FitFolder:
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the frames of the nominal arm are fitted again to the fitted rows."""
         found, cell, expected = self.findings(), installation.read(self.path), None
-        chosen = settings.combine(loss=found.loss or settings.loss)
+        chosen = replace(settings, loss=found.loss or settings.loss)
         if found.discrepancy is not None:
             learnt = np.concatenate([block.q for block in inputs.fit])
             expected = ErrorModel(cell, *read_covariance(self.path, cell), learnt, found.discrepancy)
-        return Arms(nominal_arm(inputs, chosen), cell, calibrated.read(self.path).chain, expected)
+        start = install(inputs.chain, inputs.fit, inputs.known)
+        nominal = polish_frames(start, inputs.fit, chosen).cell
+        return Arms(nominal, cell, calibrated.read(self.path).chain, expected)
 
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
         """Read the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
@@ -154,10 +158,8 @@ def _read(kind: type[T], path: Path) -> T:
         raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
     if content.get("findings"):
         content["findings"] = _of_today(content["findings"])
-    try:
+    with refused_as(UsageError, ValueError, f"{path} cannot be read ({{}}); fit again"):
         return read_record(kind, content | {"schema": content.get("schema", 1)})
-    except ValueError as error:
-        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
 
 
 def _of_today(findings: dict[str, Any]) -> dict[str, Any]:

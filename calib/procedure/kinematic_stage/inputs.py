@@ -271,10 +271,8 @@ def _units(block: PoseMeasurements) -> np.ndarray:
     labels = np.array(block.together)
     for cycles in repeated_rows(block):
         labels[np.isin(labels, labels[cycles])] = labels[cycles[0]]
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=int)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse]
+    rank = {label: k for k, label in enumerate(dict.fromkeys(labels.tolist()))}
+    return np.array([rank[label] for label in labels.tolist()], dtype=int)
 
 
 def pose_count(blocks: Sequence[PoseMeasurements]) -> int:

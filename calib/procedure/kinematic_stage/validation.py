@@ -6,7 +6,7 @@ The rules of the verdict have their limits and sentences in the catalogue of fin
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,8 +16,7 @@ from calib import files
 from calib.data.poses.measurements import Positions
 from calib.errors import Finding, finding
 from calib.geometry.error_model import ErrorModel
-from calib.geometry.first_guess import install
-from calib.geometry.fit import polish_frames, without_corrections
+from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.weighing import Settings
@@ -257,7 +256,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
         settings: of the fit, as asked for; the loss is the one that the fit chose.
         wanted: the model asked for, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
-    settings = settings.combine(loss=findings.loss or settings.loss)
+    settings = replace(settings, loss=findings.loss or settings.loss)
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
     cells = [each for each in (arms.nominal, arms.calibrated, alone) if each is not None]
     fitted = compare(cells, inputs.fit, "fitted on these rows", False, wanted.seed)
@@ -314,11 +313,6 @@ def _copies(inputs: Inputs) -> list[str]:
             same = "was fitted on" if own == name else f"is a copy of {own}"
             words.append(f"{name} {same if own else 'repeats rows of the fit'}")
     return words
-
-
-def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
-    """Return the nominal arm (with earlier corrections), with base and tool placement fitted to it."""
-    return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings).cell
 
 
 def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:

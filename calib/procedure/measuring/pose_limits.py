@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read
 from calib.config_types import number
-from calib.errors import RobotError, UsageError, listing, require
+from calib.errors import RobotError, UsageError, listing, refused_as, require
 from calib.extensions import needed
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
@@ -130,10 +130,8 @@ def _with_camera(
     unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     if stated.unknown:
         return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))
-    try:
+    with refused_as(UsageError, RobotError, "{}"):
         view = needed("camera_view")(stated, cell.chain, where, folder)
-    except RobotError as error:
-        raise UsageError(str(error)) from error
     arm = replace(view.cell, stations=np.eye(4)[None])
     model = None if "view" in absent else limits.collision
     sight = sight_of(arm, view.stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
@@ -160,14 +158,12 @@ def limits_of(
         seen: False for motions, which nothing measures: no lines of sight.
     """
     absent = {*stated.without, *without}
-    try:
+    with refused_as(UsageError, RobotError, "{}"):
         margin = 0.0 if "joint-margin" in absent else _joint_margin(stated.joints, where)
         lower, upper, wide = _joints(stated.joints, cell, where, margin)
         model, checked, notes = _collision(stated, cell, source, where, absent)
         found = (*_target(stated.target, cell), *_orientation(stated, cell, where))
         sight = _sight(stated, cell, where, None if "view" in absent else model) if seen else None
-    except RobotError as error:
-        raise UsageError(str(error)) from error
     kept = (f"{100 * margin:g} % of each joint's range to its limits", *checked) if margin else checked
     if sight is not None:
         words = {"line of sight": "cone of acceptance"}
@@ -235,10 +231,8 @@ def _joints(
 
 def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, float]:
     low, high = (number(side, where, quantity) for side in value)
-    try:
+    with refused_as(UsageError, ValueError, "{}"):
         rising((low, high), where)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     return low, high
 
 
@@ -293,17 +287,15 @@ def _collision(
     walls, within = _walls(table.box, f"{where}: collision.box"), "self-collision" not in absent
     idle, far = _never_act(table, obstacles, walls, cell, where)
     place = partial(_model, cell, source, table, obstacles, walls, within)
-    try:
-        model, shapes, notes = place(floor)
-    except RobotError as error:
-        if floor is None or table.floor is not None:
-            raise UsageError(f"{where}: {error}") from error
+    with refused_as(UsageError, RobotError, f"{where}: {{}}"):
         try:
-            model, shapes, notes = place(None)
+            model, shapes, notes = place(floor)
         except RobotError:
-            raise UsageError(f"{where}: {error}") from error
-        notes = (*notes, f"the floor is NOT checked: all postures are below {floor:g} m; state it in [collision]")
-        floor = None
+            if floor is None or table.floor is not None:
+                raise
+            model, shapes, notes = place(None)
+            notes = (*notes, f"the floor is NOT checked: all postures are below {floor:g} m; state it in [collision]")
+            floor = None
     if model.excluded:
         pairs = listing((" with ".join(pair) for pair in model.excluded), 3)
         notes = (*notes, f"collision pairs ignored, since they touch in nearly all postures: {pairs}")

@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calib import files
 from calib.errors import Finding, UsageError, finding, require
@@ -100,33 +99,26 @@ def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, pos
 
 
 def by_count(
-    seen: Observation,
-    candidates: np.ndarray,
-    typical: np.ndarray,
-    before: np.ndarray | None = None,
-    counts: ArrayLike = COUNTS,
+    seen: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
 ) -> tuple[Prediction, ...]:
-    """Return predictions for other numbers of poses, chosen greedily among candidates (N, rows, p).
+    """Return predictions for `COUNTS` poses, chosen greedily among candidates (N, rows, p).
 
     Args:
         seen, typical: see `predicted`.
         candidates: whitened Jacobians.
         before: (k, rows, p) Jacobians of poses measured before.
-        counts: numbers of poses; those beyond the candidates, or too few for the parameters, are left out.
     """
-    wanted = sorted(int(k) for k in np.atleast_1d(counts) if k <= len(candidates))
     past = np.zeros((0, *candidates.shape[1:])) if before is None else before
-    found = []
-    for most in wanted[-1:]:
-        try:
-            ready = prepared(candidates, most, before)
-        except (NotIdentifiable, TooFewCandidates):
-            break
-        order = greedy(Pool(ready.z, ready.known), most).members
-        for count in wanted:
-            one = predicted(seen, np.concatenate([candidates[list(order[:count])], past]), typical, count)
-            found += [one] if np.isfinite(one.rms) else []
-    return tuple(found)
+    wanted = [count for count in COUNTS if count <= len(candidates)]
+    if not wanted:
+        return ()
+    try:
+        ready = prepared(candidates, wanted[-1], before)
+    except (NotIdentifiable, TooFewCandidates):
+        return ()
+    order = list(greedy(Pool(ready.z, ready.known), wanted[-1]).members)
+    found = [predicted(seen, np.concatenate([candidates[order[:k]], past]), typical, k) for k in wanted]
+    return tuple(one for one in found if np.isfinite(one.rms))
 
 
 def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, str]]:

@@ -323,7 +323,7 @@ def validate(session: Session, say: Say) -> list[str]:
         notes += check_file(session, chain, path, plan, like)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    settings = Settings(wanted.loss or options.loss, options.loss_scale)
     asked = replace(wanted, model=wanted.model or options.model)
     found = assess(fit.arms(given, settings), given, fit.findings(), settings, asked)
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
