@@ -125,53 +125,40 @@ def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> 
     return (low + high) / 2
 
 
-def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: float = 0.0) -> np.ndarray:
-    """Return the mask (pairs,) of pairs that touch in nearly every posture, from distances (N, pairs) [m] in N.
+def inseparable(
+    pairs: Sequence[tuple[str, str]], distances: np.ndarray, fixed: np.ndarray, margin: float, slack: float = 0.0
+) -> tuple[np.ndarray, tuple[tuple[str, str], ...]]:
+    """Return the mask (pairs,) of pairs that touch in nearly every posture, and their names.
 
     Parts of an arm: those nearer than `margin` in at least 95 % of the postures (MoveIt's setup assistant: that touch),
     or never further apart than margin + slack: neighbours, whose shapes overlap by construction. Against what stands
     fixed in the world: only pairs that are nearer, at a distance that no joint changes; an obstacle that the arm nearly
-    always hits is an obstacle.
-
-    Args:
-        distances: signed.
-        fixed: (pairs,) whether the pair is one with the world.
-        margin: the least distance that will be asked for [m].
-        slack: distance that shapes as coarse as these cannot resolve [m].
-    """
-    near = (distances <= margin).mean(axis=0) >= ALWAYS
-    highest = distances.max(axis=0)
-    return np.where(fixed, (highest <= margin) & (np.ptp(distances, axis=0) < 1e-6), near | (highest <= margin + slack))
-
-
-def check_reachable(
-    pairs: Sequence[tuple[str, str]], distances: np.ndarray, fixed: np.ndarray, slack: float = 0.0
-) -> None:
-    """Refuse a floor or obstacle in permanent collision with a link (wrong size or place).
-
-    A link at a distance that no joint changes, the turret of an arm, may touch what it stands on: by as much as shapes
-    this coarse cannot tell.
+    always hits is an obstacle. A link at a distance that no joint changes, the turret of an arm, may touch what it
+    stands on: by as much as shapes this coarse cannot tell.
 
     Args:
         pairs: names of link and thing.
-        distances: (N, pairs) [m] in random postures, signed.
+        distances: (N, pairs) [m] in N random postures, signed.
         fixed: (pairs,) whether the pair is one with the world.
+        margin: the least distance that will be asked for [m].
         slack: distance that shapes as coarse as these cannot resolve [m].
 
     Raises:
-        RobotError: naming links and things.
+        RobotError: for a floor or obstacle in permanent collision with a link (wrong size or place).
     """
-    highest, moves = distances.max(axis=0), np.ptp(distances, axis=0) >= 1e-6
+    near, highest = (distances <= margin).mean(axis=0) >= ALWAYS, distances.max(axis=0)
+    moves = np.ptp(distances, axis=0) >= 1e-6
     max_overlap = 0.01  # by which a turret may reach into what it stands on [m] (our choice)
     buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - max_overlap)))
-    if not len(buried):
-        return
-    shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)
-    raise RobotError(
-        f"in all of {len(distances)} random postures {shown} collide: no pose is free of collision. Sizes and "
-        "places are in m (or write \"20 mm\"), in the arm's base frame, maybe above the floor; an obstacle's xyz "
-        "is its centre; if links are modelled by capsules, [collision] radius may be too large"
-    )
+    if len(buried):
+        shown = listing((f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried.tolist()), 3)
+        raise RobotError(
+            f"in all of {len(distances)} random postures {shown} collide: no pose is free of collision. Sizes and "
+            "places are in m (or write \"20 mm\"), in the arm's base frame, maybe above the floor; an obstacle's xyz "
+            "is its centre; if links are modelled by capsules, [collision] radius may be too large"
+        )
+    gone = np.where(fixed, (highest <= margin) & ~moves, near | (highest <= margin + slack))
+    return gone, tuple(pair for pair, out in zip(pairs, gone, strict=True) if out)
 
 
 MIN_RADIUS, RADIUS_SHARE = 0.05, 0.05
@@ -423,9 +410,7 @@ def from_chain(
         return found
     fixed = np.arange(len(own) + len(world)) >= len(own)
     distances = found.distances(random_joints(chain, SAMPLES, seed))
-    check_reachable(found.pairs, distances, fixed, size)
-    gone = inseparable(distances, fixed, margin, size)
-    excluded = tuple(pair for pair, out in zip(found.pairs, gone, strict=True) if out)
+    gone, excluded = inseparable(found.pairs, distances, fixed, margin, size)
     return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
 
 

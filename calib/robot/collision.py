@@ -5,7 +5,7 @@ choice: faster and on the safe side). A robot without shapes is made of capsules
 
 Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that
 touch in nearly every posture (`calib.robot.capsules.inseparable`, listed in `Collision.excluded`). A floor or an
-obstacle that a link never leaves is refused (`calib.robot.capsules.check_reachable`).
+obstacle that a link never leaves is refused.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import refuse_robot
 from calib.records import shaped
-from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, check_reachable, closing, inseparable
+from calib.robot.capsules import SAMPLES, TARGET_RADIUS, Obstacle, Wall, closing, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.simulators import configurations, driven_joints
@@ -199,9 +199,7 @@ def _without_inseparable(found: Collision, margin: float, seed: int) -> Collisio
     geometry = found._geometry
     fixed = np.array([pair.second >= found._links for pair in geometry.collisionPairs])
     distances = found.distances(random_joints(found._chain, SAMPLES, seed))
-    check_reachable(found.pairs, distances, fixed)
-    gone = inseparable(distances, fixed, margin)
-    excluded = tuple(pair for pair, out in zip(found.pairs, gone, strict=True) if out)
+    gone, excluded = inseparable(found.pairs, distances, fixed, margin)
     for index in np.flatnonzero(gone)[::-1]:
         geometry.removeCollisionPair(geometry.collisionPairs[int(index)])
     return replace(found, pairs=_names(geometry), excluded=excluded)

@@ -46,6 +46,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.errors import RobotError, one_of, refuse_robot, require
 from calib.robot import tables
@@ -170,26 +171,17 @@ def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
 def _parallel(rows: Iterable[Row], max_sine: float = 0.05) -> set[int]:
     """Return the indices of moving rows with an axis nearly parallel to the previous moving axis, at zero joints."""
     found: set[int] = set()
-    turned: np.ndarray | None = None
+    turned: Rotation | None = None
     for row in rows:
-        turned = None if turned is None else turned @ _turn(0, row.alpha) @ _turn(1, row.beta or 0.0)
-        if turned is not None and row.kind != "fixed" and np.hypot(turned[0, 2], turned[1, 2]) < max_sine:
-            found.add(row.index)
+        if turned is not None:
+            turned = turned * Rotation.from_euler("XY", [row.alpha, row.beta or 0.0])
+            if row.kind != "fixed" and np.hypot(*turned.as_matrix()[:2, 2]) < max_sine:
+                found.add(row.index)
         if row.kind != "fixed":
-            turned = np.eye(3)
+            turned = Rotation.identity()
         elif turned is not None:
-            turned = turned @ _turn(2, row.theta)
+            turned = turned * Rotation.from_euler("Z", row.theta)
     return found
-
-
-def _turn(axis: int, angle: float) -> np.ndarray:
-    """Return the elementary rotation (3, 3) about x, y or z."""
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    result = np.eye(3)
-    result[one, one] = result[two, two] = np.cos(angle)
-    result[two, one] = np.sin(angle)
-    result[one, two] = -np.sin(angle)
-    return result
 
 
 def _row(entry: Any, index: int, where: str) -> Row:

@@ -281,7 +281,7 @@ def logged(clock: float = 1.0, speed: float | np.ndarray = 1.0) -> Recording:
 @pytest.mark.parametrize("clock, speed", [(1.0, 0.9), (1.0, 1.1), (1.0, 2.0), (2.0, 1.0), (0.9, 1.0), (0.1, 1.0)])
 def test_counted_dates_that_contradict_the_stamps_are_told_with_both_rates(clock: float, speed: float) -> None:
     case = case_of(logged(clock, speed)) if clock != 0.1 else make_case("log", make_motion(logged(clock, speed)))
-    assert case.motion.sampling.clock == "counted" and case.motion.rate * clock == pytest.approx(200.0, rel=0.01)
+    assert case.motion.sampling.clock.kind == "counted" and case.motion.rate * clock == pytest.approx(200.0, rel=0.01)
     (one,) = coded(findings([compare_sizes(case, ARM)], NAMES), "velocities-scaled", "velocities-unlike-positions")
     assert level_of(one) == ("fail" if not 0.6 < clock * speed < 1.5 else "marginal")
     assert one.values["rate"] == pytest.approx(200.0 / clock, rel=0.01)

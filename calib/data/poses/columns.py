@@ -31,14 +31,8 @@ SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.p
 BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
-OURS = (
-    tuple(
-        name
-        for column in (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE)
-        for name in column.names
-    )
-    + LABELS
-)
+_FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE)
+OURS = (*(name for column in _FAMILIES for name in column.names), *LABELS)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 
@@ -47,10 +41,10 @@ _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 class Sheet:
     """A table and the options to read it with.
 
-        Attributes:
-            table: as the file has it.
-            options: names and units that the header does not state.
-    suffixes: allowed endings of our names in a family of columns.
+    Attributes:
+        table: as the file has it.
+        options: names and units that the header does not state.
+        suffixes: allowed endings of our names in a family of columns.
     """
 
     table: Table
@@ -112,7 +106,9 @@ class Sheet:
         for form in (tuple(joints), tuple(f"q_{joint}" for joint in joints), numbered):
             found = tuple(theirs or (name if name in table else "") for name, theirs in zip(form, mapped))
             if all(found):
-                self._no_extra(found)
+                extra = [name for name in table.header if re.fullmatch(r"q\d+", name) and name not in found]
+                if extra and all(re.fullmatch(r"q\d+", name) for name in found):
+                    self.fail(f"the robot has only {n} joints: is this the right robot (chain)?", extra[0])
                 return found
             if any(name in table for name in form):
                 missing = next(name for name, there in zip(form, found) if not there)
@@ -121,12 +117,6 @@ class Sheet:
                 self.fail(f"missing{near}: the robot has {n} joints, the header has only {have}", missing)
         message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
         self.fail(f"{message}. Map them in the options' [columns]")
-
-    def _no_extra(self, found: Sequence[str]) -> None:
-        if all(re.fullmatch(r"q\d+", name) for name in found):
-            extra = [name for name in self.table.header if re.fullmatch(r"q\d+", name) and name not in found]
-            if extra:
-                self.fail(f"the robot has only {len(found)} joints: is this the right robot (chain)?", extra[0])
 
     def family(self, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
         """Return the file's names of a family of columns (plain, or with a suffix); () if all are absent.

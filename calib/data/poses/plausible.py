@@ -118,9 +118,22 @@ def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -
     return values / norm[:, None]
 
 
-def rotation_matrices(values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-    """Return rotation matrices (m, 3, 3) from their elements row by row (m, 9); refuse what is not a rotation."""
-    matrices = values.reshape(-1, 3, 3)
+def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
+    """Return unit quaternions (m, 4) x y z w from the columns of a quaternion, a matrix or three angles."""
+    values = sheet.numbers(names, replace(TURNS, most=math.inf) if len(names) == 3 else Column(tuple(names)))
+    if len(names) == 4:
+        return unit_quaternions(values, sheet.table, names)
+    if len(names) == 9:
+        return _from_matrices(values.reshape(-1, 3, 3), sheet.table, names).as_quat(canonical=True)
+    if (euler := sheet.options.euler) == "vector":
+        return Rotation.from_rotvec(values).as_quat(canonical=True)
+    TURNS.check(values, sheet.table, names)
+    axes, _, how = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler).partition(" ")
+    return Rotation.from_euler(axes if how == "fixed" else axes.upper(), values).as_quat(canonical=True)
+
+
+def _from_matrices(matrices: np.ndarray, source: Rows, columns: Sequence[str]) -> Rotation:
+    """Return the rotations of matrices (m, 3, 3); refuse a matrix that is not a rotation."""
     defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
     skewed = defect > 2 * BOUNDS.max_norm_error
 
@@ -130,23 +143,4 @@ def rotation_matrices(values: np.ndarray, source: Rows, columns: Sequence[str]) 
         return "the matrix r11 to r33 is left-handed (determinant -1): an axis is mirrored, or two are swapped"
 
     refuse(source, skewed | (np.linalg.det(matrices) < 0), columns, says)
-    return matrices
-
-
-def turns(values: np.ndarray, source: Rows, columns: Sequence[str], euler: str) -> np.ndarray:
-    """Return quaternions (m, 4) x y z w of three angles (m, 3) [rad] in the convention `euler` (`fit_options`)."""
-    if euler == "vector":
-        return Rotation.from_rotvec(values).as_quat(canonical=True)
-    TURNS.check(values, source, columns)
-    axes, _, how = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler).partition(" ")
-    return Rotation.from_euler(axes if how == "fixed" else axes.upper(), values).as_quat(canonical=True)
-
-
-def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
-    """Return unit quaternions (m, 4) x y z w from the columns of a quaternion, a matrix or three angles."""
-    values = sheet.numbers(names, replace(TURNS, most=math.inf) if len(names) == 3 else Column(tuple(names)))
-    if len(names) == 3:
-        return turns(values, sheet.table, names, sheet.options.euler)
-    if len(names) == 4:
-        return unit_quaternions(values, sheet.table, names)
-    return Rotation.from_matrix(rotation_matrices(values, sheet.table, names)).as_quat(canonical=True)
+    return Rotation.from_matrix(matrices)

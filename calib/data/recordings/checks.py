@@ -94,10 +94,8 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     """
     count = len(recording)
     few = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
-    limit = np.full(recording.n, np.inf)
-    if joints is not None and recording.kind == "torque":
-        limit = np.where(np.isfinite(joints.effort) & (joints.effort > 0), LIMITS.max_effort * joints.effort, np.inf)
-    size, beyond = np.abs(recording.effort - np.median(recording.effort, axis=0)), np.abs(recording.effort) > limit
+    beyond = np.abs(recording.effort) > LIMITS.max_effort * _effort_limits(recording, joints)
+    size = np.abs(recording.effort - np.median(recording.effort, axis=0))
     ordered = np.sort(size, axis=0)
     usual = ordered[count - few - 1]
     wild = ((size > LIMITS.min_spike * usual) | ((size > LIMITS.min_spike_beyond * usual) & beyond)) & (usual > 0.0)
@@ -123,6 +121,13 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
         f"{size[~rows, j].max():.4g} of its median: a spike of the log, not used"
     )
     return _noted(recording.take(~rows), note)
+
+
+def _effort_limits(recording: Recording, joints: Joints | None) -> np.ndarray:
+    """Return the effort limits (n,) of the joints; infinite where unknown, and for currents."""
+    if joints is None or recording.kind != "torque":
+        return np.full(recording.n, np.inf)
+    return np.where(np.isfinite(joints.effort) & (joints.effort > 0), joints.effort, np.inf)
 
 
 def _drop_repeats(recording: Recording) -> Recording:
@@ -204,7 +209,7 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     usual = np.maximum(np.median(off, axis=0), 1e-9)
     apart = (step[2:-2] < 3 * np.median(step))[:, None]  # not over a gap
     kinds = joints.kinds if joints is not None else ("revolute",) * recording.n
-    least = np.array([LIMITS.max_jump if kind != "prismatic" else LIMITS.max_jump / 10 for kind in kinds])
+    least = np.where(np.array(kinds) == "prismatic", LIMITS.max_jump / 10, LIMITS.max_jump)
     notes = []
     for j in np.flatnonzero(((off > least) & (off > 20 * usual) & apart).any(axis=0)):
         row = int(np.argmax(off[:, j] * apart[:, 0]))
@@ -226,20 +231,20 @@ def _still(recording: Recording) -> list[str]:
     still = np.ptp(recording.q, axis=0) < LIMITS.min_travel
     if still.all():
         return ["no joint moves in this recording: it contains only gravity in one pose"]
+    dead = np.ptp(recording.effort, axis=0) == 0
+    if (dead & ~still).any():
+        j = int(np.argmax(dead & ~still))
+        message = f"is {recording.effort[0, j]:g} in all {len(recording)} rows while the joint moves: was it logged?"
+        refuse_data(recording.file, message, _columns(recording, "effort")[j])
     notes = []
-    for j, dead in enumerate(np.ptp(recording.effort, axis=0) == 0):
-        if dead and not still[j]:
-            message = f"is {recording.effort[0, j]:g} in all {len(recording)} rows while the joint moves: was it logged"
-            refuse_data(recording.file, message + "?", _columns(recording, "effort")[j])
-        if still[j]:
-            travel = (
-                "is one number"
-                if np.ptp(recording.q[:, j]) < BOUNDS.min_travel
-                else f"moves less than {LIMITS.min_travel:g}"
-            )
-            own = f", and so is its {recording.kind}" if dead else ""
-            notes.append(f"{recording.joint_names[j]} never moves (its position {travel}{own}): what only its motion")
-            notes[-1] += " excites cannot be identified from this file"
+    for j in np.flatnonzero(still):
+        fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
+        travel = "is one number" if fixed else f"moves less than {LIMITS.min_travel:g}"
+        effort = f", and so is its {recording.kind}" if dead[j] else ""
+        notes.append(
+            f"{recording.joint_names[j]} never moves (its position {travel}{effort}): what only its motion excites "
+            "cannot be identified from this file"
+        )
     return notes
 
 
@@ -249,25 +254,24 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     Raises:
         MeasurementError: where every joint is far beyond its limit: another unit.
     """
-    if joints is None or recording.kind != "torque":
+    most, limit = np.abs(recording.effort).max(axis=0), _effort_limits(recording, joints)
+    known = np.isfinite(limit)
+    if not known.any():
         return []
-    most, limit = np.abs(recording.effort).max(axis=0), joints.effort
-    known = np.isfinite(limit) & (limit > 0)
     usual = np.quantile(np.abs(recording.effort), 0.99, axis=0)  # a spike is no unit
-    if known.any() and (usual[known] > LIMITS.max_effort * limit[known]).all():
-        j = int(np.argmax(np.where(known, usual / np.where(known, limit, 1.0), 0.0)))
+    if (usual > LIMITS.max_effort * limit)[known].all():
+        j = int(np.argmax(usual / limit))
         message = (
             f"|torque| reaches {usual[j]:.4g}, the joint's limit is {limit[j]:g}; every joint exceeds "
             f"{LIMITS.max_effort:g} times its limit: N mm, or another robot? If N mm, state the unit (a header "
             "'tau_1 [Nmm]', or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
         refuse_data(recording.file, message, _columns(recording, "effort")[j])
-    high = known & (most > 1.2 * np.where(known, limit, np.inf))
     notes = [
         f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: another unit?"
-        for j in np.flatnonzero(high)
+        for j in np.flatnonzero(most > 1.2 * limit)
     ]
-    if known.any() and (most[known] < 0.03 * limit[known]).all():
+    if (most < 0.03 * limit)[known].all():
         notes.append(
             "no torque reaches 3 % of its joint's limit: currents, or torques before the gear? If currents,"
             " state kind = 'current': their gains are then identified"

@@ -160,14 +160,14 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
     """Return the motion of a recording: resampled to an even grid, low-passed without phase shift, differentiated.
 
     Args:
-        sampled: the recording on its grid if already computed with the same clock and gap (`sample`).
+        sampled: the recording on its grid if already computed with the same clock and gap.
 
     Raises:
         MeasurementError: for a cut-off at or above the Nyquist frequency; for segments that the filters eat up.
         UsageError: for a list of cut-offs of another length than the joints.
     """
     options = options or FilterOptions()
-    sampled = sample(recording, options) if sampled is None else sampled
+    sampled = resample(recording, options.clock, options.gap) if sampled is None else sampled
     cutoffs = propose_cutoffs(sampled, options.dynamics)
     cutoff = _per_joint(cutoffs.position if options.cutoff is None else options.cutoff, recording)
     faster = None if options.velocity_cutoff is None else _per_joint(options.velocity_cutoff, recording)
@@ -210,11 +210,6 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
         jumps=recording.jumps,
         **others,
     )
-
-
-def sample(recording: Recording, options: FilterOptions) -> Resampled:
-    """Return a recording resampled to its even grid, before filtering."""
-    return resample(recording, options.clock, options.gap)
 
 
 def with_reference(motion: Motion, path: Path, joints: Joints, options: RecordingOptions) -> Motion:

@@ -177,35 +177,32 @@ class SamplingReport:
     """Quality of a recording's time stamps.
 
     Attributes:
-        clock: the clock used (`calib.data.signals.resampling`), roughness: relative roughness with each clock.
-        rate: of the even grid [Hz].
+        clock: the clock used.
         jitter: rms and largest distance of the stamps' steps from whole numbers of periods [s].
         repeated: samples read twice, left out.
         lost: samples missing between others, interpolated.
         gaps: (start, length) [s] of the times without a sample that were too long to bridge, where segments end.
         dropped: (start, length) [s] of segments too short to use.
-        times: a counted step by the measured velocities over that by the stamps; NaN where steps are not counted.
     """
 
-    clock: str
-    roughness: dict[str, float]
+    clock: Clock
     rate: float
     jitter: tuple[float, float]
     repeated: int
     lost: int
     gaps: tuple[tuple[float, float], ...]
     dropped: tuple[tuple[float, float], ...]
-    times: float = np.nan
 
     def lines(self) -> list[str]:
         """Return notes on the sampling for the user, one finding per line."""
         lines = [f"{self.rate:.6g} Hz; jitter of the stamps: {self.jitter[0] * 1e3:.3g} ms rms"]
         lines[0] += f", {self.jitter[1] * 1e3:.3g} ms at most"
-        if self.clock != "stamps":
-            share = self.roughness[self.clock]
-            lines.append(f"samples dated {self.clock}, not by stamps: positions {1 / share:.3g} times smoother")
-        if self.clock == "counted" and abs(self.times - 1.0) > APART:
-            lines.append(f"step from measured velocities / step from stamps: {self.times:.4g}")
+        kind, times = self.clock.kind, self.clock.times
+        if kind != "stamps":
+            share = self.clock.roughness[kind]
+            lines.append(f"samples dated {kind}, not by stamps: positions {1 / share:.3g} times smoother")
+        if kind == "counted" and abs(times - 1.0) > APART:
+            lines.append(f"step from measured velocities / step from stamps: {times:.4g}")
         if self.repeated:
             lines.append(f"{self.repeated} samples were read twice; the second one is not used")
         if self.lost:
@@ -265,15 +262,13 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     steps = np.diff(recording.t) / found.period
     off = (steps - np.maximum(np.round(steps), 1)) * found.period
     report = SamplingReport(
-        found.kind,
-        found.roughness,
+        found,
         1 / period,
         (float(np.sqrt(np.mean(off[steps < 20] ** 2))), float(np.abs(off).max())),
         int((~found.keep).sum()),
         int(np.maximum(np.round(step[~long] / found.period) - 1, 0).sum()),
         tuple((float(t[i]), float(step[i])) for i in np.flatnonzero(long)),
         tuple((float(t[a]), float(t[b - 1] - t[a])) for a, b in spans if (a, b) not in used),
-        found.times,
     )
     return Resampled(
         frozen(np.concatenate(grids)),

@@ -253,7 +253,7 @@ def compare_sizes(
     speed, v = (nothing, nothing, nothing), motion.v_measured
     if v is not None:
         speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
-    counted = motion.sampling.clock == "counted"
+    counted = motion.sampling.clock.kind == "counted"
     bodies = _under(chain, gravity)
     many, few = (take_samples(case, bodies, count) for count in (MAX_LAG_SAMPLES, MAX_SAMPLES))
     lag = None if many is None else lag_of(many, motion.rate)

@@ -14,8 +14,8 @@ from calib.data.recordings.recording import Recording, earlier
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
-from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample, with_reference
-from calib.data.signals.resampling import Resampled
+from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
+from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
@@ -224,7 +224,7 @@ def read_motion(
         recording = check_recording(earlier(given, own.recording.lag), joints)
     else:
         recording = read_recording(given, joints, own.recording)
-    sampled = sample(recording, own.filter)
+    sampled = resample(recording, own.filter.clock, own.filter.gap)
     if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
         banded = replace(own.filter, band=like.band * (1.0 - 1e-9))
         motion = make_motion(recording, banded, sampled)

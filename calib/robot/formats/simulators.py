@@ -146,10 +146,9 @@ def motion_torques(
     import pinocchio
 
     pin: Any = pinocchio
-    try:
+    words = f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {{}}"
+    with refused_as(RobotError, (ValueError, RuntimeError), words):
         model: Any = _from_mjcf(pin, source) if mjcf else pin.buildModelFromXML(source)
-    except (ValueError, RuntimeError) as error:
-        raise RobotError(f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {error}") from error
     data = model.createData()
     model.gravity = pin.Motion(np.array(chain.gravity), np.zeros(3))
     joints = driven_joints(model, chain)
