@@ -67,7 +67,6 @@ from calib.procedure.kinematic_stage.folder import (
 from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
-from calib.robot.formats.origin_files import joint_origins
 from calib.robot.formats.urdf_tree import text, with_comment
 
 README, UR_KINEMATICS = "README.txt", "ur_kinematics.yaml"
@@ -196,7 +195,7 @@ def _drives(export: Export, path: Path) -> list[str]:
 
 def _joint_origins(export: Export, path: Path) -> list[str]:
     if export.urdf is not None:
-        files.write(path, joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
+        files.write(path, geometry.joint_origins(text(export.urdf)[0], export.with_masses[0], str(export.urdf)))
     return []
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from calib.robot.formats.origin_files import block
+from calib.procedure.export.geometry import block
 
 yaml = pytest.importorskip("yaml")
 
