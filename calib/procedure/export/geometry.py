@@ -121,8 +121,8 @@ def ur_kinematics(robot: CalibratedChain) -> str:
     """Return the kinematics YAML for ur_description: x y z roll pitch yaw of the six joint origins [m, rad].
 
     The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
-    so that only the calibrated part of the numbers is new. ur_description puts its tool0 where wrist_3 is: fixed joints of the robot's file behind it (a flange, a tool) are
-    not part of it, see `flange_note`.
+    so that only the calibrated part of the numbers is new. ur_description puts its tool0 where wrist_3 is: fixed joints
+    of the robot's file behind it (a flange, a tool) are not part of it, see `flange_note`.
 
     Raises:
         NoSuchArm: for an arm that has not UR's axes.
