@@ -1,17 +1,202 @@
-"""An identified model as a predictor of torques."""
+"""An identified model as a predictor of torques.
+
+Errors of predicted torques: relative errors, moving and standing separately, and the share above the band.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
 from typing_extensions import TypeVar
 
+from calib.data.signals.motion import moving
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
-from calib.identification.rows import BLOCK, Case, segmented_states
-from calib.records import Frozen
+from calib.estimation.whiteness import Whiteness, examine, r_squared
+from calib.identification.rows import BLOCK, Case, segmented_states, segments
+from calib.records import Array, Frozen, Number
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeErrors:
+    """Relative errors of predicted torques [%].
+
+    Attributes:
+        total: 100 ‖τ - τ̂‖_F / ‖τ‖_F over all rows and samples.
+        joints: (rows,) 100 ‖τ_j - τ̂_j‖ / ‖τ_j‖; NaN without measurements.
+    """
+
+    total: Number
+    joints: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionErrors:
+    """Prediction errors on one set of samples.
+
+    Attributes:
+        relative_error_percent: of all rows together, and of each.
+        rms: (rows,) of τ - τ̂ in the torque's unit.
+        samples: number of torque values in all rows.
+    """
+
+    relative_error_percent: RelativeErrors
+    rms: Array
+    samples: int = 0
+
+    @property
+    def total(self) -> float:
+        """Relative error of all rows [%]."""
+        return self.relative_error_percent.total
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Relative error of each row (rows,) [%]."""
+        return self.relative_error_percent.joints
+
+
+@dataclass(frozen=True, eq=False)
+class IntervalCoverage:
+    """Share of the errors within a model's 95 % intervals, and share of samples outside its training range.
+
+    Attributes:
+        coverage_percent, joints_percent: of all rows, and of each (rows,).
+        median: (rows,) half width of the intervals in the torque's unit.
+        samples: number of samples compared.
+        extrapolated_percent: share of these samples outside the training range.
+    """
+
+    coverage_percent: float
+    joints_percent: Array
+    median: Array
+    samples: int
+    extrapolated_percent: float
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Prediction errors of one case, a record of ``metrics.json``.
+
+    Attributes:
+        raw: errors relative to the torque as recorded, at the full rate.
+        filtered: errors with both torques low-passed to the identification band, at the full rate.
+        moving, standing: errors as `raw` for moving joints, and for standing ones.
+        above_band_percent: (rows,) share of the torque above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]:
+            noise, ripple, elasticity; a lower bound of `raw` for any model with predictions in the band.
+        r_squared: (rows,) R² of the raw torque.
+        whiteness: whiteness test of the residuals below the band, per row; None for series too short to test.
+        rate: sampling rate of the series in the whiteness test, decimated to its band [Hz].
+        motion_share: share of rows in motion; if small, the test covers mostly friction at rest.
+        evidence: False for a repeat of the training motion.
+        interval95: coverage of the 95 % intervals; None where the model states no intervals.
+    """
+
+    raw: PredictionErrors
+    filtered: PredictionErrors
+    moving: PredictionErrors
+    standing: PredictionErrors
+    above_band_percent: Array
+    r_squared: Array
+    whiteness: tuple[Whiteness | None, ...]
+    rate: Number
+    motion_share: float
+    evidence: bool = True
+    interval95: IntervalCoverage | None = None
+
+
+def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: int = 10) -> float:
+    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%]: a jackknife over blocks of time, as residuals are not white.
+
+    Efron and Tibshirani 1993, eq. 11.5, with a block left out in place of a sample (Künsch 1989); ten blocks are our
+    choice.
+
+    Args:
+        measured, predicted: (rows, N) torques.
+
+    Returns:
+        NaN where there are fewer samples than two for each block, or no torque.
+    """
+    count = measured.shape[1]
+    if count < 2 * blocks:
+        return np.nan
+    starts = np.linspace(0, count, blocks, endpoint=False).astype(int)
+    left, whole = (np.add.reduceat(np.sum(x**2, axis=0), starts) for x in (measured - predicted, measured))
+    if not (whole.sum() - whole > 0.0).all():
+        return np.nan
+    each = 100.0 * np.sqrt((left.sum() - left) / (whole.sum() - whole))
+    return float(np.sqrt((blocks - 1) / blocks * np.sum((each - each.mean()) ** 2)))
+
+
+def score(
+    case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | None = None, apart: Sequence[int] = ()
+) -> Score:
+    """Return the errors of a prediction (N, rows) at the full rate, without lost samples.
+
+    Args:
+        slow: what stands, see `calib.data.signals.motion.moving`.
+        apart: rows in a unit of their own, which no total holds.
+    """
+    motion = case.motion
+    known = motion.weight > 0.5
+    moves = moving(motion) if slow is None else moving(motion, slow)
+    count = case.target.shape[1]
+    rows = [_row(case, np.asarray(predicted)[:, k], k, known, moves[:, k % motion.n]) for k in range(count)]
+    sums, above, explained, low = zip(*rows)
+    every, residual = motion.decimator.factor, np.stack(low, axis=1)
+    raw, filtered, moved, stood = (_together([one[k] for one in sums], apart) for k in range(4))
+    white, share = _whiteness(residual, motion.segment[::every]), float(moves.mean())
+    rate, shares = motion.rate / every, (np.array(above), np.array(explained))
+    return Score(raw, filtered, moved, stood, *shares, white, rate, share)
+
+
+def _row(
+    case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray
+) -> tuple[np.ndarray, float, float, np.ndarray]:
+    """Return the sums of one torque row for a score; rows are processed one by one to save memory.
+
+    Returns:
+        (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
+        `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
+    """
+    motion, target = case.motion, case.target[:, k]
+    low = motion.in_band(np.stack([target, predicted], axis=1))
+    residual, own = target - predicted, low[:, 0] - low[:, 1]
+    sums = [_sums(target, residual, known), _sums(low[:, 0], own, known)]
+    sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]
+    size = float(np.linalg.norm(target))
+    above = 100.0 * float(np.linalg.norm(target - low[:, 0])) / size if size > 0.0 else 0.0
+    return np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor]
+
+
+def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[float, float, float]:
+    return float(np.sum(residual[used] ** 2)), float(np.sum(target[used] ** 2)), float(used.sum())
+
+
+def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErrors:
+    """Return the errors of all rows from their sums (3,); the total excludes the rows `apart`."""
+    square, size, count = np.array(sums).T
+    alike = ~np.isin(np.arange(len(square)), apart)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        joints = 100.0 * np.sqrt(square / size)
+        rms = np.sqrt(square / count)
+        total = float(100.0 * np.sqrt(square[alike].sum() / size[alike].sum()))
+    relative = RelativeErrors(total, np.where(size > 0.0, joints, np.nan))
+    return PredictionErrors(relative, np.where(count > 0, rms, np.nan), int(count.sum()))
+
+
+def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:
+    """Return the whiteness tests of the longest segment of the decimated residuals (M, rows)."""
+    spans = segments(segment)
+    first, last = max(spans, key=lambda span: span[1] - span[0]) if spans else (0, 0)
+    found: list[Whiteness | None] = []
+    for column in residual[first:last].T:
+        enough = len(column) > 40 and np.ptp(column) > 0.0
+        found.append(examine(column, min(30, len(column) // 2)) if enough else None)
+    return tuple(found)
+
 
 Model = TypeVar("Model", bound=RegressorModel, default=IdentificationModel, covariant=True)
 

@@ -17,8 +17,8 @@ from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop import LoopSettings, check_loop
+from calib.identification.methods.parameter_constraints import ConstraintSettings
 from calib.identification.methods.registry import METHODS
-from calib.identification.parameter_constraints import ConstraintSettings
 from calib.robot.chain import Chain
 
 T = TypeVar("T")

@@ -39,12 +39,11 @@ from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
 from calib.identification.loop import Controller
-from calib.identification.parameter_constraints import ConstraintSettings, hold, make_constraints
+from calib.identification.methods.parameter_constraints import ConstraintSettings, hold, make_constraints
 from calib.identification.rows import Case, make_case, observe
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier, trapezoidal
-from calib.rooms.closed_loop.controllers import Reference, pd
-from calib.rooms.closed_loop.identified_controller import identify_controller
+from calib.rooms.closed_loop.controllers import Reference, identify_controller, pd
 from calib.rooms.closed_loop.instrumental import Instrumental, Round, identify_instrumental
 from calib.rooms.closed_loop.loop_recordings import Loop, simulated_case
 from calib.rooms.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate

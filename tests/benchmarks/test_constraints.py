@@ -12,7 +12,7 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
+from calib.identification.methods.parameter_constraints import ConstraintSettings, make_constraints
 from calib.identification.rows import make_case
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier

@@ -16,9 +16,8 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.dynamics.torque_rows import BOTH
 from calib.identification.identify import identify
-from calib.identification.prediction import predict
+from calib.identification.prediction import predict, score
 from calib.identification.rows import make_case
-from calib.identification.scores import score
 from calib.identification.settings import IdentificationSettings
 from calib.robot.library import load
 from calib.rooms.cells.known_robots import random_fourier

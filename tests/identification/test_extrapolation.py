@@ -9,13 +9,13 @@ import pytest
 from calib.data.signals.filtering import design_decimator
 from calib.dynamics import drives
 from calib.dynamics.shapes import Joined
-from calib.identification.friction.drive_table import drive_table
 from calib.identification.friction.passivity import braking, driven
 from calib.identification.identify import Identification, identify
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.identification.time_folds import regimes
+from calib.procedure.export.identified import drive_table
 from calib.records import frozen
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")

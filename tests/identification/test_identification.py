@@ -9,12 +9,11 @@ from calib.dynamics.drives import term
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.identification.friction.friction_ladder import FrictionCandidates, select_friction
 from calib.identification.gains import identify_gains
+from calib.identification.geometry_uncertainty import standstill_shift
 from calib.identification.identify import chain_states, common_decimator, find_base, first_fit, identify
-from calib.identification.prediction import Dynamics, predict
+from calib.identification.prediction import Dynamics, predict, score
 from calib.identification.rows import observe, pool, triangulate, with_blocks
-from calib.identification.scores import score
 from calib.identification.settings import IdentificationSettings, Payload, make_model
-from calib.identification.uncertainty.geometry_uncertainty import standstill_shift
 
 PLAIN = IdentificationSettings(friction="standard")
 

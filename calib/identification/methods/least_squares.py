@@ -14,7 +14,7 @@ from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
 from calib.identification.friction.passivity import braking, driving
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
-from calib.identification.parameter_constraints import Constraints, hold
+from calib.identification.methods.parameter_constraints import Constraints, hold
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, bounded, residual_inflation, weighing
 from calib.identification.time_folds import estimate

@@ -22,7 +22,7 @@ from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, empty, retriangulate
 from calib.identification.loop import LoopSettings
-from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
+from calib.identification.methods.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.prior import Prior
 from calib.identification.rows import Case, ObservationRows, pool, triangulate
 from calib.records import frozen

@@ -22,12 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib import files
-from calib.identification.uncertainty.geometry_uncertainty import (
-    NOTHING,
-    TILTS,
-    GeometryComparison,
-    GeometryUncertainty,
-)
+from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryComparison, GeometryUncertainty
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
 

@@ -15,19 +15,13 @@ from calib.data.signals.persistency import ExcitationReport, repeats, report_exc
 from calib.errors import Finding, finding
 from calib.extensions import offered
 from calib.identification.friction.passivity import driven
+from calib.identification.geometry_uncertainty import GeometryComparison, GeometryUncertainty, compare, propagate
 from calib.identification.identify import Identification, identify
 from calib.identification.loop import Controller, LoopDisagreement, Replay
 from calib.identification.possible.solve import Contradiction, contradiction
-from calib.identification.prediction import Dynamics, predict
+from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
-from calib.identification.scores import Score, score
-from calib.identification.uncertainty.geometry_uncertainty import (
-    GeometryComparison,
-    GeometryUncertainty,
-    compare,
-    propagate,
-)
-from calib.identification.uncertainty.torque_errors import (
+from calib.identification.torque_errors import (
     TorqueDiscrepancy,
     TorqueErrorModel,
     TorqueIntervals,

@@ -20,10 +20,10 @@ from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.loop import LoopMetrics, Replay
+from calib.identification.methods.parameter_constraints import Binding
 from calib.identification.methods.registry import METHODS
-from calib.identification.parameter_constraints import Binding
+from calib.identification.prediction import Score
 from calib.identification.rows import Case
-from calib.identification.scores import Score
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs

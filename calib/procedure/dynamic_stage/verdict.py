@@ -15,11 +15,11 @@ import numpy as np
 from calib.data.signals.motion import moving
 from calib.data.signals.persistency import ExcitationReport
 from calib.errors import Finding, finding
+from calib.identification.geometry_uncertainty import standstill_shift
 from calib.identification.identify import Identification
+from calib.identification.prediction import Score
 from calib.identification.rows import Case
-from calib.identification.scores import Score
-from calib.identification.uncertainty.geometry_uncertainty import standstill_shift
-from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
+from calib.identification.torque_errors import COVERED, TorqueIntervals
 from calib.procedure.findings import Verdict, limit, lines_of, sentence, settle
 from calib.robot.chain import Chain
 

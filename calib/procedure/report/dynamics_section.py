@@ -20,7 +20,7 @@ from calib.identification.loop import (
     LoopMetrics,
     Replay,
 )
-from calib.identification.scores import Score, relative_error_sigma
+from calib.identification.prediction import Score, relative_error_sigma
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome

@@ -4,4 +4,4 @@ Also the tracking error with the identified model as feedforward. Settings and r
 `calib.identification.loop`.
 """
 
-OFFERS = {"methods": "simulated:METHODS", "loop_results": "bias:loop_results", "track": "replay:track"}
+OFFERS = {"methods": "simulated:METHODS", "loop_results": "simulated:loop_results", "track": "replay:track"}

@@ -9,7 +9,7 @@ x_{k+1} = W_s⁺ y. A Coulomb sign whose measured speed is noisier than the widt
 noise: no instrument helps there, and the simulated sign, which rests on the reference, takes its place in W; or that of
 the measured speed in half the band where the simulation does not follow the motion, as with a wrong controller (our
 choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
-(`calib.identification.parameter_constraints`); they do not cure a bias.
+(`calib.identification.methods.parameter_constraints`); they do not cure a bias.
 """
 
 from __future__ import annotations
@@ -29,7 +29,13 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
 from calib.identification.loop import ExogeneityTest
-from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, hold, make_constraints
+from calib.identification.methods.parameter_constraints import (
+    Constraints,
+    ConstraintSettings,
+    Held,
+    hold,
+    make_constraints,
+)
 from calib.identification.rows import Case, ObservationRows, observe, pool, triangulate
 from calib.records import frozen
 from calib.rooms.closed_loop import instrumental_variables

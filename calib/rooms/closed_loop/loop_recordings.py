@@ -19,8 +19,13 @@ from calib.errors import CalibError, NotConverged, UsageError, refuse_data
 from calib.identification.loop import Controller, LoopSettings
 from calib.identification.rows import Case, segments
 from calib.records import frozen
-from calib.rooms.closed_loop.controllers import Reference, completed, stated_controller
-from calib.rooms.closed_loop.identified_controller import IdentifiedController, identify_controller
+from calib.rooms.closed_loop.controllers import (
+    IdentifiedController,
+    Reference,
+    completed,
+    identify_controller,
+    stated_controller,
+)
 from calib.rooms.closed_loop.simulation import Plant, SimulatedRun, feed_forward
 
 DEGREES = 180.0 / np.pi
@@ -31,7 +36,7 @@ class Loop:
     """The closed loop in which a recording was made.
 
     Attributes:
-        controller: stated, identified from the log (`calib.rooms.closed_loop.identified_controller`) or guessed: a
+        controller: stated, identified from the log (`calib.rooms.closed_loop.controllers`) or guessed: a
             third of the true bandwidth suffices.
         reference: at the controller's rate, in the recording's time, over its whole duration.
         every: control periods per recorded sample, not necessarily an integer.

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import UsageError
+from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
-from calib.identification.loop import LoopSettings
+from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults, LoopSettings
 from calib.identification.methods.least_squares import CONSISTENT, CONSTRAINED, WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
 from calib.rooms.closed_loop.instrumental import Instrumental, identify_instrumental
@@ -115,3 +116,158 @@ PC_IV, PC_DIDIM = (
     for one, source in ((IV, "Janot & Wensing 2021"), (DIDIM, "Leboutet et al. 2021"))
 )  # fmt: skip
 METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopTest:
+    """Result of instrumental variables from simulation.
+
+    Attributes:
+        found: their estimate of the standard model, with the test of least squares; None if they failed.
+        loops: the simulated closed loops.
+        failure: reason for a missing estimate.
+    """
+
+    found: Instrumental | None = None
+    loops: ClosedLoops | None = None
+    failure: str = ""
+
+    def findings(self, taken: bool) -> list[Finding]:
+        """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
+        if self.failure:
+            return [finding("loop-test-failed", why=self.failure)]
+        if self.found is None:
+            return []
+        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
+        return noticed + (_blurred(self) if taken else _biased(self.found))
+
+
+def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
+    """Return the result of instruments from simulation on an estimate's problem; an empty one without a loop.
+
+    An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
+    """
+    if problem.loop is None:
+        return LoopTest()
+    found = estimate if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None else None
+    if found is None:
+        try:
+            found = IV.beside(problem, estimate)
+        except CalibError as error:
+            return LoopTest(failure=str(error))
+    return LoopTest(found.instrumental, found.loops, "" if found.found else str(found.failure))
+
+
+def _weakness(found: Instrumental) -> list[Finding]:
+    strength = found.strength
+    if not strength.weak:
+        return []
+    least = np.argsort(strength.partial_r2)[:5]
+    names = [f"{strength.names[k]} ({100 * strength.partial_r2[k]:.2g} %)" for k in least]
+    return [finding("weak-instruments", donald=strength.cragg_donald, names=names)]
+
+
+def _distance(found: Instrumental) -> list[Finding]:
+    max_miss = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
+    joints = [f"{x:.3g} % at joint {j + 1}" for j, x in enumerate(found.distance) if not x < max_miss]
+    return [finding("loop-not-followed", joints=joints)] if joints else []
+
+
+def _gains(found: Instrumental) -> list[Finding]:
+    """Return a finding on joints whose stated gains are not those of the recording, though the simulation follows."""
+    joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
+    return [finding("loop-gains-off", joints=joints)] if joints else []
+
+
+def _biased(found: Instrumental) -> list[Finding]:
+    """Return a finding on a bias of least squares; none if the loop fits worse than the model, or for a small bias."""
+    shift, min_shift = found.shift, 1.0  # standard deviations of a shift that is worth a word (our choice)
+    if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
+        return []
+    names = [f"{found.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
+    return [finding("least-squares-biased", p=found.verdict.p, names=names)]
+
+
+def _blurred(test: LoopTest) -> list[Finding]:
+    """Return a finding on joints where W is not its true value plus noise, as instruments assume."""
+    if test.found is None or test.loops is None or not test.found.estimator.measured:
+        return []
+    noise, max_blur = test.loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
+    widths = {one.acts[0][0]: one.settings[-1] for one in test.found.plant.terms if one.shape == "sign"}
+    blurred = [(j, noise[j] / width) for j, width in widths.items() if noise[j] > max_blur * width]
+    joints = [f"{size:.2g} at joint {j + 1}" for j, size in blurred]
+    return [finding("noisy-signs", joints=joints)] if joints else []
+
+
+SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choice)
+
+
+def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
+    """Return how recorded torques contradict an output-error estimate; None if they do not, or for another method.
+
+    Args:
+        problem: of both.
+        found: the estimate.
+        test: result of instruments; least squares replaces it if absent.
+    """
+    if not (found.found and found.alone and isinstance(found, LoopEstimate)):
+        return None
+    own, instruments = found.estimate, test.found
+    max_beside_instruments = 1.2  # times the torque that instruments leave unexplained (our choice)
+    max_beside_wls = 2.0  # the same beside least squares, of which it is the least that there is (our choice)
+    if instruments is not None and instruments.valid and len(instruments.names) == len(own.values):
+        name, other, limit = instruments.estimator.name, instruments.fit.estimate, max_beside_instruments
+        left, beside = (instruments.simulated_error(x.values) for x in (own, other))
+    else:
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return None
+        name, other, limit = "wls", plain.estimate, max_beside_wls
+        left, beside = (problem.pooled.relative_errors(x.values) for x in (own, other))
+    away = np.abs(own.values - other.values) / np.maximum(np.hypot(own.sigma, other.sigma), 1e-300)
+    worst = int(np.argmax(away))
+    if away[worst] < SIGMAS or not np.any(left > limit * beside):
+        return None
+    return LoopDisagreement(
+        found.method, name, other.names[worst], float(away[worst]), tuple(left.tolist()), tuple(beside.tolist()),
+        _factors(problem, own.values, other.values),
+    )  # fmt: skip
+
+
+def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
+    """Return for each torque row the regression slope of torques W own on torques W other."""
+    factors = problem.pooled.factors[:, :, :-1]
+    mine, theirs = factors @ own, factors @ other
+    return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))
+
+
+def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
+    """Return the results of simulating the closed loop beside an estimate of a problem."""
+    test = compare_with_loop(problem, estimate)
+    taken = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
+    return LoopResults(
+        _metrics(test, not taken), tuple(test.findings(taken)), () if test.found is None else _table(test.found),
+        test.loops and test.loops.controller, disagreement(problem, estimate, test),
+    )  # fmt: skip
+
+
+def _metrics(test: LoopTest, beside: bool) -> LoopMetrics | None:
+    """Return the metrics of a test by simulation; None if no loop was stated."""
+    found, loops = test.found, test.loops
+    notes = () if loops is None else loops.notes
+    if found is None or loops is None:
+        return LoopMetrics(test.failure, notes) if test.failure or notes else None
+    identified, strength = loops.identified, found.strength
+    return LoopMetrics(
+        "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
+        strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
+        found.stray, found.valid, found.explains, loops.controller, identified and identified.explained,
+    )  # fmt: skip
+
+
+def _table(found: Instrumental) -> tuple[tuple[Any, ...], ...]:
+    """Return the rows of both estimates of the standard model, one for each parameter."""
+    estimate = found.fit.estimate
+    columns = (estimate.values, estimate.sigma, found.ordinary.estimate.values, found.shift)
+    explained = 100.0 * found.strength.partial_r2
+    return tuple(zip(estimate.names, estimate.units, *(one.tolist() for one in (*columns, explained))))

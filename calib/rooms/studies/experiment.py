@@ -27,7 +27,7 @@ from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
 from calib.identification.loop import Controller, LoopSettings
 from calib.identification.methods.method import IdentificationProblem
-from calib.identification.parameter_constraints import ConstraintSettings
+from calib.identification.methods.parameter_constraints import ConstraintSettings
 from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
@@ -156,7 +156,7 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, Ident
         if condition.mismatch == "geometry":
             return true, model, base, plant
         measured = [measure(cell, random_joints(chain, pose_count, seed), seed=seed)]
-        found = geometry.fit(install(chain, measured), measured).calibrated.chain
+        found = geometry.fit(install(chain, measured), measured).cell.chain
         fitted = replace(model, bodies=bodies_of(found))
         return true, fitted, bases.regroup(base, fitted), plant
     if condition.mismatch == "friction":

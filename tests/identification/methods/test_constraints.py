@@ -13,8 +13,8 @@ from calib.estimation.triangles import combine
 from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
 from calib.identification.methods.method import IdentificationProblem
+from calib.identification.methods.parameter_constraints import MIN_EIGENVALUE, ConstraintSettings, WeightedSum
 from calib.identification.methods.registry import METHODS
-from calib.identification.parameter_constraints import MIN_EIGENVALUE, ConstraintSettings, WeightedSum
 
 FREE = {"pc-ols": "ols", "pc-wls": "wls", "pc-irls": "irls"}
 

@@ -12,12 +12,12 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
-from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
+from calib.identification.methods.parameter_constraints import ConstraintSettings, make_constraints
 from calib.identification.rows import make_case
 from calib.robot import mdh
 from calib.rooms.cells import known_robots
 from calib.rooms.closed_loop import controllers, instrumental, instrumental_variables
-from calib.rooms.closed_loop.identified_controller import identify_controller
+from calib.rooms.closed_loop.controllers import identify_controller
 from calib.rooms.closed_loop.instrumental import identify_instrumental
 from calib.rooms.closed_loop.loop_recordings import Loop
 from calib.rooms.closed_loop.simulation import Plant, Sensing, simulate

@@ -10,7 +10,7 @@ from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage.plausibility import another_loop
 from calib.procedure.findings import level_of
 from calib.records import read_record
-from calib.rooms.closed_loop.bias import LoopDisagreement, LoopTest, compare_with_loop, disagreement
+from calib.rooms.closed_loop.simulated import LoopDisagreement, LoopTest, compare_with_loop, disagreement
 
 
 def judged(name: str, *noise: float, seed: int = 0, **loop) -> tuple[LoopDisagreement | None, LoopTest]:

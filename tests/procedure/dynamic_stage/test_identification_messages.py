@@ -18,7 +18,7 @@ from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import IdentifyOptions
-from calib.identification.scores import PredictionErrors, RelativeErrors
+from calib.identification.prediction import PredictionErrors, RelativeErrors
 from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.report import charts, dynamics_figures, dynamics_section, page

@@ -8,7 +8,7 @@ import pytest
 
 from calib.data.signals.persistency import report_excitation
 from calib.identification.identify import identify
-from calib.identification.scores import PredictionErrors, RelativeErrors, Score
+from calib.identification.prediction import PredictionErrors, RelativeErrors, Score
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage import verdict
 from calib.procedure.dynamic_stage.verdict import Resting, judge, with_prior

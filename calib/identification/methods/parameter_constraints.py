@@ -4,7 +4,7 @@ A row is lower <= aᵀ β <= upper over the columns that are estimated. A standa
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
 over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `MIN_EIGENVALUE`, S making the mean diagonal one.
-Bodies that can exist are a cone (`calib.identification.body_cone`), which M(q) > 0 follows from.
+Bodies that can exist are a cone (`calib.identification.methods.body_cone`), which M(q) > 0 follows from.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from calib.errors import Finding, NotConverged, UsageError, finding, refuse_opti
 from calib.estimation.constrained import Constrained, Definite, contradicting, restricted, within
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
-from calib.identification.body_cone import BodyCone, cone_of
+from calib.identification.methods.body_cone import BodyCone, cone_of
 from calib.records import Frozen, Number, frozen
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)

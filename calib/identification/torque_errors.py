@@ -33,9 +33,8 @@ from calib.estimation.whiteness import inflation
 from calib.identification import time_folds
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.model_file import read_covariance
-from calib.identification.prediction import Dynamics
+from calib.identification.prediction import Dynamics, IntervalCoverage
 from calib.identification.rows import Case, pool, segmented_states, triangulate
-from calib.identification.scores import IntervalCoverage
 from trajectories.timing.profile import Sampled
 
 BLOCK = 4000

@@ -1,1 +1,0 @@
-"""Uncertainty of an identified model, including the contribution of the geometry."""
