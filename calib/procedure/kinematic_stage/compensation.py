@@ -240,30 +240,20 @@ def compensate(
     one, two = placements(fitted, frame, tool)
     count, note = _dof(targets, one.chain, dof)
     lower, upper = one.chain.lower, one.chain.upper
-
-    def inside(q: np.ndarray) -> np.ndarray:
-        return np.all((q >= lower - LIMIT_TOLERANCE) & (q <= upper + LIMIT_TOLERANCE), axis=-1)
-
-    if start is not None and not inside(np.asarray(start)):
+    before, after = Goal(one, count, lower, upper), Goal(two, count, lower, upper, fitted.torques)
+    if start is not None and not _inside(before, np.asarray(start)):
         raise UsageError(f"start {list(start)}: beyond the joints' limits {lower.tolist()} to {upper.tolist()}")
-    before = Goal(one, count, lower, upper)
-    after = Goal(two, count, lower, upper, fitted.torques)
     say("the nominal robot at the targets")
     poses, q0 = _reference(before, targets, start, seed)
-    held = np.clip(q0, lower, upper)
     say("the calibrated robot")
-    q = inverse.nearest(after, poses, held, inverse.reach(after, poses, q0))
-    far = np.flatnonzero(np.abs(q - q0).max(axis=1, initial=0.0) > MAX_CORRECTION)
-    q[far] = inverse.held_back(after, poses[far], q0[far], MAX_CORRECTION)
+    held, q = np.clip(q0, lower, upper), _followed(after, poses, q0)
     left, missed = (_sizes(inverse.differences(after, each, poses)) for each in (q, held))
-    reached = _within(left, tolerance) & inside(q0)
+    reached = _within(left, tolerance) & _inside(before, q0)
     singular = inverse.conditions(after, q0) < SINGULAR
     beyond = np.zeros(q.shape, bool) if fitted.learnt is None else np.atleast_2d(outside(q, fitted.learnt))
     reason = tuple(_reason(one.chain, *row) for row in zip(reached, beyond, q0, q, left, singular))
     say("sigmas")
     sigma, expected = _predicted_sigmas(fitted, q, frame, tool, after)
-    if count == 3:
-        sigma[:, 1] = np.nan
     notes = (_frame_note(fitted, frame), finding("at-targets", tool=tool), note, *_turn_note(fitted, count))
     own = None
     if frame == "base" and fitted.placed:
@@ -273,6 +263,18 @@ def compensate(
         targets, fitted, q, q0, reached, reason, left, missed, sigma, expected, beyond, count, tuple(lines_of(notes)),
         own,
     )  # fmt: skip
+
+
+def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
+    return np.all((q >= goal.lower - LIMIT_TOLERANCE) & (q <= goal.upper + LIMIT_TOLERANCE), axis=-1)
+
+
+def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return joint values (m, n) near `start` that reach the poses; near a singularity, as near as they may come."""
+    q = inverse.nearest(goal, poses, np.clip(start, goal.lower, goal.upper), inverse.reach(goal, poses, start))
+    far = np.flatnonzero(np.abs(q - start).max(axis=1, initial=0.0) > MAX_CORRECTION)
+    q[far] = inverse.held_back(goal, poses[far], start[far], MAX_CORRECTION)
+    return q
 
 
 def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, Finding]:
@@ -361,6 +363,7 @@ def _predicted_sigmas(
     torque = None if goal.torques is None else goal.torques(q)
     station = -1 if frame == "base" else _station(fitted, frame)
     own = pose_sigmas(cell, q, free, covariance, torque, station, number)
+    own[:, 1] = np.nan if goal.dof == 3 else own[:, 1]
     if fitted.learnt is None or fitted.discrepancy is None:
         return own, np.full((len(q), 2), np.nan)
     errors = ErrorModel(cell, free, covariance, fitted.learnt, fitted.discrepancy)
