@@ -54,13 +54,8 @@ ROBOTS = {"lwr4plus": lambda: load("lwr4plus"), "ur5": lambda: load("ur5"), "sca
 
 @pytest.mark.parametrize(
     "name, kind, rank",
-    [
-        ("lwr4plus", "pose", 34),
-        ("ur5", "pose", 30),
-        ("scara", "pose", 20),
-        ("lwr4plus", "position", 31),
-        ("ur5", "position", 27),
-    ],
+    [(n, "pose", r) for n, r in (("lwr4plus", 34), ("ur5", 30), ("scara", 20))]
+    + [(n, "position", r) for n, r in (("lwr4plus", 31), ("ur5", 27))],
 )
 def test_with_general_frames(name, kind, rank):
     found = split(cell(ROBOTS[name](), 2), kind)

@@ -46,8 +46,12 @@ def study(mounting: str = IN_HAND, count: int = 40, seed: int = 0, encoder: floa
 def started(cell, block):
     block = complete_camera(cell.cell.nominal, block)
     start = install(cell.cell.nominal, [block])
-    table = layout(start)
-    return block, start, table.rigid_index
+    return block, start, layout(start).rigid_index
+
+
+def fitted(cell, block, **more):
+    block, start, candidates = started(cell, block)
+    return block, fit(start, [block], candidates, **more)
 
 
 @pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
@@ -56,12 +60,8 @@ def started(cell, block):
 )
 def test_the_residuals_slope_is_minus_the_jacobian(mounting, lens):
     """Arm, both placements, every value of the lens, scale and bending; some corners unseen; away from the truth."""
-    cell = camera.camera_cell(
-        Cell(load("ur5"), replace(virtual_cell("ur5").truth, deflection=Deflection())),
-        mounting,
-        lens=lens,
-        shape=BoardShape(1.01, 0.1, -0.2, 0.3),
-    )
+    arm = Cell(load("ur5"), replace(virtual_cell("ur5").truth, deflection=Deflection()))
+    cell = camera.camera_cell(arm, mounting, lens=lens, shape=BoardShape(1.01, 0.1, -0.2, 0.3))
     block = camera.photograph(cell, camera.views(cell, 4, 1), 0.5, 0)
     pixel = block.pixel.copy()
     pixel[1, 5:20] = np.nan
@@ -108,10 +108,9 @@ def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
 @pytest.mark.parametrize("mounting", [IN_HAND, pytest.param(TO_HAND, marks=pytest.mark.slow)])
 def test_the_arm_is_recovered_with_lens_and_mounting_found(mounting):
     cell, block = study(mounting)
-    block, start, candidates = started(cell, block)
+    block, found = fitted(cell, block)
     assert block.mounting == mounting
     assert block.lens.values[:2] == pytest.approx(cell.lens.values[:2], rel=2e-3)
-    found = fit(start, [block], candidates)
     before, placed, arm = position_errors(cell.cell, found.cell, found.cell.chain)
     assert before > 3.0 and arm < 0.03 and placed < 0.3  # a camera at 1.5 m knows its own place to 0.1 mm
     assert found.estimate.residual_std == pytest.approx(1.0, abs=0.05)
@@ -125,8 +124,7 @@ def test_the_arm_is_recovered_with_lens_and_mounting_found(mounting):
 @pytest.mark.slow
 def test_a_lens_that_was_given_stays():
     cell, block = study()
-    block, start, candidates = started(cell, replace(block, lens=cell.lens, known=True, free=()))
-    found = fit(start, [block], candidates)
+    _, found = fitted(cell, replace(block, lens=cell.lens, known=True, free=()))
     assert np.array_equal(found.cell.optics.lenses[0].values, cell.lens.values)
     assert found.estimate.names[-1].endswith(".rz")
 
@@ -143,8 +141,7 @@ def test_a_print_of_another_size_is_measured_beside_another_instrument():
     points = measure(virtual_cell_points(cell), camera.views(cell, 40, 4), 5)
     block = complete_camera(cell.cell.nominal, block)
     start = install(cell.cell.nominal, [block, points])
-    table = layout(start)
-    found = fit(start, [block, points], table.rigid_index)
+    found = fit(start, [block, points], layout(start).rigid_index)
     values = dict(zip(found.estimate.names, zip(found.estimate.values, found.estimate.sigma)))
     for name, true in zip(("scale", "bend_xx", "bend_xy", "bend_yy"), shape.values):
         value, sigma = values[f"{block.target}.{name}"]
@@ -172,8 +169,7 @@ def test_two_cameras_see_one_board():
     blocks = [complete_camera(cell.cell.nominal, each) for each in (one, replace(two, tool_names=("other board",)))]
     start = install(cell.cell.nominal, blocks)
     assert start.optics.lens_names == ("camera", "other camera")
-    table = layout(start)
-    found = fit(start, blocks, table.rigid_index)
+    found = fit(start, blocks, layout(start).rigid_index)
     assert position_errors(cell.cell, placed_like(found.cell), found.cell.chain)[2] < 0.03
 
 
@@ -185,8 +181,7 @@ def placed_like(cell):
 def test_what_an_arm_does_not_repeat_is_told_from_what_a_corner_does_not():
     """Encoders of 0.1 mrad before corners of 0.05 px: the fit finds both, and its sigmas are those of the arm."""
     cell, block = study(count=60, encoder=1e-4)
-    block, start, candidates = started(cell, block)
-    found = fit(start, [block], candidates)
+    _, found = fitted(cell, block)
     noise = found.pieces[0].part.noise
     assert noise.factor == pytest.approx(1.0, abs=0.1)
     assert noise.turn == pytest.approx(1e-4 * np.sqrt(7 / 3), rel=0.5)
@@ -230,8 +225,7 @@ def test_without_images_that_contradict_all_others_the_fit_is_good_and_half_of_t
     cell, block = study()
     q = block.q.copy()
     q[[20, 30]] = q[[30, 20]]
-    done, start, candidates = started(cell, replace(block, q=q, lens=cell.lens))
-    found = fit(start, [done], candidates, settings=Settings(loss="none"))
+    _, found = fitted(cell, replace(block, q=q, lens=cell.lens), settings=Settings(loss="none"))
     assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.05
     q = np.concatenate([block.q[:27], np.roll(block.q[27:], 3, axis=0)])
     with pytest.raises(MeasurementError, match=r"13 of 40 images show the board .* was camera or board moved"):
@@ -248,8 +242,7 @@ def test_the_noise_of_images_settles_wherever_the_camera_stands(seed):
         rigid(virtual_cell("lwr4plus", instrument=instrument)), TO_HAND, lens=lens, reach_of_arm=0.75
     )
     block = camera.photograph(cell, camera.views(cell, 30, seed, camera.Views((0.25, 0.6))), 0.03, seed)
-    block, start, candidates = started(cell, block)
-    found = fit(start, [block], candidates)
+    _, found = fitted(cell, block)
     noise = found.pieces[0].part.noise
     assert noise.displacement < 5e-5 and noise.turn < 2e-4
     assert position_errors(cell.cell, found.cell, found.cell.chain)[2] < 0.08
@@ -312,8 +305,7 @@ def test_every_closed_form_places_exact_poses(method, monkeypatch):
 @pytest.mark.slow
 def test_frames_of_unseen_images_are_placed_with_the_lens_of_the_fit():
     cell, block = study()
-    block, start, candidates = started(cell, block)
-    found = fit(start, [block], candidates)
+    block, found = fitted(cell, block)
     later = camera.photograph(cell, camera.views(cell, 15, 8), 0.05, 8)
     later = complete_camera(cell.cell.nominal, later, [block])
     assert later.lens is block.lens and not later.free

@@ -14,6 +14,7 @@ from calib.geometry.observation import layout, observe, predict, prepare, step, 
 from calib.robot.calibrated import Deflection, Term
 from calib.transforms import pose
 
+NONE = np.array([], int)
 CHAINS = {"lwr4plus": lambda: load("lwr4plus"), "ur5": lambda: load("ur5"), "mixed": motley_with_follower}
 
 
@@ -84,7 +85,7 @@ def test_every_effect_of_the_ladder(effect, known):
 
 
 def residuals(truth, block, x, free):
-    return np.concatenate([p.value.ravel() for p in observe(step(truth, free, x), block, np.array([], int))])
+    return np.concatenate([p.value.ravel() for p in observe(step(truth, free, x), block, NONE)])
 
 
 @pytest.mark.parametrize(
@@ -96,11 +97,8 @@ def test_the_residuals_slope_is_minus_the_jacobian(name, kind):
     truth = cell(CHAINS[name](), 4)
     measured = measure(truth, kind, 24, 6)
     rng = np.random.default_rng(2)
-    away = replace(
-        truth,
-        chain=perturb(truth.chain, 9, 0.02, 0.05),
-        tools=truth.tools @ pose(Rotation.from_rotvec([1.2, -0.9, 0.8]), 0.05 * rng.normal(size=3)),
-    )
+    tools = truth.tools @ pose(Rotation.from_rotvec([1.2, -0.9, 0.8]), 0.05 * rng.normal(size=3))
+    away = replace(truth, chain=perturb(truth.chain, 9, 0.02, 0.05), tools=tools)
     free = np.arange(len(layout(away).names))
     if kind == "sockets":  # without an instrument the residual vectors turn with station 0, their lengths do not
         free = np.setdiff1d(free, layout(away).index("station"))
@@ -124,13 +122,8 @@ def test_orientation_residuals_of_every_size(angle):
     block = prepare(away, [measured])[0]
     part = observe(away, block, free)[1]
     assert np.linalg.norm(part.value, axis=0) == pytest.approx(angle, abs=1e-7)
-    check(
-        lambda x: observe(step(away, free, x), block, np.array([], int))[1].value,
-        -part.jacobian.transpose(1, 2, 0),
-        np.zeros(len(free)),
-        step=1e-6,
-        tolerance=1e-6 if angle < 3 else 1e-5,
-    )
+    value, slope = lambda x: observe(step(away, free, x), block, NONE)[1].value, -part.jacobian.transpose(1, 2, 0)
+    check(value, slope, np.zeros(len(free)), step=1e-6, tolerance=1e-6 if angle < 3 else 1e-5)
 
 
 @pytest.mark.parametrize("kind", ["plane", "bar", "sockets", "distance"])
@@ -146,13 +139,8 @@ def test_the_gradient_of_the_cost_is_exact_with_nuisances_eliminated(kind, size)
     gradient = -sum(np.einsum("frm,rm->f", p.jacobian, p.value) for p in parts)
     unit = np.abs(gradient).max()
     assert unit > 0
-    check(
-        lambda x: np.array(0.5 * np.sum(residuals(away, block, x, free) ** 2) / unit),
-        gradient / unit,
-        np.zeros(len(free)),
-        step=1e-6,
-        tolerance=1e-5,
-    )
+    cost = lambda x: np.array(0.5 * np.sum(residuals(away, block, x, free) ** 2) / unit)  # noqa: E731
+    check(cost, gradient / unit, np.zeros(len(free)), step=1e-6, tolerance=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["plane", "bar"])

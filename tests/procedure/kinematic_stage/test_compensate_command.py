@@ -2,22 +2,25 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib import cli, config
-from calib.data.poses.pose_lists import read_targets
+from calib.data.poses.measurements import Poses
+from calib.data.poses.pose_lists import Targets, read_targets
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
-from calib.procedure.kinematic_stage import compensation
+from calib.procedure.kinematic_stage import compensation, inputs
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.kinematics import forward
 from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell
-from calib.transforms import from_xyz_rpy, rotation_vector, to_quaternion
+from calib.transforms import from_quaternion, from_xyz_rpy, rotation_vector, to_quaternion
 
 SIGMA = 20e-6
 
@@ -73,6 +76,17 @@ def numbers(rows: list[dict[str, str]], names: list[str]) -> np.ndarray:
 Q = [f"q{k + 1}" for k in range(6)]
 
 
+def commanded(calib, fitted: Path, *more: str) -> str:
+    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv", *more)
+    assert code == 0, err
+    return out
+
+
+def write_poses(path: Path, poses: np.ndarray, q: np.ndarray) -> None:
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw", *Q]
+    write(path, names, np.hstack([poses[:, :3, 3], to_quaternion(poses), q]))
+
+
 def off(one: np.ndarray, two: np.ndarray) -> tuple[float, float]:
     """Return rms differences of poses: position [m], orientation [rad]."""
     shift = np.linalg.norm(one[:, :3, 3] - two[:, :3, 3], axis=1)
@@ -86,8 +100,7 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
     write(here / "t.csv", ["x [mm]", "y [mm]", "z [mm]", "qx", "qy", "qz", "qw", *Q], np.hstack(
         [1e3 * wanted[:, :3, 3], to_quaternion(wanted), drawn(cell, 120, 5)]
     ))  # fmt: skip
-    code, out, err = calib("compensate", fitted, "t.csv", "--frame", "seen", "--tool", "tool", "--out", "commands.csv")
-    assert code == 0, err
+    out = commanded(calib, fitted, "--frame", "seen", "--tool", "tool")
     assert "instrument's frame, station 'seen'" in out and "targets: 'tool'" in out
     rows = commands()
     assert {row["status"] for row in rows} == {"reached"}
@@ -110,8 +123,7 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
 def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(cell, fitted, here, calib):
     q = np.array([[0.5, -1.2, 1.3, 0.4, 0.9, 0.2], [3.0, -1.2, 1.3, 0.4, 0.9, 3.1]])
     write(here / "t.csv", Q, q)
-    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
-    assert code == 0, err
+    out = commanded(calib, fitted)
     near, far = commands()
     names = cell.nominal.joint_names
     assert (near["extrapolated"], near["reason"], far["extrapolated"]) == ("0", "", "1")
@@ -124,8 +136,7 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     """In the base that URDF users see: the calibrated flange, base to tip, stands where the nominal one would."""
     q = drawn(cell, 100, 6)
     write(here / "t.csv", [f"q{k + 1} [deg]" for k in range(6)], np.rad2deg(q))
-    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
-    assert code == 0, err
+    out = commanded(calib, fitted)
     assert "base frame of the calibrated robot" in out and "targets: 'flange'" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
     found = compensation.read(fitted)
@@ -140,8 +151,7 @@ def test_the_robots_file_is_parsed_once(cell, fitted, here, calib, monkeypatch):
     parsed, parse = [], config.tomllib.loads
     monkeypatch.setattr(config.tomllib, "loads", lambda text: (parsed.append(text), parse(text))[1])
     write(here / "t.csv", Q, drawn(cell, 3, 7))
-    code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
-    assert code == 0, err
+    commanded(calib, fitted)
     assert parsed == [(fitted / "robot.toml").read_text()]
 
 
@@ -151,9 +161,7 @@ def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     metrics = json.loads((fitted / "metrics.json").read_text())["validation"]["seen.csv"]
     sizes, said = {}, {}
     for frame in ("base", "nominal"):
-        where = ("--frame", frame, "--tool", "tool", "--out", "commands.csv")
-        code, said[frame], _ = calib("compensate", fitted, "t.csv", *where)
-        assert code == 0
+        said[frame] = commanded(calib, fitted, "--frame", frame, "--tool", "tool")
         sizes[frame] = np.sqrt(np.mean(numbers(commands(), ["before [mm]"]) ** 2))
     assert sizes["nominal"] == pytest.approx(metrics["nominal"]["position_mm"]["rms"], rel=0.2)
     assert sizes["nominal"] < sizes["base"]
@@ -166,8 +174,7 @@ def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):
     poses = forward(cell.nominal, q)
     write(here / "t.csv", ["x", "y", "z"], poses[:, :3, 3])
     start = "0,-1.2,1.5,-1,-1.4,0.3"
-    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv", "--start", start)
-    assert code == 0, err
+    out = commanded(calib, fitted, "--start", start)
     assert "position only" in out
     rows = commands()
     sent = numbers(rows, list(cell.nominal.joint_names))
@@ -179,9 +186,7 @@ def test_a_tool_given_by_numbers_is_the_flange_moved(cell, fitted, here, calib):
     q = drawn(cell, 30, 9)
     tool = from_xyz_rpy([0.1, 0.0, 0.2], [0.0, 0.5, 0.0])
     at_tool = forward(cell.nominal, q) @ tool
-    write(here / "tool.csv", ["x", "y", "z", "qx", "qy", "qz", "qw", *Q], np.hstack(
-        [at_tool[:, :3, 3], to_quaternion(at_tool), q]
-    ))  # fmt: skip
+    write_poses(here / "tool.csv", at_tool, q)
     write(here / "flange.csv", Q, q)
     assert calib("compensate", fitted, "flange.csv", "--out", "a.csv")[0] == 0
     code, _, err = calib("compensate", fitted, "tool.csv", "--tool", "0.1,0,0.2,0,0.5,0", "--out", "b.csv")
@@ -193,9 +198,7 @@ def test_what_is_out_of_reach_stops_all_or_is_left_empty(cell, fitted, here, cal
     q = drawn(cell, 3, 10)
     poses = forward(cell.nominal, q)
     poses[1, :3, 3] *= 3.0 / np.linalg.norm(poses[1, :3, 3])
-    write(here / "t.csv", ["x", "y", "z", "qx", "qy", "qz", "qw", *Q], np.hstack(
-        [poses[:, :3, 3], to_quaternion(poses), q]
-    ))  # fmt: skip
+    write_poses(here / "t.csv", poses, q)
     code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
     assert (code, Path("commands.csv").exists()) == (2, False)
     assert "1 of 3 targets" in err and "target 2: out of reach" in err and "--partial" in err
@@ -212,8 +215,7 @@ def test_joint_limits_are_kept(cell, fitted, here, calib):
     q = np.tile([0.3, 0.0, 1.2, 0.4, 1.1, 0.2], (3, 1))
     q[0, 1], q[1, 1], q[2, 1] = limit, -limit, limit + 0.1
     write(here / "t.csv", Q, np.vstack([q, drawn(cell, 5, 1)]))
-    code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv", "--partial")
-    assert code == 0, err
+    commanded(calib, fitted, "--partial")
     rows = commands()
     assert "outside the limits" in rows[2]["reason"]
     assert {rows[0]["status"], rows[1]["status"]} == {"reached", "not reached"}  # one of the two ends is inside
@@ -267,8 +269,7 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
 def test_one_target_and_the_same_one_twice_are_targets(fitted, here, calib):
     for count in (1, 3):
         write(here / "t.csv", Q, np.full((count, 6), 0.7))
-        code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
-        assert code == 0, err
+        commanded(calib, fitted)
         assert len(commands()) == count
 
 
@@ -277,3 +278,44 @@ def test_the_file_of_targets_reads_as_documented(here):
     found = read_targets("t.csv", Q)
     assert found.ignored == ("name",) and found.q is None
     assert found.position.tolist() == [[0.4, 0.0, 0.5]]
+
+
+CASES = [  # folder, robot, file, held-out share, goal [mm]
+    ("motoman_leica", "model_right.urdf", "right_6x6x6_150.csv", 1 / 3, 0.075),
+    pytest.param("ur5_gts3800", "model.urdf", "grid_800.csv", 0.25, 0.07, marks=pytest.mark.slow),
+    pytest.param("ur10_ipa", "model.urdf", "A_grid_2500.csv", 0.4, 0.12, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("folder", "robot", "file", "share", "goal"), CASES)
+def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
+    data, tmp_path, capsys, folder, robot, file, share, goal
+):
+    robot, file = data / folder / robot, data / folder / file
+    arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done", "--no-plots"]
+    assert cli.run([str(each) for each in arguments]) == 0
+    unseen = inputs.gather(robot, [file], settings=FitSettings(holdout=share)).unseen[file.name].block
+    fitted = compensation.read(tmp_path / "done")
+    turns = from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3] if isinstance(unseen, Poses) else None
+    targets = Targets(unseen.q, unseen.position, turns, file=file.name)
+    found = compensation.compensate(
+        fitted, targets, frame=unseen.station, tool=unseen.tool_names[0], tolerance=(1e-6, 1e-5)
+    )
+    arms = compensation.placements(fitted, unseen.station, unseen.tool_names[0])
+    ruler = Goal(replace(arms[0], tools=arms[1].tools))
+    stood = inverse.seen_at(ruler, unseen.q).poses()
+    off = {
+        name: np.linalg.norm(inverse.differences(ruler, q, stood)[:, :3], axis=1)[found.reached]
+        for name, q in (("nominal", found.nominal), ("compensated", found.q))
+    }
+    rms = {name: 1e3 * np.sqrt(np.mean(sizes**2)) for name, sizes in off.items()}
+    with capsys.disabled():
+        print(
+            f"\n  {folder} {file.name}, {int(found.reached.sum())} of {len(unseen)} held-out poses: "
+            f"{rms['nominal']:.3f} mm with the nominal joints, {rms['compensated']:.4f} mm with the commands"
+        )
+    assert found.reached.mean() > 0.97
+    assert rms["compensated"] < goal
+    assert rms["compensated"] < 0.5 * rms["nominal"]
+    assert rms["compensated"] == pytest.approx(1e3 * fitted.unseen, rel=0.1)

@@ -2,18 +2,27 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.geometry import fit as geometric_fit
 from calib.geometry import installation
+from calib.geometry.weighing import Settings
+from calib.procedure.kinematic_stage import fit, inputs
+from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.kinematic_stage.validation import Arms, assess
 from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
 from calib.robot.library import load
+from calib.rooms.cells.cell import SimulatedInstrument, measure
+from calib.rooms.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy
 
 ERRORS = {"mean", "rms", "p95", "max"}
@@ -331,3 +340,92 @@ def test_a_placement_alone_is_validated_with_frames_of_its_own(cell, calib):
     file, other = cell.write("a.csv", cell.measure(60)), cell.write("b.csv", cell.measure(40, 1))
     code, out, err = calib("fit", "ur5", file, "--model", "frames", "--validate", other, "--refit-frames", "--out", "o")
     assert (code, "b.csv" in out) == (0, True), err
+
+
+NOISE = 2e-5
+JOINTS = [f"q{j + 1}" for j in range(6)]
+REFLECTORS = ([0.05, 0.02, 0.1], [-0.05, 0.03, 0.1], [0.0, -0.06, 0.12])
+
+
+def points(cell, q: np.ndarray, tool: list[float]) -> np.ndarray:
+    """Return where the target is in the arm's base (m, 3)."""
+    return (forward(cell.truth, q) @ from_xyz_rpy(tool, [0, 0, 0]))[:, :3, 3]
+
+
+def distances(cell, q, generator) -> list[dict]:
+    p = points(cell, q, REFLECTORS[0])
+    known = np.linalg.norm(p[0::2] - p[1::2], axis=1) + NOISE * generator.standard_normal(len(q) // 2)
+    return [dict(zip(JOINTS, row)) | {"distance": known[k // 2], "pair": k // 2} for k, row in enumerate(q)]
+
+
+def bars(cell, q, generator) -> list[dict]:
+    p = points(cell, q, REFLECTORS[0])
+    known = np.linalg.norm(p - [0.6, 0.2, 0.3], axis=1) + NOISE * generator.standard_normal(len(q))
+    return [dict(zip(JOINTS, row)) | {"distance": d, "bar": "a"} for row, d in zip(q, known)]
+
+
+def reflectors(cell, q, generator) -> list[dict]:
+    station = from_xyz_rpy([1.5, -0.8, 0.4], [0.1, -0.2, 2.0])
+    rows = [dict(zip(JOINTS, row)) for row in q]
+    for number, tool in enumerate(REFLECTORS, 1):
+        seen = points(cell, q, tool) @ station[:3, :3].T + station[:3, 3]
+        for row, place in zip(rows, seen + NOISE * generator.standard_normal(seen.shape)):
+            row |= {f"{axis}{number}": value for axis, value in zip("xyz", place)}
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("measure", "count", "nature", "poses"),
+    [(distances, 240, "distance_mm", 192), (bars, 160, "distance_mm", 128), (reflectors, 60, "position_mm", 48)],
+)
+def test_a_kind_calibrates(cell, calib, measure, count, nature, poses):
+    generator = np.random.default_rng(3)
+    q = generator.uniform(-2.5, 2.5, (count, 6))
+    rows = measure(cell, q, generator)
+    file = cell.write("a.csv", rows, list(rows[0]))
+    code, _, err = calib("fit", "ur5", file, "--model", "geometry", "--holdout", "0.2", "--out", "done")
+    assert code == 0, err
+    metrics = json.loads(Path("done/metrics.json").read_text())
+    unseen = metrics["validation"]["a.csv"]
+    assert metrics["fit"]["poses"] == poses
+    assert unseen["nominal"][nature]["rms"] > 0.4
+    assert unseen["calibrated"][nature]["rms"] < 0.06
+    if nature == "distance_mm":
+        assert unseen["calibrated"]["position_mm"] is None
+    else:
+        assert unseen["calibrated"]["distance_mm"] is None
+
+
+def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The optimiser gets one linearisation for the file's own frames: what it leaves there means nothing."""
+    cell = perturbed_cell(load("ur10"), 0, SimulatedInstrument("6-D probe", 30e-6, 1e-4), hidden=0.3)
+    rng = np.random.default_rng(0)
+    seen, other = (measure(cell, rng.uniform(-2.0, 2.0, (count, 6)), count) for count in (40, 30))
+    wanted = FitSettings(model="offsets", refit_frames=True)
+    given = inputs.gather(
+        CalibratedChain(cell.nominal),
+        [replace(seen, file="seen.csv")],
+        [replace(other, file="other.csv")],
+        settings=wanted,
+    )
+    found = fit.run(given, wanted=wanted)
+    (name,) = found.validation
+    assert found.validation[name].settled and found.validation[name].proves and name in found.verdict.reason
+    monkeypatch.setattr(geometric_fit, "CRAWLS", 1)
+    chosen = found.selection
+    arms = Arms(chosen.nominal.cell, chosen.fit.cell, found.rigid.cell.chain, found.expected)
+    again = assess(arms, given, found.findings, Settings(limit=1), wanted)
+    assert not again.validation[name].settled and not again.validation[name].proves
+    codes = {one.code: one.values.get("file") for one in again.noticed}
+    assert codes["placement-unsettled"] == name and "interval-coverage" not in codes
+    assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason
+
+
+def test_a_file_that_its_own_placement_explains_proves_nothing(cell, calib) -> None:
+    """Six positions are eighteen numbers, base and tool nine parameters; twelve positions leave enough."""
+    file, other = cell.write("a.csv", cell.measure(60)), cell.measure(12, 1)
+    for count, scored in ((6, False), (12, True)):
+        few = cell.write("few.csv", other[:count])
+        _, out, err = calib("fit", "ur5", file, "--model", "offsets", "--validate", few, "--refit-frames", "--out", "o")
+        assert ("few.csv is not scored: base and tool placement use 9" in out) is not scored, err
+        assert ("on few.csv, unseen" in out) is scored

@@ -13,16 +13,17 @@ from calib.robot.kinematics import forward
 
 ODD = [code for code, entry in catalogue().items() if entry.accept]
 
-COUNT = 40
+COUNT, SLOW = 40, pytest.mark.slow
 
 
-def changed(cell, name: str, change, quaternions: bool = False) -> Path:
+def changed(cell, change) -> list[dict[str, float]]:
     rows = cell.measure(COUNT)
-    place = np.array([[row[axis] for axis in "xyz"] for row in rows])
-    for row, (x, y, z) in zip(rows, change(place)):
-        row |= {"x": x, "y": y, "z": z}
-    columns = None if quaternions else [*(f"q{j + 1}" for j in range(6)), *"xyz"]
-    return cell.write(name, rows, columns)
+    places = change(np.array([[row[axis] for axis in "xyz"] for row in rows]))
+    return [row | dict(zip("xyz", place)) for row, place in zip(rows, places)]
+
+
+def fitted(cell, calib, rows, *model: str) -> tuple[int, str, str]:
+    return calib("fit", "ur5", cell.write("m.csv", rows), "--out", "o", *(("--model", *model) if model else ()))
 
 
 def verdict() -> tuple[str, str, list[str]]:
@@ -36,7 +37,7 @@ def noticed() -> dict[str, Finding]:
 
 
 def test_sound_poses_are_not_remarked_upon(cell, calib):
-    code, _, err = calib("fit", "ur5", cell.write("m.csv", cell.measure(COUNT)), "--out", "o", "--model", "frames")
+    code, _, err = fitted(cell, calib, cell.measure(COUNT), "frames")
     assert (code, *verdict()) == (0, "pass", "", []), err
 
 
@@ -44,17 +45,13 @@ def test_sound_poses_are_not_remarked_upon(cell, calib):
     "change, name",
     [
         (lambda place: np.random.default_rng(0).permutation(place), "unexplained"),
-        pytest.param(
-            lambda place: np.random.default_rng(0).uniform(-0.8, 0.8, place.shape),
-            "unexplained",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(lambda place: place[:, [1, 1, 2]], "unexplained", marks=pytest.mark.slow),
+        pytest.param(lambda p: np.random.default_rng(0).uniform(-0.8, 0.8, p.shape), "unexplained", marks=SLOW),
+        pytest.param(lambda place: place[:, [1, 1, 2]], "unexplained", marks=SLOW),
         (lambda place: place * [1, -1, 1], "left-handed"),
     ],
 )
 def test_frames_alone_are_judged_too(cell, calib, change, name):
-    code, out, _ = calib("fit", "ur5", changed(cell, "m.csv", change), "--out", "o", "--model", "frames")
+    code, out, _ = fitted(cell, calib, changed(cell, change), "frames")
     level, decided, odd = verdict()
     assert (code, level, decided) == (1, "fail", name) and odd[0] == name
     assert f'accept = ["{catalogue()[name].accept}"]' in out
@@ -68,8 +65,8 @@ def test_frames_alone_are_judged_too(cell, calib, change, name):
     [
         ("frames", (2, 5)),
         ("geometry", (4,)),
-        *(pytest.param("frames", joints, marks=pytest.mark.slow) for joints in ((1,), (4,))),
-        *(pytest.param("geometry", joints, marks=pytest.mark.slow) for joints in ((1,), (2, 5))),
+        *(pytest.param("frames", joints, marks=SLOW) for joints in ((1,), (4,))),
+        *(pytest.param("geometry", joints, marks=SLOW) for joints in ((1,), (2, 5))),
     ],
 )
 def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, model):
@@ -77,8 +74,7 @@ def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, mo
     rows = cell.measure(COUNT)
     for row in rows:
         row |= {f"q{j + 1}": -row[f"q{j + 1}"] for j in reversed_ones}
-    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    code, _, err = calib("fit", "ur5", path, "--out", "o", "--model", model)
+    code, _, err = fitted(cell, calib, rows, model)
     level, decided, odd = verdict()
     assert (code, level, decided) == (1, "fail", "joint-sign"), err
     assert odd[0] == "joint-sign" and "moved" not in odd
@@ -101,8 +97,7 @@ def test_joints_that_count_from_another_or_are_exchanged_are_named(cell, calib, 
     rows = cell.measure(COUNT)
     for row in rows:
         row |= {name: row[one] + way * row[other] for name, (one, other, way) in change.items()}
-    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    done, _, err = calib("fit", "ur5", path, "--out", "o", "--model", model)
+    done, _, err = fitted(cell, calib, rows, model)
     level, decided, odd = verdict()
     assert (done, level, decided) == (1, "fail", code) and "moved" not in odd, err
     found = noticed()[code].values
@@ -113,8 +108,7 @@ def test_joints_that_count_from_another_or_are_exchanged_are_named(cell, calib, 
 @pytest.mark.parametrize("degrees, level", [(90, "fail"), (20, "marginal")])
 def test_a_joint_counted_from_another_zero_is_told(cell, calib, degrees, level):
     rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]
-    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    code, out, _ = calib("fit", "ur5", path, "--out", "o", "--model", "geometry")
+    code, out, _ = fitted(cell, calib, rows, "geometry")
     assert (code, *verdict()) == (int(level == "fail"), level, "moved", ["moved"])
     assert f"-{degrees}°" in str(noticed()["moved"].values["elements"]) and 'accept = ["moved"]' in out
     Path("a.toml").write_text('accept = ["moved"]')
@@ -126,7 +120,7 @@ def test_a_joint_counted_from_another_zero_is_told(cell, calib, degrees, level):
     "factor, level", [(1.0, None), (1.05, "fail"), (0.97, "fail"), (0.98, "marginal"), (1.003, "note")]
 )
 def test_one_factor_on_all_lengths_is_the_instruments_or_another_robots(cell, calib, factor, level):
-    calib("fit", "ur5", changed(cell, "m.csv", lambda place: factor * place), "--out", "o", "--model", "frames")
+    fitted(cell, calib, changed(cell, lambda place: factor * place), "frames")
     found = [one for code, one in noticed().items() if catalogue()[code].accept == "scale"]
     assert [level_of(one) for one in found] == ([] if level is None else [level])
     if level is not None:
@@ -140,8 +134,7 @@ def test_lengths_that_grew_together_are_noted_whatever_else_was_wrong(cell, cali
     rows = cell.measure(COUNT)
     for row in rows:
         row |= {axis: factor * row[axis] for axis in "xyz"} | {"q2": row["q2"] + 0.02, "q3": row["q3"] - 0.03}
-    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    calib("fit", "ur5", path, "--out", "o", "--model", "geometry")
+    fitted(cell, calib, rows, "geometry")
     found = noticed().get("lengths-grew")
     assert (found is not None) == told
     if found is not None:
@@ -149,26 +142,23 @@ def test_lengths_that_grew_together_are_noted_whatever_else_was_wrong(cell, cali
         assert size["factor"] == pytest.approx(factor, abs=3 * size["sigma"] + 5e-4) and level_of(found) == "note"
 
 
+def computed(cell) -> np.ndarray:
+    q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in cell.measure(COUNT)])
+    return forward(cell.nominal, q)[:, :3, 3]
+
+
 def test_computed_positions_are_noted(cell, calib):
-    rows = cell.measure(COUNT)
-    q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in rows])
-    place = forward(cell.nominal, q)[:, :3, 3] + 3e-7 * np.random.default_rng(0).normal(size=(COUNT, 3))  # rounded
-    for row, (x, y, z) in zip(rows, place):
-        row |= {"x": x, "y": y, "z": z}
-    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    _, out, err = calib("fit", "ur5", path, "--out", "o", "--model", "frames")
+    rounding = 3e-7 * np.random.default_rng(0).normal(size=(COUNT, 3))
+    rows = changed(cell, lambda _: computed(cell) + rounding)
+    _, out, err = fitted(cell, calib, rows, "frames")
     assert not err
     assert verdict()[2] == ["commanded"] and lines_of([noticed()["commanded"]])[0] in out
 
 
 def test_positions_without_any_error_leave_nothing_to_gain(cell, calib):
     """No step is better than the start here: the residuals are rounding."""
-    rows = cell.measure(COUNT)
-    q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in rows])
-    for row, place in zip(rows, forward(cell.nominal, q)[:, :3, 3]):
-        row |= dict(zip("xyz", place))
-    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    code, _, err = calib("fit", "ur5", path, "--out", "o")
+    rows = changed(cell, lambda _: computed(cell))
+    code, _, err = fitted(cell, calib, rows)
     assert not code, err
     assert verdict() == ("pass", "", ["commanded"])
 

@@ -13,14 +13,7 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import judge, judge_deliverables
 
 
-def rows(
-    nominal: float,
-    calibrated: float,
-    proves: bool = True,
-    turned: float | None = None,
-    alone: float | None = None,
-    shares_frames: bool = True,
-) -> Comparison:
+def rows(nominal, calibrated, proves=True, turned=None, alone=None, shares_frames=True) -> Comparison:
     """Return a comparison with errors of these sizes [mm] on 50 poses; orientations are off by `turned` [deg]."""
     angles = None if turned is None else np.radians(np.full(50, turned))
     sizes = [Errors(np.full(50, 1e-3 * size), angles, None) for size in (nominal, calibrated)]
@@ -34,6 +27,7 @@ def rows(
 FITTED = Findings("geometry", 1e-4, None, 0.0, np.inf)
 MISFIT = finding("rigid-misfit", rms=1e-3, reach=1.0, healthy=4e-4, left=2.0)
 LIGHT = finding("rigid-misfit", rms=1e-3, reach=1.0, healthy=4e-4, left=0.5)
+ASKED = {"model": "frames", "asked": "frames"}
 SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01, sigmas=100.0)
 
 
@@ -57,13 +51,8 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({}, {"cross_validated": 2e-3}, "fail", "worse-than-nominal"),
         ({"a": rows(1.0, 0.01, proves=False)}, {"cross_validated": None}, "marginal", "no-unseen-poses"),
         ({"a": rows(1.0, 1.0)}, {"model": "frames"}, "fail", "no-better-model"),
-        ({"a": rows(1.0, 1.0)}, {"model": "frames", "asked": "frames"}, "pass", ""),
-        (
-            {"a": rows(1.0, 1.0)},
-            {"model": "frames", "asked": "frames", "noticed": (SCALE,)},
-            "marginal",
-            "lengths-grew",
-        ),
+        ({"a": rows(1.0, 1.0)}, ASKED, "pass", ""),
+        ({"a": rows(1.0, 1.0)}, ASKED | {"noticed": (SCALE,)}, "marginal", "lengths-grew"),
         # orientations count
         ({"a": rows(1.0, 0.1, turned=4.0)}, {}, "pass", ""),
         ({"a": rows(1.0, 0.1, turned=6.0)}, {}, "fail", "orientations-off"),

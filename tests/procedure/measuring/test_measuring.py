@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +13,20 @@ from calib.cli import run
 from calib.config import parse
 from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
+from calib.procedure.measuring import run as measuring
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
-from calib.procedure.measuring.run import RunSettings, is_run, plan_run, rehearsed_samples, write_run
+from calib.procedure.measuring.run import (
+    Exchange,
+    RunSettings,
+    drivable,
+    is_run,
+    plan_run,
+    rehearsed_samples,
+    turns,
+    write_run,
+)
 from calib.procedure.session.questions import cell_tables
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
@@ -75,12 +86,8 @@ def test_several_reflectors_let_more_poses_be_seen_and_only_seen_rows_count(tmp_
     assert np.array_equal(np.abs(rows).reshape(len(own), 3, -1).max(axis=2) > 0, visible)
     for constraint in spaces[1].constraints:
         for pose in own[:3]:
-            check(
-                lambda x, one=constraint: one.function(x[None])[0],
-                constraint.gradient(pose[None])[0],
-                pose,
-                tolerance=1e-5,
-            )
+            slope = constraint.gradient(pose[None])[0]
+            check(lambda x, one=constraint: one.function(x[None])[0], slope, pose, tolerance=1e-5)
 
 
 def test_the_cell_as_told_becomes_tables():
@@ -125,12 +132,8 @@ def test_answers_that_cannot_be(answers, words):
 def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path, capsys):
     given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
     assert run([*given, str(tmp_path / "a.csv")]) == 0
-    assert {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")} == {
-        "a.csv",
-        "a_prediction.json",
-        "a_predicted.png",
-        "a_outlook.png",
-    }
+    written = {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")}
+    assert written == {"a.csv", "a_prediction.json", "a_predicted.png", "a_outlook.png"}
     assert run([*given, str(tmp_path / "b.csv"), "--no-plots"]) == 0 and not (tmp_path / "b_predicted.png").exists()
     (tmp_path / "a.csv").rename(tmp_path / "c_outlook.png")
     assert run([*given, str(tmp_path / "c.csv"), "--existing", str(tmp_path / "c_outlook.png")]) == 2
@@ -187,13 +190,8 @@ def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
     wanted = calib.SelectionSettings("position", ((0.05, 0, 0.05),), candidates=100)
     chosen = calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "c.toml")
     told = str(chosen)
-    for words in (
-        "predicted σ of the tool's position",
-        "cost of line of sight",
-        "run: 14 poses in",
-        "NOT checked: walls",
-    ):
-        assert words in told
+    said = ("predicted σ of the tool's position", "cost of line of sight", "run: 14 poses in", "NOT checked: walls")
+    assert all(words in told for words in said)
     outlook = chosen.outlook
     assert outlook.blind is not None and outlook.blind[0] > outlook.comparable
     with pytest.raises(calib.CalibError, match="of random postures keep: line of sight 0 %"):
@@ -227,3 +225,83 @@ def test_what_never_acts_is_told_and_not_said_to_be_kept(tmp_path):
     assert any("wall: 49.5 m" in note for note in far.notes) and not any("wall" in kept for kept in far.checked)
     assert not any("wall:" in note for note in near.notes) and any("wall" in kept for kept in near.checked)
     assert any("if in degrees" in note for note in _limits("[joints]\nq1 = [-90, 90]\n", tmp_path).notes)
+
+
+CHAIN = load("ur5")
+FULL = 2 * np.pi
+
+
+class Barrier:
+    """A wall through the axis of the first joint, at one of its angles."""
+
+    def free(self, q: np.ndarray, clearance: float) -> np.ndarray:
+        return np.abs(np.angle(np.exp(1j * q[:, 0]))) > 0.1
+
+
+def walls(most: float) -> SimpleNamespace:
+    top = np.array([most, 2.0, 2.0, 2.0, 2.0, 2.0])
+    return SimpleNamespace(lower=-top, upper=top, collision=Barrier(), clearance=0.05)
+
+
+def poses(count: int, seed: int, side: float) -> np.ndarray:
+    q = np.random.default_rng(seed).uniform(-1.5, 1.5, (count, 6))
+    q[:, 0] = side * np.random.default_rng(seed + 1).uniform(0.2, 2.5, count)
+    return q
+
+
+@pytest.mark.parametrize("index", ["O1", pytest.param("O3", marks=pytest.mark.slow)])
+def test_poses_behind_a_wall_are_replaced_by_those_that_cost_least(index):
+    room, seen = walls(2.8), observation(targets_of(CHAIN))
+    q = np.concatenate([poses(9, 1, 1.0), poses(2, 2, -1.0)])
+    candidates = np.concatenate([poses(60, 3, 1.0), poses(60, 4, -1.0)])
+    assert plan_run(CHAIN, q, room).cut_off == (9, 10)
+    exchange = Exchange(seen, candidates, None, index)
+    found = drivable(CHAIN, q, exchange, room, RunSettings())
+    assert set(found.replaced) == {9, 10} and not found.run.blocked and np.array_equal(found.q[:9], q[:9])
+    assert all(number < 60 for number in found.replaced.values())  # on the side where the others are
+    trials = [exchange.value(np.concatenate([found.q[:10], one[None]]))[0] for one in candidates[:60]]
+    assert found.value[1] == pytest.approx(max(trials), rel=1e-9)
+    assert found.value == pytest.approx((exchange.value(q)[0], exchange.value(found.q)[0]))
+    named = [number for number, place in enumerate(found.run.order, 1) if place > 8]
+    assert found.words.startswith(f"poses {named[0]}, {named[1]} replaced")
+
+
+def test_the_same_pose_on_another_turn_is_kept():
+    room, seen = walls(6.0), observation(targets_of(CHAIN))
+    q = np.concatenate([poses(9, 1, 1.0), poses(2, 2, -1.0)])
+    found = drivable(CHAIN, q, Exchange(seen, poses(60, 3, 1.0), None, "O1"), room, RunSettings())
+    assert not found.replaced and not found.words and not found.run.blocked
+    assert np.abs(np.sin((found.q - q) / 2)).max() < 1e-9
+    assert found.value[0] == pytest.approx(found.value[1], rel=1e-9)
+
+
+def test_what_cannot_be_replaced_is_told():
+    room, seen = walls(2.8), observation(targets_of(CHAIN))
+    q = np.concatenate([poses(5, 1, 1.0), poses(1, 2, -1.0)])
+    found = drivable(CHAIN, q, Exchange(seen, poses(60, 4, -1.0), None, "O1"), room, RunSettings())
+    assert found.run.cut_off == (5,) and len(found.run.blocked) == 1 and not found.replaced
+
+
+def test_turns_are_the_same_posture_within_the_limits():
+    top = np.array([6.2, 2.0, 2.0, 2.0, 2.0, 9.0])
+    found = turns(CHAIN, np.full(6, 1.0), -top, top)
+    assert len(found) == 2 * 3 and (np.abs(found) <= top).all()
+    assert np.abs(np.sin((found - 1.0) / 2)).max() < 1e-12
+
+
+def test_ways_found_lead_by_third_poses_where_no_other_way_is_found(monkeypatch):
+    """Of a star only the middle is joined with each: the run comes back to it, and leaves nothing out."""
+    room, q = walls(2.8), poses(5, 1, 1.0)
+
+    def only_the_middle(room, start, goal, **_):
+        ends = [start, goal]
+        return np.array(ends) if any(np.array_equal(end, q[0]) for end in ends) else None
+
+    monkeypatch.setattr(measuring, "way", only_the_middle)
+    found = drivable(CHAIN, q, Exchange(observation(targets_of(CHAIN)), q, None, "O1"), room, RunSettings())
+    run = found.run
+    assert not found.replaced and np.array_equal(found.q, q)
+    assert not run.blocked and not run.cut_off and sorted(run.order) == list(range(5)) and run.around >= 2
+    for (one, two), way in run.found_ways.items():
+        assert np.array_equal(way[[0, -1]], q[[one, two]])
+        assert len(way) == 2 or np.array_equal(way[1], q[0])
