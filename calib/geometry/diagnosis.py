@@ -149,13 +149,9 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
     if not rows:
         return None
     value, matrix = np.concatenate(rows), np.concatenate(columns)
-    size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
-    return _scale(value, matrix / size, float(size[-1]))
-
-
-def _scale(value: np.ndarray, matrix: np.ndarray, size: float) -> Scale | None:
-    """Return the scale s of y - p = (1 - 1/s) y, fitted by the last column together with all others."""
-    others, last = matrix[:, :-1], matrix[:, -1]
+    sizes = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
+    matrix, size = matrix / sizes, float(sizes[-1])
+    others, last = matrix[:, :-1], matrix[:, -1]  # of y - p = (1 - 1/s) y the last column has s
     left, own = (x - others @ np.linalg.lstsq(others, x, rcond=1e-9)[0] for x in (value, last))
     power, count = float(own @ own), len(value) - matrix.shape[1]
     if count < 1 or power < 1e-12:

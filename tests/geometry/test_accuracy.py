@@ -41,13 +41,9 @@ def test_rms_is_that_of_the_norm():
     assert statistics(None) is None
 
 
-def test_positions_alone_have_no_orientation():
+def test_positions_alone_have_no_orientation_and_distances_no_position():
     found = errors(CELL, [block("position", position=EXACT[:, :3, 3])]).summary()
-    assert found.orientation_deg is None
-    assert found.position_mm.max < 1e-9
-
-
-def test_distances_have_no_position():
+    assert found.orientation_deg is None and found.position_mm.max < 1e-9
     known = np.linalg.norm(IN_BASE[0::2] - IN_BASE[1::2], axis=1) + 2e-3
     found = errors(CELL, [block("distance", distance=np.repeat(known, 2), group=np.repeat(np.arange(12), 2))]).summary()
     assert found.position_mm is None

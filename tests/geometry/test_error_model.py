@@ -26,13 +26,16 @@ def measured(seed: int, count: int, reach: float, outside: float) -> Positions:
     return replace(seen, q=q, sigma=None, station="station")
 
 
-@pytest.fixture(scope="module")
-def found() -> tuple[ErrorModel, Installation]:
-    block = measured(1, 150, 1.6, 5e-4)
-    selected = select_model(install(load("ur5"), [block]), [block])
+def learnt(block: Positions, *model: str) -> tuple[ErrorModel, Installation]:
+    selected = select_model(install(load("ur5"), [block]), [block], *model)
     model = learn_errors(selected, [block])
     assert model is not None
     return model, selected.fit.cell
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[ErrorModel, Installation]:
+    return learnt(measured(1, 150, 1.6, 5e-4))
 
 
 @pytest.mark.parametrize("reach", [1.2, 1.6, 2.4])
@@ -62,11 +65,9 @@ def test_an_arm_that_errs_more_at_one_end_of_a_joint_is_expected_to():
         return replace(block, position=block.position + np.random.default_rng(seed).normal(0.0, size, (count, 3)))
 
     block, unseen = uneven(1, 200), uneven(2, 600)
-    selected = select_model(install(load("ur5"), [block]), [block], "geometry")
-    model = learn_errors(selected, [block])
-    assert model is not None
-    radius = model.discrepancy.radius * model.sigma_on(selected.fit.cell, unseen)
-    size, end = errors(selected.fit.cell, [unseen]).main, unseen.q[:, 0] > 0.8
+    model, cell = learnt(block, "geometry")
+    radius = model.discrepancy.radius * model.sigma_on(cell, unseen)
+    size, end = errors(cell, [unseen]).main, unseen.q[:, 0] > 0.8
     assert np.median(radius[~end]) < 0.4 * np.median(radius[end])
     assert 0.9 < np.mean(size[end] < radius[end]) < 0.98 and np.mean(size[~end] < radius[~end]) > 0.95
 
@@ -80,12 +81,9 @@ def test_intervals_learnt_from_few_poses_hold_on_average():
 
     unseen, covered = noisy(99, 300), []
     for seed in range(10, 26):
-        block = noisy(seed, 24)
-        selected = select_model(install(load("ur5"), [block]), [block], "frames")
-        model = learn_errors(selected, [block])
-        assert model is not None
-        radius = model.discrepancy.radius * model.sigma_on(selected.fit.cell, unseen)
-        covered.append(np.mean(errors(selected.fit.cell, [unseen]).main < radius))
+        model, cell = learnt(noisy(seed, 24), "frames")
+        radius = model.discrepancy.radius * model.sigma_on(cell, unseen)
+        covered.append(np.mean(errors(cell, [unseen]).main < radius))
     assert 0.92 < np.mean(covered) < 0.98
 
 

@@ -25,12 +25,17 @@ def assert_partition(folds: Folds, measured) -> None:
     assert counts.min() > 0 and counts.max() < counts.sum()
 
 
+def parted(measured, kind: str, count: int | None = None) -> Folds:
+    """Return the most demanding folds: a partition of this kind."""
+    folds = transfer_folds(measured)
+    assert folds.kind == kind and count in (None, folds.count)
+    assert_partition(folds, measured)
+    return folds
+
+
 @pytest.mark.parametrize("count", [30, 60, 300, 1000])
 def test_regions_are_a_partition_of_any_size_and_none_dominates(truth, count):
-    measured = [measure(truth, "position", count, 1)]
-    folds = transfer_folds(measured)
-    assert folds.kind == "regions"
-    assert_partition(folds, measured)
+    folds = parted([measure(truth, "position", count, 1)], "regions")
     assert np.bincount(folds.members[0]).max() < (0.7 if count < 60 else 0.4) * count
 
 
@@ -55,29 +60,25 @@ def test_the_seed_repeats_the_regions(truth):
 def test_stations_are_kept_whole_each_in_a_fold_of_its_own(truth):
     measured = [measure(truth, "position", 20 + 5 * k, k, station=k) for k in range(3)]
     measured.append(replace(measure(truth, "pose", 15, 9, station=1), file="again"))
-    folds = transfer_folds(measured)
-    assert folds.kind == "stations" and folds.count == 3
-    assert_partition(folds, measured)
+    folds = parted(measured, "stations", 3)
     first = [members[0] for members in folds.members]
     assert all(len(set(members)) == 1 for members in folds.members)
     assert first[1] == first[3] and len(set(first[:3])) == 3
 
 
-def test_one_station_only_is_split_by_regions(truth):
-    measured = [measure(truth, "position", 40, 1), measure(truth, "pose", 40, 2)]
-    folds = transfer_folds(measured)
-    assert folds.kind == "regions"
-    assert_partition(folds, measured)
+def test_one_station_or_fixture_cannot_be_left_out_so_regions_are(truth):
+    parted([measure(truth, "position", 40, 1), measure(truth, "pose", 40, 2)], "regions")
+    parted([sockets(1)], "regions")
+
+
+def assert_pairs_together(folds: Folds, block) -> None:
+    assert all(len(set(folds.members[0][block.group == pair])) == 1 for pair in np.unique(block.group))
 
 
 def test_the_two_rows_of_a_distance_stay_together(truth):
     measured = [measure(truth, "distance", 120, 1), measure(truth, "position", 50, 2)]
-    order = np.random.default_rng(0).permutation(120)
-    measured[0] = take(measured[0], order)
-    folds = transfer_folds(measured)
-    assert_partition(folds, measured)
-    for pair in np.unique(measured[0].group):
-        assert len(set(folds.members[0][measured[0].group == pair])) == 1
+    measured[0] = take(measured[0], np.random.default_rng(0).permutation(120))
+    assert_pairs_together(parted(measured, "regions"), measured[0])
 
 
 def sockets(fixtures: int, file: str = "one", linked: bool = True) -> PoseMeasurements:
@@ -91,29 +92,17 @@ def sockets(fixtures: int, file: str = "one", linked: bool = True) -> PoseMeasur
 @pytest.mark.parametrize("fixtures", [3, 5, 8])
 def test_fixtures_stay_whole_with_both_sockets_of_a_known_distance(fixtures):
     measured = sockets(fixtures)
-    folds = transfer_folds([measured])
-    assert folds.kind == "fixtures" and folds.count == min(fixtures, 5)
-    assert_partition(folds, [measured])
+    folds = parted([measured], "fixtures", min(fixtures, 5))
     for k in range(fixtures):
         assert len(set(folds.members[0][np.isin(measured.group, [2 * k, 2 * k + 1])])) == 1
 
 
 def test_sockets_without_links_are_left_out_one_by_one():
-    measured = sockets(2, linked=False)
-    folds = transfer_folds([measured])
-    assert folds.kind == "fixtures" and folds.count == 4
-    assert_partition(folds, [measured])
-
-
-def test_one_fixture_cannot_be_left_out_so_regions_are():
-    assert transfer_folds([sockets(1)]).kind == "regions"
+    parted([sockets(2, linked=False)], "fixtures", 4)
 
 
 def test_files_without_an_instrument_are_left_out_one_by_one():
-    measured = [sockets(2, "x"), sockets(2, "y"), sockets(2, "z")]
-    folds = transfer_folds(measured)
-    assert folds.kind == "files" and folds.count == 3
-    assert_partition(folds, measured)
+    folds = parted([sockets(2, name) for name in "xyz"], "files", 3)
     assert all(len(set(members)) == 1 for members in folds.members)
 
 
@@ -126,8 +115,7 @@ def test_random_folds_are_a_partition_that_the_seed_repeats(truth, kind):
     assert np.array_equal(folds.members[0], random_folds(measured, 10, seed=3).members[0])
     assert not np.array_equal(folds.members[0], random_folds(measured, 10, seed=4).members[0])
     if kind == "distance":
-        for pair in np.unique(measured[0].group):
-            assert len(set(folds.members[0][measured[0].group == pair])) == 1
+        assert_pairs_together(folds, measured[0])
 
 
 def test_leaving_out_one_pose_leaves_out_each_once_and_only_of_few(truth):

@@ -18,6 +18,10 @@ from calib.robot.calibrated import Deflection, Term, evaluate
 SIGMA = 4e-5
 
 
+def climb(nominal, measured, *model: str, **more):
+    return select_model(install(nominal, [measured]), [measured], *model, **more)
+
+
 def rigid(robot: str, seed: int) -> Installation:
     return cell(perturb(load(robot), seed, 0.5e-3, 1e-3), seed)
 
@@ -54,7 +58,7 @@ def unseen(found, truth: Installation, known: bool) -> float:
 def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed):
     truth = rigid(robot, seed)
     measured = measure(truth, kind, count, seed, sigma=SIGMA, sigma_rotation=1e-4)
-    found = select_model(install(load(robot), [measured]), [measured])
+    found = climb(load(robot), measured)
     assert found.chosen == "geometry"
     assert not found.fit.cell.deflection.terms
     kept = [rung.model for rung in found.rungs if rung.kept]
@@ -66,9 +70,7 @@ def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed
 
 def test_an_arm_that_is_its_nominal_needs_only_frames():
     truth = cell(load("ur5"), 1)
-    measured = measure(truth, "position", 150, 1, sigma=SIGMA)
-    found = select_model(install(load("ur5"), [measured]), [measured])
-    assert found.chosen == "frames"
+    assert climb(load("ur5"), measure(truth, "position", 150, 1, sigma=SIGMA)).chosen == "frames"
 
 
 def test_joint_offsets_are_found_to_be_joint_offsets():
@@ -76,9 +78,7 @@ def test_joint_offsets_are_found_to_be_joint_offsets():
     moving = [nominal.names[k] for k in nominal.moving]
     offsets = dict(zip(moving, 2e-3 * np.random.default_rng(0).normal(size=6)))
     truth = cell(nominal.with_values(offsets), 1)
-    measured = measure(truth, "position", 150, 1, sigma=SIGMA)
-    found = select_model(install(nominal, [measured]), [measured])
-    assert found.chosen == "offsets"
+    assert climb(nominal, measure(truth, "position", 150, 1, sigma=SIGMA)).chosen == "offsets"
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
@@ -88,8 +88,8 @@ def test_planted_compliance_is_found(seed, known):
     truth, nominal = sagging(seed), load("lwr4plus")
     measured = measure(truth, "position", 200, seed, sigma=SIGMA, torque=partial(gravity_torques, nominal))
     measured = measured if known else replace(measured, torque=None)
-    found = select_model(install(nominal, [measured]), [measured])
-    plain = select_model(install(nominal, [measured]), [measured], "geometry")
+    found = climb(nominal, measured)
+    plain = climb(nominal, measured, "geometry")
     assert "stiffness" in found.chosen
     errors = [unseen(f.fit, truth, True) if known or f is plain else _unseen_sag(f.fit, truth) for f in (found, plain)]
     assert errors[0] < 2.5 * SIGMA < 5 * SIGMA < errors[1]
@@ -110,8 +110,7 @@ def _unseen_sag(found, truth: Installation) -> float:
 def climbed(seed: int) -> tuple:
     """Return the ladder of a wavy UR5, and its geometry alone."""
     measured = measure(wavy(seed), "position", 400, seed, sigma=SIGMA)
-    start = install(load("ur5"), [measured])
-    return select_model(start, [measured]), select_model(start, [measured], "geometry")
+    return climb(load("ur5"), measured), climb(load("ur5"), measured, "geometry")
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
@@ -139,9 +138,7 @@ def test_the_last_rung_kept_is_the_one_chosen_and_each_kept_rung_is_better():
 
 @pytest.mark.parametrize("model", ["frames", "offsets", "geometry", "stiffness", "coupling"])
 def test_any_rung_can_be_asked_for(model):
-    truth = rigid("ur5", 2)
-    measured = measure(truth, "position", 120, 1, sigma=SIGMA)
-    found = select_model(install(load("ur5"), [measured]), [measured], model)
+    found = climb(load("ur5"), measure(rigid("ur5", 2), "position", 120, 1, sigma=SIGMA), model)
     assert found.chosen.split(" + ")[-1] == model
     assert found.rungs[-1].kept
 

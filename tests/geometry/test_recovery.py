@@ -7,10 +7,11 @@ import pytest
 import scipy.stats
 from planted import cell, deviation, load, measure, perturb, position_error, random_joints
 
+from calib.data.poses.measurements import take
 from calib.estimation import robust
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
-from calib.geometry.installation import Installation
+from calib.geometry.installation import Installation, see
 from calib.geometry.observation import layout
 from calib.geometry.weighing import Settings
 
@@ -108,8 +109,7 @@ def test_predictions_at_unseen_joints_are_better_than_one_measurement(robot, kin
 def test_without_noise_the_truth_is_found_to_rounding(name):
     scene = SCENES[name][0]
     nominal = load("lwr4plus")
-    truth = cell(perturb(nominal, 5, 1e-3, 2e-3), 1)
-    measured = scene(truth, 1, 0.0, 1)
+    measured = scene(cell(perturb(nominal, 5, 1e-3, 2e-3), 1), 1, 0.0, 1)
     found = calibrate(nominal, measured)
     assert found.solution.cost < 1e-6 * len(measured[0]) or found.estimate.residual_std < 1e-3
     assert max(np.abs(part.value).max() for part in (piece.part for piece in found.pieces)) < 1e-8
@@ -130,9 +130,7 @@ def test_sigmas_that_are_not_stated_are_estimated(name, seeds):
         found, known = calibrate(nominal, [measured]), calibrate(nominal, [told])
         true = {"position": SIGMA, "orientation": 2e-4}
         ratios.append([piece.sigma.mean() / true[piece.part.label] for piece in found.pieces])
-        q = random_joints(
-            nominal, 50, 9
-        )  # other weights may choose other columns for the same arm: compare predictions
+        q = random_joints(nominal, 50, 9)  # other weights may choose other columns for the same arm
         assert position_error(found.cell, known.cell, q).max() < 0.5 * SIGMA
     assert np.mean(ratios, axis=0) == pytest.approx(1.0, abs=4 * 0.05 / np.sqrt(seeds))
 
@@ -155,13 +153,8 @@ def test_what_few_poses_hardly_tell_goes_back_to_its_nominal():
     truth = cell(perturb(nominal, 1, 0.5e-3, 1e-3), 1)
     q = random_joints(nominal, 40, 1)
     q[:, 4] = 0.7 + 1e-3 * np.random.default_rng(0).normal(size=40)
-    from calib.geometry.installation import see
-
-    rng = np.random.default_rng(2)
-    seen = see(truth, q)
-    measured = replace(
-        measure(truth, "position", 40, 1, sigma=2e-4), q=q, position=seen.point.T + 2e-4 * rng.normal(size=(40, 3))
-    )
+    position = see(truth, q).point.T + 2e-4 * np.random.default_rng(2).normal(size=(40, 3))
+    measured = replace(measure(truth, "position", 40, 1, sigma=2e-4), q=q, position=position)
     found = calibrate(nominal, [measured])
     table = layout(found.cell)
     arm = np.isin(found.free, table.index("arm"))
@@ -182,8 +175,6 @@ def test_equation_11_and_levenberg_marquardt_end_at_the_same_arm():
 
 def test_the_order_of_rows_and_blocks_does_not_matter():
     nominal, _, measured, _ = planted("two stations", 5)
-    from calib.data.poses.measurements import take
-
     rng = np.random.default_rng(0)
     mixed = [take(block, rng.permutation(len(block))) for block in measured[::-1]]
     one, other = calibrate(nominal, measured), calibrate(nominal, mixed)
@@ -222,11 +213,9 @@ def test_planted_outliers_are_named_with_file_and_row_and_hardly_any_others(loss
 
 
 def test_a_clean_measurement_has_no_outliers():
-    named = 0
     for seed in range(6):
         nominal, _, measured, _ = planted("position", seed)
-        named += len(calibrate(nominal, measured).outliers())
-    assert named == 0
+        assert not calibrate(nominal, measured).outliers()
 
 
 def test_a_row_is_an_outlier_beyond_four_robust_sigmas_per_component():

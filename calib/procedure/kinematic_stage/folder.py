@@ -45,7 +45,7 @@ from calib.robot.formats import urdf_write
 T = TypeVar("T")
 URDF, CORRECTED_URDF = "robot.urdf", "robot_for_corrections.urdf"
 RESIDUALS = "residuals.csv"
-TERMS, FORMULA = "joint_corrections.csv", "joint_corrections.txt"
+TERMS, FORMULA = "joint_corrections.csv", "joint_corrections.txt"  # the latter is shipped beside this module
 FIGURES = (
     "position", "orientation", "distance", "ladder", "singular_values", "joints", "map", "parameters", "correlations",
 )  # fmt: skip
@@ -57,27 +57,6 @@ OURS = (
 """Files of an earlier fit that a new one replaces."""
 
 IN_SESSION, VALIDATED = "4-fit", "5-validation"  # what these folders are called in a session
-
-CORRECTIONS = """Joint corrections that a URDF cannot hold.
-
-robot.urdf               the best geometry for whoever does not apply them
-robot_for_corrections.urdf   the geometry they belong to, which is worse alone
-
-At joint values q, add to the joint (or element) of each row of joint_corrections.csv
-
-    delta = sum over its rows of  coefficient * b(q)
-
-    basis   b(q)
-    torque  gravity torque of `joint` at q [N m] (of the robot's masses; a static arm's drives show +g(q))
-    lever   component along gravity of  z_element x (axis `order` of the body behind `joint`; 0 x, 1 y, 2 z)
-    joint   q of `joint` [rad or m]
-    cos     cos(order * q of `joint`)
-    sin     sin(order * q of `joint`)
-
-To make the arm stand where the calibrated model says: predict with q + delta(q) in robot_for_corrections.urdf; to
-command a joint position for which that file wants q, send q - delta(q) (one step is enough; delta is small).
-robot.toml holds the same geometry and terms, and `calib.robot.calibrated.read` reads them.
-"""
 
 
 @dataclass(frozen=True)
@@ -257,4 +236,4 @@ def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
         target = term.element if joint is None else chain.joint_names[joint]
         rows.append([target, units[term.element], term.basis, chain.joint_names[term.source], term.order, float(value)])
     files.write_table(folder / TERMS, ("corrected", "unit", "basis", "joint", "order", "coefficient"), rows)
-    files.write(folder / FORMULA, CORRECTIONS)
+    files.write(folder / FORMULA, Path(__file__).with_name(FORMULA).read_text(encoding="utf-8"))

@@ -99,10 +99,8 @@ def gather(
     files = [_path(each) for each in measured]
     check_files(options, [*files, *map(_path, validate)])
     chain, source = load_robot(robot, files[0], options, base, tip)
-    if isinstance(robot, CalibratedChain):
-        earlier = robot
-    else:
-        earlier = calibrated.read(source) if source.suffix == ".toml" else None
+    stored = source.suffix == ".toml"
+    earlier = robot if isinstance(robot, CalibratedChain) else calibrated.read(source) if stored else None
     blocks = _named(
         [(path, block) for path, each in zip(files, measured) for block in read_file(each, chain, options)],
         options, settings.stations, settings.tools,

@@ -155,12 +155,5 @@ def _scale(codes: tuple[str, str], one: Scale | None) -> list[Finding]:
     if one is None:
         return []
     off = abs(one.factor - 1.0)
-    values = {
-        "factor": one.factor,
-        "sigma": one.sigma,
-        "explained": one.explained,
-        "off": off,
-        "surely_off": off - 3.0 * one.sigma,
-        "sigmas": off / max(one.sigma, 1e-300),
-    }
+    values = vars(one) | {"off": off, "surely_off": off - 3.0 * one.sigma, "sigmas": off / max(one.sigma, 1e-300)}
     return [each for code in codes if level_of(each := finding(code, **values))][:1]

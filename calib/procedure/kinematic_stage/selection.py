@@ -261,23 +261,16 @@ def bound_words(found: Selection) -> str:
 
 def record(chosen: Chosen) -> dict[str, Any]:
     """Return the results of the selection as numbers; `table` returns them as text."""
-    found = chosen.selection
+    found, rms = chosen.selection, chosen.outlook.poses.rms
+    search = ("index", "method", "value", "random_baseline", "efficiency", "seconds")
     return {
-        "index": found.index,
-        "method": found.method,
-        "parameters": chosen.parameters,
-        "value": found.value,
+        **{name: getattr(found, name) for name in search},
+        **{name: getattr(chosen, name) for name in ("parameters", "existing")},
+        **{name: list(getattr(chosen, name)) for name in ("checked", "unchecked", "notes")},
         "start": float(found.history[0]),
-        "random_baseline": found.random_baseline,
-        "existing": chosen.existing,
-        "efficiency": found.efficiency,
         "efficiency_covers": bound_words(found),
-        "seconds": found.seconds,
-        "tool_sigma": chosen.outlook.poses.rms if np.isfinite(chosen.outlook.poses.rms) else None,
+        "tool_sigma": rms if np.isfinite(rms) else None,
         "run_seconds": chosen.run.seconds,
-        "checked": list(chosen.checked),
-        "unchecked": list(chosen.unchecked),
-        "notes": list(chosen.notes),
     }
 
 
