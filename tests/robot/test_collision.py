@@ -27,7 +27,6 @@ def planar(*shapes: str) -> str:
         joint("a", "continuous", "base", "one", axis("0 0 1"), "0 0 0.5"),
         joint("b", "revolute", "one", "two", axis("0 0 -1"), "1 0 0"),
         joint("c", "revolute", "two", "three", axis("0 0 1"), "1 0 0"),
-        links="base one two three",
         bodies=bodies,
     )
 
@@ -42,19 +41,22 @@ def balls(tmp_path):
     return path
 
 
+def measured(found, q):
+    return dict(zip(found.pairs, found.distances(np.array([q]))[0], strict=True))
+
+
 def test_distances_by_hand(balls):
     wall = Obstacle("wall", "box", (0.2, 9.0, 9.0), pose(position=[3.0, 0, 0]))
     ball = Obstacle("ball", "sphere", (0.2,), pose(position=[0.5, 1.0, 0.5]))
     found = collision.from_urdf(balls, floor=0.1, obstacles=[wall, ball])
     assert found.pairs[0] == ("one", "three") and ("one", "two") not in found.pairs
-    distances = dict(zip(found.pairs, found.distances(np.zeros((1, 3)))[0], strict=True))
+    distances = measured(found, [0.0, 0, 0])
     assert distances["one", "three"] == pytest.approx(2.0 - 0.2)
     assert distances["three", "wall"] == pytest.approx(2.9 - 2.5 - 0.1)
     assert distances["two", "floor"] == pytest.approx(0.5 - 0.1 - 0.1)
     assert distances["one", "ball"] == pytest.approx(1.0 - 0.3)
     # the first two links stretched along y, the third folded back by 90 degrees about z and -z
-    q = np.array([[np.pi / 2, np.pi / 2, 0.0]])
-    distances = dict(zip(found.pairs, found.distances(q)[0], strict=True))
+    distances = measured(found, [np.pi / 2, np.pi / 2, 0.0])
     assert distances["two", "ball"] == pytest.approx(-0.3)
     assert distances["one", "three"] == pytest.approx(np.hypot(1.5, 0.5) - 0.2)
 
@@ -97,7 +99,7 @@ def test_every_primitive_and_a_mesh(tmp_path):
     (tmp_path / "arm.urdf").write_text(source)
     found = collision.from_urdf(tmp_path / "arm.urdf", floor=0.0)
     assert found.missing == ("package://arm/meshes/absent.stl",)
-    distances = dict(zip(found.pairs, found.distances(np.zeros((1, 3)))[0], strict=True))
+    distances = measured(found, [0.0, 0, 0])
     assert distances["one", "floor"] == pytest.approx(0.5 - 0.2)
     assert distances["two", "floor"] == pytest.approx(0.5 - 0.3)
     assert distances["three", "floor"] == pytest.approx(0.5)
@@ -131,7 +133,7 @@ def test_capsules_along_a_chain():
     chain = load("ur10")
     wall = Obstacle("wall", "box", (0.1, 4.0, 4.0), pose(position=[-1.4, 0, 0]))
     found = capsules.from_chain(chain, 0.05, floor=-0.1, obstacles=[wall])
-    distances = dict(zip(found.pairs, found.distances(np.zeros((1, 6)))[0], strict=True))
+    distances = measured(found, [0.0] * 6)
     # at q = 0 the UR10 lies along -x: the forearm ends at x = -0.612 - 0.5723
     assert distances["elbow_joint_link", "wall"] == pytest.approx(1.35 - 1.1843 - 0.05, abs=1e-6)
     assert distances["shoulder_lift_joint_link", "floor"] == pytest.approx(0.1 + 0.1273 - 0.05, abs=1e-6)
@@ -241,7 +243,6 @@ def test_continuous_and_mimic_joints_move_the_shapes(tmp_path):
         robot(
             joint("a", "continuous", "base", "one", axis("0 0 1")),
             joint("b", "revolute", "one", "two", follow, "1 0 0"),
-            links="base one two",
             bodies={"two": shape(BALL, "1 0 0")},
         )
     )
@@ -267,10 +268,9 @@ def test_bad_shapes(inner, message, tmp_path):
         collision.from_urdf(tmp_path / "arm.urdf")
 
 
-def test_bad_obstacles(balls):
-    for kind, size, message in (
-        ("cone", (1.0,), "kind 'cone' is not one of"),
-        ("box", (1.0, 2.0), "a box has 3 positive"),
-    ):
-        with pytest.raises(RobotError, match=message):
-            collision.from_urdf(balls, obstacles=[Obstacle("o", kind, size, np.eye(4))])
+@pytest.mark.parametrize(
+    ("kind", "size", "words"), [("cone", (1,), "kind 'cone' is not"), ("box", (1, 2), "3 positive")]
+)
+def test_bad_obstacles(kind, size, words):
+    with pytest.raises(RobotError, match=words):
+        Obstacle("o", kind, size, np.eye(4))

@@ -63,16 +63,14 @@ def test_impossible_bodies_are_named(change, said):
     assert said in found
 
 
-def test_limits_of_zero_are_told_as_not_stated():
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"velocity": 0.0}, "a: velocity 0 in the robot's description is not a limit; ignored"),
+        ({"lower": -360.0, "upper": 360.0}, "a: limits up to 360 rad in the robot's description; degrees?"),
+    ],
+)
+def test_limits_of_zero_or_of_many_turns_are_remarks(limits, words):
     chain = load("ur5")
-    joints = (Joint("a", velocity=0.0), *chain.joints[1:])
-    assert joints[0].velocity == np.inf
-    assert remarks(replace(chain, joints=joints)) == (
-        "a: velocity 0 in the robot's description is not a limit; ignored",
-    )
-
-
-def test_limits_of_many_turns_are_told():
-    chain = load("ur5")
-    (found,) = remarks(replace(chain, joints=(Joint("a", lower=-360.0, upper=360.0), *chain.joints[1:])))
-    assert found.startswith("a: limits up to 360 rad") and found.endswith("degrees?")
+    joint = Joint("a", **limits)
+    assert joint.velocity == np.inf and remarks(replace(chain, joints=(joint, *chain.joints[1:]))) == (words,)

@@ -20,7 +20,6 @@ ZOO = robot(
         "d", "revolute", "three", "four", axis("0 0 1") + '<mimic joint="a" multiplier="-0.5" offset="0.2"/>', "0 0 0.1"
     ),
     joint("e", "fixed", "four", "tip", "", "0.1 0.2 0.3", "0.4 0.5 0.6"),
-    links="base one two three four tip",
 )
 CHAINS = [load("ur10"), load("lwr4plus"), urdf.parse(ZOO, "zoo", "base", "tip")]
 

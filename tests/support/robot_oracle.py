@@ -1,5 +1,7 @@
 """Pinocchio as the judge of kinematics, and small URDFs to judge by."""
 
+import re
+
 import numpy as np
 import pinocchio as pin
 
@@ -41,21 +43,18 @@ def joint(
     name: str, kind: str, parent: str, child: str, inner: str = "", xyz: str = "0 0 0", rpy: str = "0 0 0"
 ) -> str:
     """Return a <joint>; limits are given unless `inner` gives some."""
-    limit = (
-        ""
-        if "<limit" in inner or kind in ("fixed", "floating")
-        else '<limit velocity="2" effort="9" lower="-2" upper="2"/>'
-    )
+    stated = "<limit" in inner or kind in ("fixed", "floating")
+    limit = "" if stated else '<limit velocity="2" effort="9" lower="-2" upper="2"/>'
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
         f'<origin xyz="{xyz}" rpy="{rpy}"/>{limit}{inner}</joint>\n'
     )
 
 
-def robot(*joints: str, links: str = "", bodies: dict[str, str] | None = None) -> str:
-    """Return a URDF of these joints; `links` are the names of all links, `bodies` their inner text."""
-    bodies = bodies or {}
-    tags = "".join(f'<link name="{name}">{bodies.get(name, "")}</link>\n' for name in links.split())
+def robot(*joints: str, bodies: dict[str, str] | None = None) -> str:
+    """Return a URDF of these joints and the links they name; `bodies` are the links' inner texts."""
+    links = dict.fromkeys([*re.findall(r'<(?:parent|child) link="([^"]*)"', "".join(joints)), *(bodies or {})])
+    tags = "".join(f'<link name="{name}">{(bodies or {}).get(name, "")}</link>\n' for name in links)
     return f'<?xml version="1.0"?>\n<robot name="synthetic">\n{tags}{"".join(joints)}</robot>\n'
 
 

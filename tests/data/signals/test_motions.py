@@ -16,18 +16,11 @@ from calib.errors import MeasurementError, UsageError
 
 def waves(t: np.ndarray, lines=((0.4, 0.9, 1.3), (0.3, 0.7, 1.1)), phase: float = 7.0) -> tuple[np.ndarray, ...]:
     """Return q, v, a (N, n) of sums of sines."""
-    sums = []
-    for order, f in ((0, np.sin), (1, np.cos), (2, lambda x: -np.sin(x))):
-        sums.append(
-            np.stack(
-                [
-                    sum(0.4 / w * (2 * np.pi * w) ** order * f(2 * np.pi * w * t + phase * w) for w in line)
-                    for line in lines
-                ],
-                1,
-            )
-        )
-    return tuple(sums)
+    w = 2 * np.pi * np.array(lines)
+    angle = w * t[:, None, None] + phase * np.array(lines)
+    size = 0.8 * np.pi / w
+    turned = (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))
+    return tuple((size * each).sum(axis=-1) for each in turned)
 
 
 def recorded(t: np.ndarray, true: np.ndarray, noise: float = 0.0, seed: int = 0, measured: bool = True) -> Recording:

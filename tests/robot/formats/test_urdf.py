@@ -30,7 +30,6 @@ def test_every_axis(kind, direction):
         joint("a", kind, "base", "one", axis(direction), "0.1 -0.2 0.3", "0.3 -0.4 2"),
         joint("b", "revolute", "one", "two", axis("0 1 0"), "0.3 0.2 0.1", "1 1.5707963267948966 0.2"),
         joint("c", "fixed", "two", "tip", "", "0.1 0.2 0.3", "0.4 0.5 0.6"),
-        links="base one two tip",
     )
     chain = agrees(source)
     assert (chain.base, chain.tip, chain.links) == ("base", "tip", ("one", "two"))
@@ -40,11 +39,11 @@ def test_every_axis(kind, direction):
 
 
 def test_elements_of_a_joint():
-    chain = agrees(robot(joint("a", "revolute", "base", "one", axis("0 -1 0"), "0.1 0 0"), links="base one"))
+    chain = agrees(robot(joint("a", "revolute", "base", "one", axis("0 -1 0"), "0.1 0 0")))
     assert chain.names == ("a.x", "a.y", "a.z", "a.rx", "a.rz", "a.offset")
     moving = chain.elements[-1]
     assert (moving.axis, moving.sign, moving.joint) == ("ry", -1.0, 0)
-    chain = agrees(robot(joint("a", "prismatic", "base", "one", axis("1 0 0")), links="base one"))
+    chain = agrees(robot(joint("a", "prismatic", "base", "one", axis("1 0 0"))))
     assert chain.names == ("a.y", "a.z", "a.rx", "a.ry", "a.rz", "a.offset")
     assert chain.elements[-1].axis == "tx" and chain.elements[0].placement is None
 
@@ -56,7 +55,6 @@ def test_fixed_joints_are_folded_in():
         joint("g", "fixed", "one", "two", "", "0.1 0.2 0.3", "0.4 0.5 0.6"),
         joint("h", "fixed", "two", "three", "", "0.3 0.2 0.1", "0.6 0.5 0.4"),
         joint("b", "revolute", "three", "four", axis("1 0 0")),
-        links="world base one two three four",
     )
     chain = agrees(source)
     assert (chain.base, chain.tip, chain.n, len(chain.elements)) == ("world", "four", 2, 12)
@@ -68,7 +66,6 @@ def test_mimic_on_the_path():
         joint("a", "revolute", "base", "one", axis("0 0 -1"), "0 0 0.1"),
         joint("b", "revolute", "one", "two", axis("0 1 0") + MIMIC, "0.3 0 0"),
         joint("c", "revolute", "two", "three", axis("1 0 0"), "0.2 0 0"),
-        links="base one two three",
     )
     chain = urdf.parse(source, "synthetic")
     assert chain.joint_names == ("a", "c") and len(chain.elements) == 18
@@ -76,17 +73,9 @@ def test_mimic_on_the_path():
     assert (follower.name, follower.joint, follower.ratio, follower.value) == ("b.offset", 0, -0.7, 0.2)
     assert [chain.names[k] for k in chain.moving] == ["a.offset", "c.offset"]
     agrees(source, mimic=True)
-
-
-def test_followers_of_followers():
-    source = robot(
-        joint("a", "revolute", "base", "one", Z),
-        joint("b", "revolute", "one", "two", Z + '<mimic joint="a" multiplier="2" offset="0.1"/>'),
-        joint("c", "revolute", "two", "three", Z + '<mimic joint="b" multiplier="3" offset="0.2"/>'),
-        links="base one two three",
-    )
-    element = urdf.parse(source).elements[-1]
-    assert (element.joint, element.ratio, element.value) == (0, 6.0, pytest.approx(0.5))
+    again = joint("d", "revolute", "three", "four", Z + '<mimic joint="b" multiplier="3" offset="0.2"/>')
+    element = urdf.parse(source.replace("</robot>", '<link name="four"/>' + again + "</robot>")).elements[-1]
+    assert (element.joint, element.ratio, element.value) == (0, pytest.approx(-2.1), pytest.approx(0.8))
 
 
 def gripper(*arm: str, leader: str = "finger1") -> str:
@@ -97,7 +86,6 @@ def gripper(*arm: str, leader: str = "finger1") -> str:
         joint("mount", "fixed", "one", "hand", "", "0 0 0.1"),
         joint("finger1", "prismatic", "hand", "left", axis("0 1 0")),
         joint("finger2", "prismatic", "hand", "right", axis("0 -1 0") + follow),
-        links="base one hand left right",
     )
 
 
@@ -109,24 +97,17 @@ def test_default_tip_stops_before_a_gripper():
         urdf.parse(gripper(), tip="right")
 
 
-def test_a_driven_linkage_does_not_end_the_arm():
-    source = robot(
-        joint("a", "revolute", "base", "one", Z),
-        joint("rod", "revolute", "base", "rods", Z + '<mimic joint="a"/>'),
-        joint("b", "revolute", "one", "two", Z),
-        links="base one two rods",
-    )
-    assert urdf.parse(source).joint_names == ("a", "b")
-
-
-def test_default_tip_with_several_leaves_is_the_last_moving_link():
-    source = robot(
-        joint("a", "revolute", "base", "one", Z),
-        joint("f", "fixed", "one", "flange"),
-        joint("g", "fixed", "one", "camera"),
-        links="base one flange camera",
-    )
-    assert urdf.parse(source).tip == "one"
+@pytest.mark.parametrize(
+    "more, joints, tip",
+    [
+        ([joint("rod", "revolute", "base", "rods", Z + '<mimic joint="a"/>'), joint("b", "revolute", "one", "two", Z)],
+         ("a", "b"), "two"),
+        ([joint("f", "fixed", "one", "flange"), joint("g", "fixed", "one", "camera")], ("a",), "one"),
+    ],
+)  # fmt: skip
+def test_default_tip_beside_a_driven_linkage_or_several_leaves(more, joints, tip):
+    chain = urdf.parse(robot(joint("a", "revolute", "base", "one", Z), *more))
+    assert (chain.joint_names, chain.tip) == (joints, tip)
 
 
 TWO_ARMS = robot(
@@ -135,7 +116,6 @@ TWO_ARMS = robot(
     joint("l2", "revolute", "left1", "left2", Z, "1 0 0"),
     joint("r1", "revolute", "chest", "right1", Z, "0 -1 0"),
     joint("r2", "revolute", "right1", "right2", Z, "1 0 0"),
-    links="base chest left1 left2 right1 right2",
 )
 
 
@@ -152,10 +132,7 @@ def test_joint_names_choose_the_chain():
         ({}, r"several chains with 3 actuated joints, to the links left2, right2; choose one as tip"),
         ({"joint_names": ["l1", "l2"]}, r"some joints are not in the measurements: torso; choose base and tip"),
         ({"joint_names": ["torso", "l1", "r1"]}, r"joint '[lr]1' is not between 'base' and '(left|right)1'"),
-        (
-            {"joint_names": ["torso", "l11"]},
-            r"no joint 'l11' \(did you mean 'l[12]'\?\) \(joints: torso, l1, l2, r1, r2\)",
-        ),
+        ({"joint_names": ["torso", "l11"]}, r"no joint 'l11' \(did you mean 'l[12]'\?\) \(joints: torso, l1, l2, r1"),
         ({"tip": "left_2"}, r"no link 'left_2' for the tip .did you mean 'left2'"),
         ({"base": "bass", "tip": "left2"}, r"no link 'bass' for the base .did you mean 'base'"),
         ({"base": "left1", "tip": "right2"}, r"link 'right2' does not follow 'left1'"),
@@ -190,29 +167,17 @@ def three(*joints: str) -> str:
         (three(joint("j", "fixed", "a", "b") * 2), r"line 3: a second joint named 'j'"),
         (
             three(joint("j", "fixed", "a", "c"), joint("k", "fixed", "b", "c")),
-            r"line 3: link 'c' has two parents, joints 'j' and 'k'; a URDF must be a tree",
+            r"line 3: link 'c' has two parents, .*'k'",
         ),
         (three(joint("j", "fixed", "b", "c"), joint("k", "fixed", "c", "b")), r"links b, c form a loop"),
         (three(joint("j", "revolute", "a", "b", axis("0 0 0"))), r"joint 'j': its axis is zero"),
-        (
-            three(joint("j", "revolute", "a", "b", axis("0 0 nan"))),
-            r'xyz="0 0 nan" of <axis> in line 2 is not 3 finite numbers',
-        ),
+        (three(joint("j", "revolute", "a", "b", axis("0 0 nan"))), r'xyz="0 0 nan" of <axis> in line 2 is not 3'),
         (three(joint("j", "fixed", "a", "b", xyz="0 0")), r'xyz="0 0" of <origin> .* 3 finite numbers'),
         (three(joint("j", "fixed", "a", "b", rpy="0 x 0")), r'rpy="0 x 0" of <origin>'),
         (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file, expand it first"),
-        (
-            "<robot xmlns:xacro='x'><xacro:include filename='f'/></robot>",
-            r"found <xacro:include>: this is a xacro file",
-        ),
-        (
-            three(joint("j", "revolute", "a", "b", '<limit lower="1" upper="1"/>')),
-            r"joint 'j': lower limit 1 is not below the upper 1; correct them, or make the joint fixed",
-        ),
-        (
-            three(joint("j", "revolute", "a", "b", '<limit lower="one" upper="1"/>')),
-            r'lower="one" of <limit> in line 2 is not a number',
-        ),
+        ("<robot xmlns:xacro='x'><xacro:include filename='f'/></robot>", r"found <xacro:include>: this is a xacro"),
+        (three(joint("j", "revolute", "a", "b", '<limit lower="1" upper="1"/>')), r"'j': lower limit 1 is not below"),
+        (three(joint("j", "revolute", "a", "b", '<limit lower="one" upper="1"/>')), r'lower="one" of <limit> in line'),
     ],
 )
 def test_bad_files(source, message):
@@ -236,14 +201,13 @@ def test_bad_arms(one, two, three, message):
         for name, (kind, leader), own in zip("abc", (one, two, three), ends)
     ]
     with pytest.raises(RobotError, match=message):
-        urdf.parse(robot(*joints, links="base one two three"))
+        urdf.parse(robot(*joints))
 
 
 def test_missing_and_placeholder_limits_are_infinite():
     source = robot(
         joint("a", "revolute", "base", "one", Z + '<limit velocity="0" effort="0"/>'),
         joint("b", "revolute", "one", "two", Z + '<limit lower="-1" velocity="1e9" effort="3"/>'),
-        links="base one two",
     )
     a, b = urdf.parse(source).joints
     assert (a.lower, a.upper, a.velocity, a.effort) == (-np.inf, np.inf, np.inf, np.inf)
@@ -253,9 +217,9 @@ def test_missing_and_placeholder_limits_are_infinite():
 
 def test_angles_beyond_a_full_turn_are_told_and_several_of_them_refused():
     one, two = (joint(name, "revolute", *ends, Z, "0 0 0.1", "90 0 0") for name, *ends in ("abc", "dcd"))
-    assert "joint 'd' (line 5): rpy=\"90 0 0\" is beyond" in urdf.parse(robot(two, links="c d")).remarks[0]
+    assert "joint 'd' (line 5): rpy=\"90 0 0\" is beyond" in urdf.parse(robot(two)).remarks[0]
     with pytest.raises(RobotError, match=r"joint 'a' .*joint 'd' .*degrees"):
-        urdf.parse(robot(one, two, links="b c d"))
+        urdf.parse(robot(one, two))
 
 
 BODIES = ("base", "one", "box", "lid", "tip")
@@ -268,7 +232,6 @@ def test_inertias_with_fixed_bodies_on_and_off_the_path():
         joint("g", "fixed", "box", "lid", "", "0 0 0.1", "1 0 0"),
         joint("b", "revolute", "one", "two", axis("0 1 0"), "0.3 0 0", "0 0.5 0"),
         joint("h", "fixed", "two", "tip", "", "0 0 0.2"),
-        links="base one box lid two tip",
         bodies={name: inertial(mass, "0.01 0.02 0.03") for mass, name in enumerate(BODIES, 1)},
     )
     chain = agrees(source)
@@ -279,9 +242,7 @@ def test_inertias_with_fixed_bodies_on_and_off_the_path():
 
 def test_inertia_about_the_turned_frame_of_a_general_axis():
     turned = robot(
-        joint("a", "revolute", "base", "one", axis("1 2 -2"), "0 0 0.1"),
-        links="base one",
-        bodies={"one": inertial(2.0, "0.3 0.1 -0.2")},
+        joint("a", "revolute", "base", "one", axis("1 2 -2"), "0 0 0.1"), bodies={"one": inertial(2.0, "0.3 0.1 -0.2")}
     )
     chain = urdf.parse(turned)
     about = urdf.transform_body(chain.inertias[0], np.linalg.inv(chain.tail))
@@ -291,12 +252,12 @@ def test_inertia_about_the_turned_frame_of_a_general_axis():
 
 def test_no_masses_no_inertias():
     assert urdf.parse(TWO_ARMS, tip="left2").inertias is None
-    zero = robot(joint("a", "revolute", "base", "one", Z), links="base one", bodies={"base": inertial(1, "0 0 0")})
+    zero = robot(joint("a", "revolute", "base", "one", Z), bodies={"base": inertial(1, "0 0 0")})
     assert urdf.parse(zero).inertias is None
 
 
 def test_file_encodings_and_byte_order_marks(tmp_path):
-    source = robot(joint("gelénk", "revolute", "base", "one", Z, "0 0 0.1"), links="base one")
+    source = robot(joint("gelénk", "revolute", "base", "one", Z, "0 0 0.1"))
     latin = source.replace('version="1.0"', 'version="1.0" encoding="ISO-8859-1"').encode("latin-1")
     for name, data in (("a", source.encode()), ("b", latin), ("c", b"\xef\xbb\xbf" + source.encode())):
         (tmp_path / f"{name}.urdf").write_bytes(data)
