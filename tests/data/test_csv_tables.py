@@ -60,10 +60,6 @@ def test_a_comment_names_the_columns_where_nothing_else_does(tmp_path):
     np.testing.assert_allclose(table.numbers("x", "length"), [0.002, 0.004])
 
 
-def test_a_separator_at_the_end_of_each_line_adds_no_column(write):
-    assert read_table(write("a,b,", "1,2,\n3,4,")).header == ("a", "b")
-
-
 def test_a_large_table_is_read_in_chunks_without_loss(write):
     values = np.random.default_rng(1).normal(size=(50_000, 2))
     path = write(
@@ -77,12 +73,15 @@ def test_a_large_table_is_read_in_chunks_without_loss(write):
     assert (error.value.row, error.value.column) == (50_000, "c")
 
 
-def test_a_column_that_turns_to_text_late_is_text(write):
+def test_text_and_ragged_rows_far_down_keep_their_numbers(write):
     table = read_table(write("a,b", "\n".join(["1,2"] * 25_000 + ["x,2"])))
     assert table.texts("a")[0] == "1" and table.texts("a")[-1] == "x"
     with pytest.raises(MeasurementError, match="'x' where a number is needed") as error:
         table.numbers("a")
     assert error.value.row == 25_001
+    with pytest.raises(MeasurementError, match="1 cells, the header has 2") as error:
+        read_table(write("a,b", "1,2\n" * 40_002 + "3\n"))
+    assert error.value.row == 40_003
 
 
 @pytest.mark.parametrize(
@@ -98,11 +97,14 @@ def test_a_column_that_turns_to_text_late_is_text(write):
         ("1,2\n3,4\n", "has no header.*format", None, None),
         ("left,1,2\nright,3,4\n", "has no header", None, None),
         ("1,5;2,5\n3,5;4,5\n", "'1,5', with a decimal comma", 1, None),
+        ("a,b [µm]\n1,2\n", r"is not UTF-8 text.*0xb5", None, None),
+        (None, "cannot be read: No such file", None, None),
     ],
 )
 def test_a_file_that_is_no_table_is_refused(tmp_path, text, words, row, column):
     path = tmp_path / "bad.csv"
-    path.write_text(text)
+    if text is not None:
+        path.write_text(text, encoding="latin-1")
     with pytest.raises(MeasurementError, match=words) as error:
         read_table(path)
     assert (error.value.file, error.value.row, error.value.column) == (path, row, column)
@@ -125,15 +127,6 @@ def test_a_cell_that_is_no_number_is_named(write, cell, words):
     assert (error.value.row, error.value.column) == (2, "b")
 
 
-def test_files_that_cannot_be_decoded_or_found(tmp_path):
-    path = tmp_path / "latin.csv"
-    path.write_bytes("a,b [µm]\n1,2\n".encode("latin-1"))
-    with pytest.raises(MeasurementError, match=r"is not UTF-8 text.*0xb5"):
-        read_table(path)
-    with pytest.raises(MeasurementError, match="cannot be read: No such file"):
-        read_table(tmp_path / "missing.csv")
-
-
 @pytest.mark.parametrize(
     ("heading", "dimension", "unit", "words"),
     [
@@ -150,18 +143,10 @@ def test_a_column_that_is_not_what_it_should_be_is_refused(write, heading, dimen
     assert error.value.column == (None if heading == "xx" else "x")
 
 
-def test_the_unit_of_an_ignored_column_does_not_matter(write):
-    assert read_table(write("x,T [furlong]", "1,2")).numbers("x", "length")[0] == 1
-
-
-def test_the_header_alone(write):
+def test_what_a_header_says(write):
+    assert read_table(write("x,T [furlong]", "1,2")).numbers("x", "length")[0] == 1  # of an ignored column nothing
+    assert read_table(write("a,b,", "1,2,\n3,4,")).header == ("a", "b")  # each line ends with a separator
     assert read_header(write("q1 [deg];x", "1;2")) == (("q1", "x"), ("deg", ""))
-
-
-def test_a_ragged_row_far_down_keeps_its_number(write):
-    with pytest.raises(MeasurementError, match="1 cells, the header has 2") as error:
-        read_table(write("a,b", "1,2\n" * 40_002 + "3\n"))
-    assert error.value.row == 40_003
 
 
 def test_numbers_are_written_as_rows_are(tmp_path):

@@ -22,16 +22,8 @@ DYNAMICS = {
     "harmonics": "2", "rate": "100.0", "repeats": "1", "starts": "1", "evaluations": "20",
 }  # fmt: skip
 MODEL = (
-    "parameters",
-    "condition_number",
-    "friction",
-    "method",
-    "ladder",
-    "elimination",
-    "geometry",
-    "findings",
-    "unit",
-)
+    "parameters", "condition_number", "friction", "method", "ladder", "elimination", "geometry", "findings", "unit",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -58,6 +58,11 @@ def test_a_file_that_is_no_recording_is_told_why(tmp_path):
         read_recording(tmp_path / "text.npz")
     with pytest.raises(MeasurementError, match=r"write a cut as log\.npz@0:9\.4"):
         read_recording(tmp_path / "log.npz@abc")
+    with pytest.raises(UsageError, match="before the recording"):
+        read_recording("log.npz@-1:2")
+    np.savez(tmp_path / "log.npz", t=series["t"], enc_position=series["q"], motor_amps=series["tau"])
+    with pytest.raises(MeasurementError, match=r'names = \{ q = "enc_position", current = "motor_amps" \}'):
+        read_recording(tmp_path / "log.npz")
 
 
 @pytest.mark.parametrize("mark", [" ", ";", "|", ","])
@@ -73,15 +78,3 @@ def test_logs_of_controllers_are_read_whatever_parts_the_columns(tmp_path, mark,
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     found = read_recording(tmp_path / "log.csv")
     assert found.kind == "current" and np.abs(found.q - series["q"]).max() < 1e-8
-
-
-def test_unknown_names_are_asked_for_with_the_line_to_write(tmp_path):
-    series = falling(True)
-    np.savez(tmp_path / "log.npz", t=series["t"], enc_position=series["q"], motor_amps=series["tau"])
-    with pytest.raises(MeasurementError, match=r'names = \{ q = "enc_position", current = "motor_amps" \}'):
-        read_recording(tmp_path / "log.npz")
-
-
-def test_a_cut_before_the_start_is_refused():
-    with pytest.raises(UsageError, match="before the recording"):
-        read_recording("log.npz@-1:2")
