@@ -14,6 +14,8 @@ Point = Annotated[tuple[Place, Place, Place], Expect("x,y,z [m]")]
 Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or rad", quantity="1")]
 Stations = Annotated[str, OneOf(("each", "one"))]
 Deliverable = Annotated[str, OneOf(DELIVERABLES)]
+Index = Annotated[str, OneOf("poses.indices:Index")]
+Method = Annotated[str, OneOf("poses.select:Method")]
 
 
 @checked
@@ -75,8 +77,8 @@ class SelectionSettings:
 
     kind: Annotated[str, OneOf(("pose", "position"))] = "pose"
     tools: tuple[Point, ...] = ()
-    index: Annotated[str, OneOf("poses.indices:Index")] = "O1"
-    method: Annotated[str, OneOf("poses.select:Method")] = "detmax"
+    index: Index = "O1"
+    method: Method = "detmax"
     candidates: Annotated[int, Whole(1, 1_000_000)] = 2000
     sigmas: tuple[Sigma, Sigma] | None = None
     seed: Seed = 0
