@@ -1,7 +1,7 @@
 """Questions of `calib new`: instruments by name, options or questions at a terminal, each answer checked."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
 from calib.config_types import Real
-from calib.data.poses import BOARD, IN_HAND, TO_HAND
-from calib.errors import UsageError, require
+from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
+from calib.errors import UsageError, one_of, require
 from calib.extensions import needed
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.answers import CAMERA, CELL, Answers
@@ -42,33 +42,20 @@ def instrument_named(name: str) -> InstrumentSection:
     Raises:
         UsageError: for an unknown name, with the known ones.
     """
-    if name not in INSTRUMENTS:
-        known = ", ".join(f"{key} ({each.name}, {each.measures})" for key, each in INSTRUMENTS.items())
-        raise UsageError(f"unknown instrument '{name}'; known: {known}")
-    return INSTRUMENTS[name]
-
-
-def by_nothing(given: Answers) -> bool:
-    """Return whether no instrument is used, so that the described geometry is kept."""
-    return _measures(given) == NOTHING
-
-
-def by_camera(given: Answers) -> bool:
-    """Return whether a camera takes images, which needs a placement with orientation."""
-    return _measures(given) == "pixels"
+    return INSTRUMENTS[one_of(name, INSTRUMENTS, "instrument", UsageError)]
 
 
 def _measures(given: Answers) -> str:
+    """Return what the answered instrument measures; "" if it is not known."""
     return INSTRUMENTS[given.instrument].measures if given.instrument in INSTRUMENTS else ""
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question at the terminal: its answer's name, default, and condition."""
+    """A question at the terminal: name and default of its answer."""
 
     name: str
     default: str
-    applies: Callable[[Answers], bool] = lambda given: True
 
     @property
     def words(self) -> str:
@@ -76,37 +63,33 @@ class Question:
         return f"{self.name.replace('_', ' ')} ({described(Answers)[self.name]})"
 
     def open(self, given: Answers) -> bool:
-        """Return whether the question is to be asked."""
-        return getattr(given, self.name) in (None, ()) and self.applies(given)
+        """Return whether the question has no answer yet and applies to the earlier answers."""
+        if getattr(given, self.name) not in (None, ()) or (self.name in CELL and given.limits is not None):
+            return False
+        camera, nothing = _measures(given) == IMAGES, _measures(given) == NOTHING
+        match self.name:
+            case "tool" | "instrument_at":
+                return not camera and not nothing
+            case "limits":
+                return not given.cell
+            case "cone" | "facing":
+                return "instrument" in cell_tables(instrument_at=given.instrument_at)
+            case "mounting":
+                return camera
+            case "lens" | "board" | "carried" | "stands":
+                return camera and (given.mounting or "").lower() not in UNSAID
+            case "dynamics":
+                return not nothing
+            case "torques" | "payloads":
+                return given.dynamics is not False
+        return True
 
 
-def _about_camera(given: Answers, name: str) -> bool:
-    """Return whether to ask a question on the camera: no limits file, and the mounting is known."""
-    known = name == "mounting" or (given.mounting or "").lower() not in UNSAID
-    return by_camera(given) and given.limits is None and known
-
-
-def _about_cell(given: Answers, name: str) -> bool:
-    """Return whether to ask a question on the cell: no limits file; for the cone, the instrument is known."""
-    known = name not in ("cone", "facing") or "instrument" in cell_tables(instrument_at=given.instrument_at)
-    return given.limits is None and known and not (name == "instrument_at" and (by_camera(given) or by_nothing(given)))
-
-
-QUESTIONS = (
-    Question("robot", ""),
-    Question("instrument", "tracker"),
-    Question("tool", "0.05,0,0.05", lambda given: not (by_camera(given) or by_nothing(given))),
-    Question("limits", "none", lambda given: not given.cell),
-    *(Question(name, "unknown", partial(_about_camera, name=name)) for name in CAMERA),
-    *(
-        Question(name, "z" if name == "facing" else "unknown", partial(_about_cell, name=name))
-        for name in CELL
-        if name not in CAMERA
-    ),
-    Question("dynamics", "yes", lambda given: not by_nothing(given)),
-    Question("torques", "motor", lambda given: given.dynamics is not False),
-    Question("payloads", "none", lambda given: given.dynamics is not False),
-)
+DEFAULTS = {
+    "robot": "", "instrument": "tracker", "tool": "0.05,0,0.05", "limits": "none", "facing": "z", "dynamics": "yes",
+    "torques": "motor", "payloads": "none",
+}  # fmt: skip
+QUESTIONS = tuple(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one in fields(Answers))
 
 
 def with_answer(given: Answers, question: Question, text: str) -> Answers:
@@ -139,7 +122,7 @@ def checked(given: Answers) -> dict[str, Any]:
     instrument_named(instrument or "")
     stated = next((name for name in CAMERA if getattr(given, name) is not None), None)
     require(
-        by_camera(given) or not stated,
+        _measures(given) == IMAGES or not stated,
         f"--{stated} applies to a camera that takes images; the instrument is {instrument}",
     )
     dynamics = given.dynamics is not False
