@@ -8,17 +8,16 @@ import csv
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib import files
 from calib.errors import CalibError, RobotError, UsageError, refuse_robot, refused_as, require
-from calib.records import plain_text
+from calib.records import plain_text, read_rows
 
 METRICS, SESSION = "metrics.json", "session.toml"
 """Files that identify results and sessions; the metrics are written last and mark a folder as complete."""
@@ -121,46 +120,24 @@ ESTIMATE, COVARIANCE = "estimate.csv", "covariance.csv"
 AGAIN = "fit, or identify, again"
 
 
-@dataclass(frozen=True, eq=False)
-class StoredEstimate:
-    """Stored estimate, the rows of ``estimate.csv``.
+class EstimateRow(NamedTuple):
+    """A row of ``estimate.csv``; σ is None if not stated."""
 
-    Attributes:
-        names, units: p texts each.
-        values: (p,).
-        sigma: (p,), NaN where none is stated.
-        rows: p mappings from a column's name to its cell, as texts.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: np.ndarray
-    sigma: np.ndarray
-    rows: tuple[Mapping[str, str], ...]
+    name: str
+    unit: str
+    value: float
+    sigma: float | None
 
 
-def write_estimate(folder: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write the rows of an estimate; `header` includes ``name``, ``unit``, ``value`` and ``sigma``."""
-    files.write_table(folder / ESTIMATE, header, rows)
-
-
-def read_estimate(folder: Path) -> StoredEstimate:
-    """Return the rows of ``estimate.csv`` in a folder.
+def read_estimate(folder: Path, kind: Any = EstimateRow) -> tuple[Any, ...]:
+    """Return the rows of ``estimate.csv`` in a folder as named tuples `kind`, whose fields are columns.
 
     Raises:
         RobotError: where it is missing or damaged.
     """
     path = folder / ESTIMATE
-    with refused_as(
-        RobotError,
-        (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError),
-        f"{path} cannot be read ({{}}); {AGAIN}",
-    ):
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = tuple(csv.DictReader(file))
-        values, sigma = (np.array([float(row.get(key) or "nan") for row in rows]) for key in ("value", "sigma"))
-        names, units = (tuple(plain_text(row[key]) for row in rows) for key in ("name", "unit"))
-    return StoredEstimate(names, units, values, sigma, rows)
+    with refused_as(RobotError, (OSError, ValueError), f"{path} cannot be read ({{}}); {AGAIN}"):
+        return read_rows(kind, path)
 
 
 def write_covariance(path: Path, names: Sequence[str], covariance: np.ndarray) -> None:

@@ -13,7 +13,7 @@ import csv
 import json
 import math
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -55,13 +55,8 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
         OSError: where the file is missing.
     """
     with path.open(newline="", encoding="utf-8") as file:
-        return typed_rows(kind, list(csv.DictReader(file)), str(path))
-
-
-def typed_rows(kind: type[T], rows: Iterable[Mapping[str, str]], place: str) -> tuple[T, ...]:
-    """Return text rows (by column) as named tuples `kind`; `place` names their source in messages."""
-    hints = get_type_hints(kind)
-    return tuple(kind(**{name: _cell(hint, row, name, place) for name, hint in hints.items()}) for row in rows)
+        rows, hints = csv.DictReader(file), get_type_hints(kind)
+        return tuple(kind(**{name: _cell(hint, row, name, str(path)) for name, hint in hints.items()}) for row in rows)
 
 
 def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:

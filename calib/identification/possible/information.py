@@ -123,7 +123,8 @@ def read(folder: str | Path) -> Information:
         f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}",
     ):
         estimate = read_estimate(folder)
-        names, units, values = estimate.names, estimate.units, estimate.values
+        names, units = (tuple(getattr(one, key) for one in estimate) for key in ("name", "unit"))
+        values = np.array([one.value for one in estimate])
         covariance = read_covariance(folder)[1]
         transform = _transform(names, groups, dynamics.model.names)
         data = folder / INFORMATION

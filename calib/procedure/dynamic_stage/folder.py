@@ -12,16 +12,7 @@ import numpy as np
 from calib import files
 from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
-from calib.folders import (
-    COVARIANCE,
-    ESTIMATE,
-    METRICS,
-    REPORT,
-    check_target,
-    write_covariance,
-    write_estimate,
-    write_staged,
-)
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT, check_target, write_covariance, write_staged
 from calib.identification.gains import GainRecord
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
@@ -162,7 +153,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     else:
         robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
         calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
-    write_estimate(folder, HEADER, _estimate_rows(outcome))
+    files.write_table(folder / ESTIMATE, HEADER, _estimate_rows(outcome))
     estimate = found.fitted.estimate
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
     write_covariance(folder / COVARIANCE, found.names, covariance)

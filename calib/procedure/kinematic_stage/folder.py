@@ -22,7 +22,6 @@ from calib.folders import (
     InFolder,
     check_target,
     write_covariance,
-    write_estimate,
     write_staged,
 )
 from calib.geometry import installation
@@ -187,7 +186,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
         else:
             files.write(folder / name, urdf_write.write_new(geometry))
     table = estimate_table(fit, outcome.selection.nominal.cell)
-    write_estimate(folder, HEADER, table.rows())
+    files.write_table(folder / ESTIMATE, HEADER, table.rows())
     write_covariance(folder / COVARIANCE, table.names, table.covariance)
     write_residuals(outcome, folder / RESIDUALS)
     files.write_json(folder / METRICS, metrics(outcome))

@@ -28,7 +28,7 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
 from calib.procedure.report import page
-from calib.records import read_rows, typed_rows
+from calib.records import read_rows
 from calib.robot.chain import Chain
 from calib.units import small
 
@@ -103,7 +103,7 @@ def read(folder: Path) -> DynamicReport:
         place = IdentificationFolder(folder)
         return DynamicReport(
             place.metrics(),
-            typed_rows(IdentifiedParameter, read_estimate(folder).rows, str(folder)),
+            read_estimate(folder, IdentifiedParameter),
             read_rows(geometry_tables.GeometricEffect, effects) if effects.exists() else (),
             place.unseen.read(),
         )

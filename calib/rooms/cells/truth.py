@@ -1,6 +1,6 @@
 """Errors of a calibration against the hidden truth of a virtual cell: positions, torques, base parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from calib.dynamics import base as bases
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import gravity_torques, inverse_dynamics
-from calib.folders import StoredEstimate
+from calib.folders import EstimateRow
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
@@ -97,15 +97,15 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
     return float(100.0 * np.linalg.norm(error) / np.linalg.norm(size))
 
 
-def share_within(true: Mapping[str, float], estimate: StoredEstimate) -> tuple[float, int]:
+def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> tuple[float, int]:
     """Return the share of estimated parameters within two sigmas of the truth, and their number.
 
     Args:
         true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.
         estimate: with sigmas; an R behind a name (regrouped) is not part of it.
     """
-    rows = zip((name.removesuffix("R") for name in estimate.names), estimate.values, estimate.sigma)
-    inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true and sigma > 0]
+    rows = [(true[name], one) for one in estimate if (name := one.name.removesuffix("R")) in true]
+    inside = [abs(one.value - value) < 2 * one.sigma for value, one in rows if one.sigma]
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
 
 

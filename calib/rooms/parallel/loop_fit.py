@@ -27,7 +27,7 @@ from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, finding, refuse_option, suggestion
 from calib.estimation.estimate import Estimate
-from calib.folders import COVARIANCE, ESTIMATE, METRICS, check_target, write_covariance, write_estimate, write_staged
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, check_target, write_covariance, write_staged
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread
@@ -133,7 +133,7 @@ class ParallelFit(Judged):
         def write(folder: Path) -> None:
             words, read = f"calibrated from {self.nominal.source}", {"files": [str(each) for each in self.files]}
             parallel_files.write(folder / ROBOT, self.robot.chain, words, read)
-            write_estimate(folder, HEADER, list(self._table()))
+            files.write_table(folder / ESTIMATE, HEADER, list(self._table()))
             write_covariance(folder / COVARIANCE, found.names, found.covariance)
             files.write_json(folder / METRICS, self.to_dict())
 
