@@ -37,18 +37,8 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
             path = files.write(place / name, content)
         except CalibError:
             continue
-        return f"{said}; a bug report was written: {path}{_where_to()}. Please check the input, too."
+        return f"{said}; a bug report was written: {path}. Please check the input, too."
     return f"{said}; --debug shows where. Please check the input, too."
-
-
-def _where_to() -> str:
-    """Return where to send a report, from the package's metadata; "" if they state no address."""
-    try:
-        known = metadata.metadata(PACKAGES[0]).get_all("Project-URL") or []
-    except metadata.PackageNotFoundError:
-        return ""
-    found = (address for label, _, address in (entry.partition(", ") for entry in known) if "issue" in label.lower())
-    return next((f", please send it to {address}" for address in found), "")
 
 
 def _versions() -> list[str]:

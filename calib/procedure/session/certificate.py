@@ -1,6 +1,5 @@
 """The certificate of a session: both stages' findings gathered from its folders and printed on one page."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,11 +15,10 @@ from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.certificate import FileRow
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
-from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, read_state
+from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Say, Session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.records import read_json, read_lines
 
-Say = Callable[[str], None]
 ROLES = {
     "1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-excitation": "motion to record",
     "7-recorded": "recorded", "8-dynamics": "identified model", "6-export": "calibrated robot",

@@ -3,7 +3,7 @@
 What a session asks of people, in two lines: what to do at the robot, and which file to bring, in which form.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from calib.procedure.session.folder import (
     UNSEEN,
     VERDICT,
     WAYS,
+    Say,
     Session,
     create,
     locked,
@@ -128,7 +129,6 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     )
 
 
-Say = Callable[[str], None]
 UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}  # of a log: positions and torques
 LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits

@@ -3,7 +3,7 @@
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,12 +33,11 @@ from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.robot_kinds import joints_of
-from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
+from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Say, Session
 from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
 
-Say = Callable[[str], None]
 Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
 MIN_TRACKED_SHARE = 0.98  # of the motion, explained by a recorded period; below it is noted
 MAX_TORQUE_RATIO = 10.0  # a factor between measured and nominal torques that no wrong mass explains

@@ -1,7 +1,7 @@
 """Parallel run of many sessions, one folder per robot: each runs as far as it can, a failure stops no other."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ from calib.arguments import checked
 from calib.errors import CalibError, TaskLost, UsageError, complaint, require
 from calib.procedure.findings import LEVELS
 from calib.procedure.session.commands import COLOURS, go_on
-from calib.procedure.session.folder import SETTINGS
+from calib.procedure.session.folder import SETTINGS, Say
 from calib.procedure.session.steps import DONE
 from calib.workers import Workers
 from calib.workers import workers as opened
@@ -132,7 +132,7 @@ def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> Fle
     return replace(outcome, seconds=time.perf_counter() - started)
 
 
-def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) -> FleetRow:
+def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
     stop = go_on(folder, say, lambda words: None, command, plots=plots)
     session = stop.session
     if stop.waiting is not None:

@@ -28,7 +28,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -49,6 +49,7 @@ from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, c
 from calib.records import plain
 from calib.robot.calibrated import ROBOT
 
+Say = Callable[[str], None]
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
@@ -103,7 +104,6 @@ class Session:
 
     folder: Path
     settings: SessionSettings
-    notes: tuple[str, ...] = field(default=())
     plots: bool = True
 
     def path(self, name: str) -> Path:
@@ -271,7 +271,7 @@ def read_state(session: Session) -> StateFile:
 
 
 @contextmanager
-def locked(session: Session, say: Any = print) -> Iterator[None]:
+def locked(session: Session, say: Say = print) -> Iterator[None]:
     """Lock the session for one command; the lock of a killed command is taken over.
 
     The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
@@ -282,30 +282,26 @@ def locked(session: Session, say: Any = print) -> Iterator[None]:
     import fcntl
 
     path = session.path("session.lock")
-    try:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise SessionError(f"cannot write in {session.folder}: {error.strerror or error}") from error
-    try:
+    with refused_as(SessionError, OSError, f"cannot write in {session.folder}: {{}}"):
+        file = path.open("a+", errors="replace")
+    with file:
+        file.seek(0)
+        holder = file.read(200).strip()
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            holder = os.read(handle, 200).decode(errors="replace").strip() or "another command"
-            raise SessionError(f"{session.folder} is busy: {holder} works on it; wait for it to end") from None
-        if not path.exists() or os.stat(path).st_ino != os.fstat(handle).st_ino:
+            words = f"{holder or 'another command'} works on it; wait for it to end"
+            raise SessionError(f"{session.folder} is busy: {words}") from None
+        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(file.fileno())):
             raise SessionError(f"{session.folder} was busy a moment ago; try again")
-        before = os.read(handle, 200).decode(errors="replace").strip()
-        if before:
-            say(f"the last command ({before}) was interrupted; continuing from there")
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
-        yield
-        path.unlink(missing_ok=True)
-    except Exception:
-        holder = os.pread(handle, 200, 0).decode(errors="replace")
-        there = path.exists() and os.stat(path).st_ino == os.fstat(handle).st_ino
-        if there and holder.startswith(f"process {os.getpid()} "):
+        if holder:
+            say(f"the last command ({holder}) was interrupted; continuing from there")
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        file.flush()
+        try:
+            yield
+        except Exception:
             path.unlink(missing_ok=True)
-        raise
-    finally:
-        os.close(handle)
+            raise
+        path.unlink(missing_ok=True)

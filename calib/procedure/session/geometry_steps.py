@@ -4,7 +4,7 @@ Which poses a session asks for: chosen ones for the fit, random ones within the 
 """
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -49,6 +49,7 @@ from calib.procedure.session.folder import (
     UNSEEN,
     VERDICT,
     WAYS,
+    Say,
     Session,
 )
 from calib.robot import calibrated
@@ -61,7 +62,7 @@ from poses.space import is_feasible
 HOW = "state [camera] in the limits file: calib formats constraints"
 
 
-def _choose(session: Session, chain: Chain, say: Callable[[str], None]) -> list[str]:
+def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     """Choose poses as set in ``session.toml``, and write them, the run through them, and predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
@@ -128,7 +129,6 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
 
 
 MIN_READBACK_DIFFERENCE = 1e-8  # [rad or m] closer to the commanded joints they were not read back
-Say = Callable[[str], None]
 
 
 def chain_of(session: Session) -> Chain:

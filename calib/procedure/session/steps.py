@@ -40,6 +40,7 @@ from calib.procedure.session.folder import (
     UNSEEN,
     VERDICT,
     WAYS,
+    Say,
     Session,
     StateFile,
     StepRecord,
@@ -70,7 +71,7 @@ class SessionStep:
 
     name: str
     purpose: str
-    make: Callable[[Session, Callable[[str], None]], list[str]]
+    make: Callable[[Session, Say], list[str]]
     reads: str
     makes: str
     settings: str
@@ -173,7 +174,6 @@ STEPS = (
 )  # fmt: skip
 
 
-Say = Callable[[str], None]
 DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
 
 
