@@ -84,16 +84,10 @@ class MeasurementError(CalibError):
 
     def __init__(self, message: str, file: str | Path | None = None, row: int | None = None, column: str | None = None):
         self.file, self.row, self.column = file, row, column
-        place = ", ".join(
-            part
-            for part in (
-                str(file) if file else "",
-                f"row {row}" if row is not None else "",
-                f"column '{column}'" if column else "",
-            )
-            if part
-        )
-        super().__init__(f"{place}: {message}" if place else message)
+        place = [str(file)] if file else []
+        place += [] if row is None else [f"row {row}"]
+        place += [f"column '{column}'"] if column else []
+        super().__init__(f"{', '.join(place)}: {message}" if place else message)
 
 
 class Unidentifiable(CalibError):

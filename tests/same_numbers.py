@@ -85,7 +85,7 @@ def run(folder: Path, names: list[str]) -> None:
         (place / "limits.toml").write_text(LIMITS)
         line = COMMANDS[name][1].format(data=DATA)
         command = [sys.executable, "-c", PREPARE.format(examples=str(examples))] if name == "practice" else [
-            sys.executable, "-m", "calib.cli", *line.split()]  # fmt: skip
+            sys.executable, "-m", "calib", *line.split()]  # fmt: skip
         with (place / "console.txt").open("w") as console:
             codes[name] = subprocess.run(command, cwd=place, stdout=console, stderr=subprocess.STDOUT).returncode
         print(name, codes[name], flush=True)

@@ -39,18 +39,6 @@ app = typer.Typer(
     epilog=EXIT_CODES,
 )
 
-_FLAGS = (
-    "--debug",
-    "--help",
-    "--line",
-    "--plots",
-    "--no-plots",
-    "--refit-frames",
-    "--no-refit-frames",
-    "--overwrite",
-    "--verbose",
-    "-v",
-)
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
 for _group in (geometry.app, dynamics.app, session.app, *offered("commands")):
@@ -137,11 +125,16 @@ def _spread(arguments: list[str]) -> list[str]:
 
     Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
     """
+    command = next((word for word in arguments[:2] if word in ("fit", "identify", "compare")), None)
+    if command is None:
+        return arguments
+    known = [*_command().params, *_command().commands[command].params]
+    flags = [name for one in known if getattr(one, "is_flag", False) for name in (*one.opts, *one.secondary_opts)]
     result: list[str] = []
     option, positionals, spreading = "", 0, False
     for word in arguments:
-        if word.startswith("--") or word in _FLAGS:
-            option = "" if word in _FLAGS or "=" in word else word
+        if word.startswith("--") or word in flags:
+            option = "" if word in (*flags, "--help") or "=" in word else word
             spreading = False
         elif option:
             spreading = option == "--validate" and positionals > 2  # the command itself, ROBOT, MEASURED
@@ -151,7 +144,7 @@ def _spread(arguments: list[str]) -> list[str]:
         else:
             positionals += 1
         result.append(word)
-    return result if {"fit", "identify", "compare"} & set(arguments[:2]) else arguments
+    return result
 
 
 def _interrupted(given: list[str]) -> int:

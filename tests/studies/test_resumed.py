@@ -117,7 +117,7 @@ def test_a_cluster_that_loses_a_worker_loses_no_trial(study: Path, tmp_path: Pat
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
 def test_a_study_that_was_stopped_goes_on(study: Path, tmp_path: Path, how: int, code: int):
     out = tmp_path / "out"
-    words = [sys.executable, "-m", "calib.cli", "study", str(study), "--out", str(out), "--no-plots"]
+    words = [sys.executable, "-m", "calib", "study", str(study), "--out", str(out), "--no-plots"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     journal = out / JOURNAL
     for _ in range(1200):

@@ -184,49 +184,47 @@ def select(session: Session, say: Say) -> list[str]:
     return _choose(session, chain, say)
 
 
-def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
-    """Return the planned poses (m, n) of a list in ``2-poses``; None without a plan."""
-    path = session.path(f"2-poses/{name}.csv")
-    if not session.settings.poses.plan or not path.exists():
-        return None
-    return read_poses(path, Joints(chain.joint_names, joint_kinds(chain)))
-
-
 def arrive(session: Session, say: Say) -> list[str]:
     """Check the measured files for the fit, and return notes."""
-    chain, notes = chain_of(session), []
-    plan = _planned(session, chain, "poses")
-    for path in session.brought("measured"):
-        notes += check_file(session, chain, path, plan)
-    notes += _drifts(session, chain)
+    chain, sigma = chain_of(session), session.settings.instrument.sigma_position
+    blocks, again = (read_measured(session, chain, session.brought(kind)) for kind in ("measured", "drift"))
+    notes = _notes_on(session, chain, blocks, POSES)
+    notes += lines_of(drift(chain, [block for _, block in blocks], [block for _, block in again], sigma))
     files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
 
-def check_file(
-    session: Session, chain: Chain, path: Path, plan: np.ndarray | None, like: Sequence[PoseMeasurements] = ()
-) -> list[str]:
-    """Return the notes on a measured file: rows, kind, ignored columns, missing poses.
+def read_measured(
+    session: Session, chain: Chain, paths: Sequence[Path], like: Sequence[PoseMeasurements] = ()
+) -> list[tuple[str, PoseMeasurements]]:
+    """Return the blocks of measured files with their files' names.
 
     Raises:
         MeasurementError: for implausible values, with row and column.
     """
-    notes = []
-    for block in inputs.read_file(path, chain, _options_of(session), like):
-        measures = session.settings.instrument.measures
-        if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
-            notes.append(f"{path.name}: only positions, although the instrument measures poses")
+    options = _options_of(session)
+    return [(path.name, block) for path in paths for block in inputs.read_file(path, chain, options, like)]
+
+
+def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[str]:
+    """Return the notes on measured blocks: rows, kind, ignored columns, poses missing from a list in ``2-poses``."""
+    measures, notes, path = session.settings.instrument.measures, [], session.path(f"2-poses/{plan}")
+    planned = None
+    if session.settings.poses.plan and path.exists():
+        planned = read_poses(path, Joints(chain.joint_names, joint_kinds(chain)))
+    for name, block in blocks:
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
-        notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
+        found = [f"{len(block)} rows of kind {block.kind}{ignored}"]
+        if measures == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
+            found.append("only positions, although the instrument measures poses")
         if block.kind == IMAGES:
-            notes.append(f"{path.name}: {needed('image_words')(block)}")
+            found.append(needed("image_words")(block))
         elif measures == IMAGES:
-            notes.append(f"{path.name}: not images, although the instrument is a camera; it is fitted")
-        notes += [f"{path.name}: {note}" for note in block.notes]
-        if plan is not None:
-            notes += [
-                f"{path.name}: {note}" for note in (*check_against(plan, block), *lines_of(readback(plan, block)))
-            ]
+            found.append("not images, although the instrument is a camera; it is fitted")
+        found += block.notes
+        if planned is not None:
+            found += [*check_against(planned, block), *lines_of(readback(planned, block))]
+        notes += [f"{name}: {note}" for note in found]
     return notes
 
 
@@ -263,16 +261,6 @@ def drift(
         )
         for file, when, found in pairs if found is not None
     ]  # fmt: skip
-
-
-def _drifts(session: Session, chain: Chain) -> list[str]:
-    """Return the drift findings from repeatedly measured poses."""
-    options = _options_of(session)
-    first, again = (
-        [block for path in paths for block in inputs.read_file(path, chain, options)]
-        for paths in (session.brought("measured"), session.brought("drift"))
-    )
-    return lines_of(drift(chain, first, again, session.settings.instrument.sigma_position))
 
 
 def _fit_settings(session: Session) -> FitSettings:
@@ -314,13 +302,10 @@ def fit(session: Session, say: Say) -> list[str]:
 
 def validate(session: Session, say: Say) -> list[str]:
     """Validate the fitted robot on unseen poses, as `calib fit` does with validation files."""
-    chain, unseen, notes = chain_of(session), session.brought("validation"), []
-    fit, out = session.fit, session.validation
+    chain, unseen, fit, out = chain_of(session), session.brought("validation"), session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
-    plan = _planned(session, chain, "validation")
     like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
-    for path in unseen:
-        notes += check_file(session, chain, path, plan, like)
+    notes = _notes_on(session, chain, read_measured(session, chain, unseen, like), UNSEEN)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
     settings = Settings(wanted.loss or options.loss, options.loss_scale)

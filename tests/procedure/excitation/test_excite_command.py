@@ -258,7 +258,7 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
     words = ["excite", "lwr4plus", "--out", str(tmp_path / "e"), "--starts", "20", "--workers", "2"]
     for patience in (15, 30, 60):  # [s] until the workers of a busy machine have found something
         run = subprocess.Popen(
-            [sys.executable, "-m", "calib.cli", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
+            [sys.executable, "-m", "calib", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
         )
         time.sleep(patience)
         (os.killpg if "group" in whom else os.kill)(run.pid, signal.SIGINT)

@@ -148,7 +148,7 @@ def test_a_full_disk_in_the_middle_leaves_nothing(cell, calib, monkeypatch):
 
 def test_a_killed_fit_leaves_no_folder(cell):
     file = cell.write("a.csv", cell.measure(400))
-    command = [sys.executable, "-m", "calib.cli", "fit", "ur5", str(file), "--out", "done"]
+    command = [sys.executable, "-m", "calib", "fit", "ur5", str(file), "--out", "done"]
     process = subprocess.Popen(command, cwd=cell.folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     process.stdout.readline()  # it has read its input and is about to fit

@@ -13,7 +13,7 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.session.answers import CAMERA, Answers
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
-from calib.procedure.session.geometry_steps import chain_of, check_file, drift, readback
+from calib.procedure.session.geometry_steps import chain_of, drift, read_measured, readback
 from calib.procedure.session.questions import QUESTIONS, checked, with_answer
 from calib.robot.chain import random_joints
 from calib.rooms.cells.cell import measure, wandering
@@ -82,7 +82,7 @@ def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_to
     table[:, columns] *= 1e-3
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in table)]) + "\n")
     with pytest.raises(MeasurementError, match=r"validation.csv: .*are they m, although the header states mm"):
-        check_file(measured, chain_of(measured), path, None)
+        read_measured(measured, chain_of(measured), [path])
 
 
 def test_a_camera_is_asked_for_its_own_place_and_not_for_a_reflectors():

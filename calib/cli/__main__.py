@@ -1,5 +1,0 @@
-"""``python -m calib.cli``."""
-
-from calib.cli import main
-
-main()
