@@ -134,27 +134,18 @@ def identify_gains(
         gain = np.ones(n) if start is None else np.array(start, dtype=float)
     else:
         gain = _start(body, load, current)
-    x = _parameters(body, load, current, gain, np.ones(n))
-    std = np.ones(n)
+    x = _parameters(body, load, current, gain)
+    moving = np.array([j for j in range(n) if j != reference and j not in own], dtype=int)
     max_rounds = 60
     for _ in range(max_rounds):
         torque = body @ x + load
         residual = torque / gain[:, None] - current
         std = np.sqrt(np.sum(residual**2, axis=1) / currents.rows)
-        weight = 1.0 / (std * np.sqrt(tau))
-        jacobian = np.zeros((n, factors.shape[1], len(free) + n))
-        jacobian[:, :, : len(free)] = body / gain[:, None, None]
-        for j in range(n):
-            if j != reference and j not in own:
-                jacobian[j, :, len(free) + j] = -torque[j] / gain[j]  # by log K_j
-        stacked = retriangulate(
-            np.hstack(
-                [
-                    (jacobian * weight[:, None, None]).reshape(-1, len(free) + n),
-                    (residual * weight[:, None]).reshape(-1, 1),
-                ]
-            )
-        )
+        by_gain = np.zeros((n, factors.shape[1], n))
+        by_gain[moving, :, moving] = -torque[moving] / gain[moving, None]  # by log K_j
+        rows = np.concatenate([body / gain[:, None, None], by_gain, residual[:, :, None]], axis=2)
+        rows = rows / (std * np.sqrt(tau))[:, None, None]
+        stacked = retriangulate(rows.reshape(-1, rows.shape[2]))
         upper = stacked[:-1, :-1]
         step = -np.linalg.lstsq(upper, stacked[:-1, -1], rcond=1e-12)[0]
         size = min(1.0, 0.7 / max(float(np.abs(step[len(free) :]).max()), 1e-12))
@@ -249,9 +240,6 @@ def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarra
     return np.where(np.abs(found) > 0.05 * usual, np.abs(found), max(usual, 1e-3))
 
 
-def _parameters(
-    body: np.ndarray, load: np.ndarray, current: np.ndarray, gain: np.ndarray, std: np.ndarray
-) -> np.ndarray:
-    scale = (gain * std)[:, None]
-    target = (gain[:, None] * current - load) / scale
-    return np.linalg.lstsq((body / scale[:, :, None]).reshape(-1, body.shape[2]), target.ravel(), rcond=1e-12)[0]
+def _parameters(body: np.ndarray, load: np.ndarray, current: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    matrix, target = body / gain[:, None, None], current - load / gain[:, None]
+    return np.linalg.lstsq(matrix.reshape(-1, body.shape[2]), target.ravel(), rcond=1e-12)[0]

@@ -258,22 +258,16 @@ def sensitivity(
 
 def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
     """Return pairs of bodies with each element, then each tilt of gravity, `STEP` above and below its value."""
-    result = []
-    for k in range(len(chain.elements)):
-        beside = [np.array(chain.values), np.array(chain.values)]
-        beside[0][k] += STEP
-        beside[1][k] -= STEP
-        result.append((_tree(found, chain.with_values(beside[0])), _tree(found, chain.with_values(beside[1]))))
-    gravity = np.array(found.dynamics.model.bodies.gravity)
-    for axis in np.eye(3)[:2]:
-        turned = [Rotation.from_rotvec(sign * STEP * axis).apply(gravity) for sign in (1.0, -1.0)]
-        tilted = [replace(found.settings, gravity=tuple(map(float, one))) for one in turned]
-        result.append((make_model(chain, tilted[0]).bodies, make_model(chain, tilted[1]).bodies))
-    return result
 
+    def moved(step: np.ndarray) -> Bodies:
+        return make_model(chain.with_values(np.array(chain.values) + step), found.settings).bodies
 
-def _tree(found: Identification, chain: Chain) -> Bodies:
-    return make_model(chain, found.settings).bodies
+    def tilted(turn: np.ndarray) -> Bodies:
+        gravity = Rotation.from_rotvec(turn).apply(np.array(found.dynamics.model.bodies.gravity))
+        return make_model(chain, replace(found.settings, gravity=tuple(gravity.tolist()))).bodies
+
+    elements, tilts = STEP * np.eye(len(chain.elements)), STEP * np.eye(3)[:2]
+    return [*((moved(one), moved(-one)) for one in elements), *((tilted(one), tilted(-one)) for one in tilts)]
 
 
 def _pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32) -> list[tuple[slice, slice]]:

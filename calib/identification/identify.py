@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Generic, TypeGuard, cast
 
 import numpy as np
@@ -55,6 +56,7 @@ class Identification(Generic[Model]):
         friction: richer friction selected on held-out time.
         settings: settings of the identification.
         rows: the training data.
+        terms: the drive term of each estimated parameter; None for parameters of bodies.
         condition: of the base parameters' observation matrix, as it is and with columns of unit norm.
         prior: prior of the base parameters; None if unused.
         ripples: gear ripple above the identification band, by joint; not part of the estimate's covariance.
@@ -68,6 +70,7 @@ class Identification(Generic[Model]):
     friction: FrictionSelection
     settings: IdentificationSettings
     rows: tuple[ObservationRows, ...]
+    terms: tuple[DriveTerm | None, ...]
     condition: tuple[float, float]
     prior: Prior | None = None
     ripples: tuple[Ripple, ...] = ()
@@ -77,13 +80,6 @@ class Identification(Generic[Model]):
     def names(self) -> tuple[str, ...]:
         """Names of the estimate's parameters: base parameters, then richer friction."""
         return (*self.base.names, *(one.name for one in self.friction.terms))
-
-    @property
-    def terms(self) -> tuple[DriveTerm | None, ...]:
-        """The drive term of each estimated parameter; None for parameters of bodies."""
-        model = self.dynamics.model
-        own = (None if k < model.inertial else model.columns[k - model.inertial] for k in self.base.kept)
-        return (*own, *self.friction.terms)
 
 
 def identify(
@@ -164,13 +160,9 @@ def identify_model(
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
     prior = None
+    found = partial(find_prior, model, base, whole=whole, source=source, noise=noise, effort=effort)
     if _takes_prior(method, model, settings, source):
-        prior = tempered_prior(
-            lambda tempering, start: find_prior(
-                model, base, rows, whole, source, noise, start=start, effort=effort, tempering=tempering
-            ),
-            rows, regimes(rows, cases, decimator),
-        )  # fmt: skip
+        prior = tempered_prior(found, rows, regimes(rows, cases, decimator))
     first = first_fit(rows, noise) if prior is None else prior.first
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
@@ -180,13 +172,21 @@ def identify_model(
     )
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
-        groups = np.array(friction.groups)
-        prior = find_prior(model, base, full, whole, source, noise, groups, prior, effort, prior.tempering)
+        prior = found(full, groups=np.array(friction.groups), start=prior, tempering=prior.tempering)
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
         settings.constraints,
     )  # fmt: skip
+    return _identified(problem, method, friction, settings, say)
+
+
+def _identified(
+    problem: IdentificationProblem, method: Method, friction: FrictionSelection, settings: IdentificationSettings,
+    say: Progress,
+) -> Identification[RegressorModel]:  # fmt: skip
+    """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
+    model, base, cases = problem.model, problem.base, problem.cases
     say("simulating the closed loop" if method.needs_controller else "estimate")
     found = method.estimate(problem)
     values = found.estimate.values
@@ -201,7 +201,20 @@ def identify_model(
     say("essential parameters")
     gone = _essential(found, settings)
     condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
-    return Identification(dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, loop)
+    return Identification(
+        dynamics,
+        base,
+        found,
+        gone,
+        friction,
+        settings,
+        problem.rows,
+        problem.terms,
+        condition,
+        problem.prior,
+        ripples,
+        loop,
+    )
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:

@@ -111,15 +111,6 @@ def refuse_currents(folder: Path, task: str) -> None:
         )
 
 
-def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
-    """Return names and covariance (p, p) of the estimated parameters; None without the file.
-
-    Raises:
-        RobotError: where the file is damaged.
-    """
-    return folders.read_covariance(folder) if (folder / folders.COVARIANCE).is_file() else None
-
-
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
     """Return the model as a table for JSON; `unit`: that of its torques."""
     model = dynamics.model
@@ -146,13 +137,16 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
             for one, value in zip(model.columns, dynamics.values[bodies:])
         ],
         "base": dict(zip(base.names, expressions(base))),
-        "regrouping": {
-            name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
-            for name, row in zip(base.names, base.transform)
-        },
+        "regrouping": regrouping(base),
         "covariance": folders.COVARIANCE,
         "note": NOTE,
     }
+
+
+def regrouping(base: Base) -> dict[str, dict[str, float]]:
+    """Return base parameter → standard parameter → its coefficient."""
+    rows = zip(base.names, base.transform)
+    return {name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)} for name, row in rows}
 
 
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:

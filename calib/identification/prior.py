@@ -361,9 +361,7 @@ def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
 STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
 
 
-def tempered_prior(
-    find: Callable[[float, Prior | None], Prior], rows: Sequence[ObservationRows], regimes: Regimes
-) -> Prior:
+def tempered_prior(find: Callable[..., Prior], rows: Sequence[ObservationRows], regimes: Regimes) -> Prior:
     """Return the prior with the tempering that best predicts held-out regimes.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
@@ -371,16 +369,16 @@ def tempered_prior(
     `min_gain`.
 
     Args:
-        find: tempering and a prior to start from to the prior whose sizes the evidence chose with it.
+        find: `find_prior` of rows, a prior to start from, and a tempering.
         rows: in the base columns.
         regimes: of these rows.
     """
     data, columns, best = triangulate(rows), np.arange(len(rows[0].names)), None
-    found = find(STEPS[0], None)
+    found = find(rows)
     std = found.first.std
     min_gain = 0.08  # in the logarithm of squared errors, by which a stronger prior has to be better (our choice)
     for tempering in STEPS:
-        own = found if tempering == STEPS[0] else find(tempering, found)
+        own = found if tempering == STEPS[0] else find(rows, start=found, tempering=tempering)
         inflation = tempering * own.first.inflation
         validation = CrossValidation(
             data, len(std), 1, own.first.std, inflation, np.full(len(columns), -1), own.rows, regimes

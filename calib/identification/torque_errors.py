@@ -30,9 +30,9 @@ from calib.errors import UsageError, refused_as
 from calib.estimation.robust import variance_weights
 from calib.estimation.triangles import Triangles
 from calib.estimation.whiteness import inflation
+from calib.folders import COVARIANCE, read_covariance
 from calib.identification import time_folds
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.model_file import read_covariance
 from calib.identification.prediction import Dynamics, IntervalCoverage
 from calib.identification.rows import Case, pool, segmented_states, triangulate
 from trajectories.timing.profile import Sampled
@@ -101,10 +101,9 @@ def parameter_variances(
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
     """Return the uncertainty in ``covariance.csv`` of an identification; None without the file."""
-    found = read_covariance(folder)
-    if found is None:
+    if not (folder / COVARIANCE).is_file():
         return None
-    names, covariance = found
+    names, covariance = read_covariance(folder)
     with refused_as(UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}"):
         columns = estimated_columns(dynamics, names)
     return Uncertainty(dynamics, tuple(carried), columns, covariance)

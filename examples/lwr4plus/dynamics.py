@@ -257,10 +257,10 @@ def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[s
     whole = model(chain, MOTOR)
     robot = Plant(whole.bodies, whole.terms, true_parameters(chain))
     bare = replace(controller(robot, reference), ahead=None)
-    result = {"feedback alone": tracking_error(robot, None, bare, reference)}
+    result = {"feedback alone": tracking_error(robot, bare, reference)}
     for name, found in fits.items():
         believed = Plant(found.model.bodies, whole.terms, found.base.to_standard(values_of(found)))
-        result[name] = tracking_error(robot, believed, bare, reference)
+        result[name] = tracking_error(robot, bare, reference, feed_forward(believed, reference))
     return {name: (1e3 * error).tolist() for name, error in result.items()}
 
 

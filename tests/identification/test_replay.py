@@ -15,7 +15,7 @@ from calib.identification.rows import Case, make_case
 from calib.rooms.cells import known_robots
 from calib.rooms.closed_loop import controllers
 from calib.rooms.closed_loop import replay as replays
-from calib.rooms.closed_loop.simulation import Plant, replayed_error, simulate
+from calib.rooms.closed_loop.simulation import Plant, simulate, tracking_error
 
 PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]))
 
@@ -52,7 +52,7 @@ def test_the_replay_tells_how_the_true_robot_would_track(share):
     followed = controllers.Reference(motion.t, motion.q, motion.v, motion.a)
     own = push[start : start + len(motion)]
     for name, ahead in ((replays.FEEDBACK, None), (replays.IDENTIFIED, predicted)):
-        true = replayed_error(plant(), PD, followed, ahead, own)
+        true = tracking_error(plant(), PD, followed, ahead, own)
         np.testing.assert_allclose(found.rms[name], true, rtol=0.1)
     assert (found.rms[replays.FLOOR] < 0.1 * found.rms[replays.IDENTIFIED]).all()
 
@@ -81,7 +81,7 @@ def test_a_model_of_no_possible_robot_is_replayed_with_inertia_added_and_that_to
     motion = case.motion
     start = round(motion.t[0] * 1000)
     followed = controllers.Reference(motion.t, motion.q, motion.v, motion.a)
-    true = replayed_error(plant(), PD, followed, predicted, push[start : start + len(motion)])
+    true = tracking_error(plant(), PD, followed, predicted, push[start : start + len(motion)])
     np.testing.assert_allclose(found.rms[replays.IDENTIFIED], true, rtol=0.33)
     sound = replays.replay(planted.arm(), Dynamics(planted.model(), planted.truth()), case, predicted, PD)
     assert not sound.inertia_added.any()

@@ -263,6 +263,8 @@ class MotionSamples:
 
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
     """Return about `count` samples of a recording of motor torques; None if too few are usable."""
+    from scipy.ndimage import uniform_filter1d  # slow to load
+
     motion, n = case.motion, case.motion.n
     # left out at both ends of a segment [s], so that shifted torques are still recorded ones (our choice)
     edge_time = 0.3
@@ -273,7 +275,8 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
     index = inner[:: max(1, len(inner) // count)]
     # window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help
     window = 0.02
-    effort = _smoothed(np.asarray(case.target), max(1, round(window * motion.rate)))
+    size = 2 * max(1, round(window * motion.rate) // 2) + 1  # odd
+    effort = uniform_filter1d(np.array(case.target), size, axis=0, mode="nearest")
     q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
     return MotionSamples(index, q, v, a, effort, motion.v, bodies)
 
@@ -290,11 +293,3 @@ def basis(columns: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(columns.T @ columns)
     kept = values > 1e-9 * values[-1]
     return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
-
-
-def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
-    """Return the moving average (N, n) over an odd number of samples, at least three."""
-    half = max(1, width // 2)
-    padded = np.pad(values, ((half + 1, half), (0, 0)), mode="edge")
-    total = np.cumsum(padded, axis=0)
-    return (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)

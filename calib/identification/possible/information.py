@@ -7,7 +7,6 @@ they are the data's own triangle instead (``information.csv``), so that what was
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +18,7 @@ from calib.errors import RobotError, refused_as, require
 from calib.estimation.estimate import whitened
 from calib.estimation.triangles import combine, retriangulate
 from calib.folders import read_covariance, read_estimate
-from calib.identification.model_file import read_dynamics, read_table
+from calib.identification.model_file import read_dynamics, read_table, regrouping
 from calib.identification.prediction import Dynamics
 from calib.records import Frozen
 from calib.robot.chain import Chain
@@ -72,12 +71,8 @@ class Information(Frozen):
 
 def of(found: Identification, chain: Chain) -> Information:
     """Return the information of an identification in memory, without reading its files."""
-    fitted, b = found.fitted, found.base.b
-    estimate, standard = fitted.estimate, found.dynamics.model.names
-    place = {name: k for k, name in enumerate(standard)}
-    transform = np.zeros((len(found.names), len(standard)))
-    transform[:b, [place[name] for name in found.base.standard]] = found.base.transform
-    transform[np.arange(b, len(found.names)), [place[name] for name in found.names[b:]]] = 1.0
+    estimate, standard = found.fitted.estimate, found.dynamics.model.names
+    transform = _transform(found.names, regrouping(found.base), standard)
     return Information(
         chain, found.dynamics, found.names, estimate.units, estimate.values, estimate.covariance, transform,
         _information(found),
@@ -127,9 +122,9 @@ def read(folder: str | Path) -> Information:
         values = np.array([one.value for one in estimate])
         covariance = read_covariance(folder)[1]
         transform = _transform(names, groups, dynamics.model.names)
-        data = folder / INFORMATION
-        require(data.is_file() or (np.diag(covariance) > 0.0).all(), "a parameter without variance", ValueError)
-        factor = _numbers(data) if data.is_file() else whitened(values, covariance)
+        data, known = folder / INFORMATION, (folder / INFORMATION).is_file()
+        require(known or (np.diag(covariance) > 0.0).all(), "a parameter without variance", ValueError)
+        factor = np.loadtxt(data, delimiter=",", skiprows=1, ndmin=2) if known else whitened(values, covariance)
         if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
             raise ValueError("files of different sizes")
     return Information(chain, dynamics, names, units, values, covariance, transform, factor)
@@ -148,9 +143,3 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 def write(found: Identification, folder: Path) -> None:
     """Write the triangle of an identification's data (`_information`)."""
     files.write_numbers(folder / INFORMATION, (*found.names, "target"), _information(found))
-
-
-def _numbers(path: Path) -> np.ndarray:
-    """Return the numbers of a CSV table below its header."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])

@@ -14,8 +14,9 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.errors import UsageError, require
+from calib.folders import COVARIANCE, read_covariance
 from calib.identification.identify_options import FileSettings
-from calib.identification.model_file import from_table, read_covariance, read_table, refuse_currents
+from calib.identification.model_file import from_table, read_table, refuse_currents
 from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
@@ -191,11 +192,11 @@ def _dynamics(
 
 def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
     """Return the covariance of the named columns; None if the file has other columns."""
-    found = read_covariance(folder)
-    if found is None or not set(names) <= set(found[0]):
+    known, covariance = read_covariance(folder) if (folder / COVARIANCE).is_file() else ((), np.empty((0, 0)))
+    if not set(names) <= set(known):
         return None
-    index = [found[0].index(name) for name in names]
-    return found[1][np.ix_(index, index)]
+    index = [known.index(name) for name in names]
+    return covariance[np.ix_(index, index)]
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:

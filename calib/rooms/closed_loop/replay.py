@@ -38,7 +38,7 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.robot.chain import Chain
 from calib.rooms.closed_loop.controllers import Reference, pd, stated_controller
 from calib.rooms.closed_loop.loop_recordings import periods_per_sample, take
-from calib.rooms.closed_loop.simulation import Plant, feed_forward, replayed_error
+from calib.rooms.closed_loop.simulation import Plant, feed_forward, tracking_error
 
 
 def replay(
@@ -80,7 +80,7 @@ def replay(
         ahead[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
     ahead |= {IDENTIFIED: controlled(predicted), FLOOR: measured}
     push = feed_forward(robot, reference) - measured
-    rms = {name: replayed_error(robot, control, reference, one, push) for name, one in ahead.items()}
+    rms = {name: tracking_error(robot, control, reference, one, push) for name, one in ahead.items()}
     seconds = float(motion.t[part.stop - 1] - motion.t[part.start])
     return Replay(case.name, seconds, control, controller is not None, left_out, added, rms)
 

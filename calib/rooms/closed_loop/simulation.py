@@ -319,30 +319,16 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     return np.concatenate([regressor @ believed.parameters for regressor in regressors])
 
 
-def replayed_error(
-    robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None, push: np.ndarray
-) -> np.ndarray:
-    """Return the rms of q - q_r (n,) [rad or m] with feedforward torques (N, n) and disturbances (N, n), no noise."""
-    own = controller if ahead is None else controller.with_feedforward(ahead)
-    run = simulate(robot, own, reference, push=push)
-    return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
-
-
 def tracking_error(
-    robot: Plant,
-    believed: Plant | None,
-    controller: Controller,
-    reference: Reference,
-    sensing: Sensing | None = None,
-    seed: int = 0,
-) -> np.ndarray:
-    """Return the rms of q - q_r (n,) [rad or m] of a robot with feedback and feedforward of the believed model.
+    robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None = None,
+    push: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Return the rms of q - q_r (n,) [rad or m] of a robot without noise, at the controller's instants.
 
     Args:
         robot: what moves; on a real arm the best model there is stands for it.
-        believed: whose torques are fed forward; None: feedback alone.
+        ahead: (N, n) feedforward torques, of `feed_forward`; None: those of the controller.
+        push: (N, n) torques that act besides; None for none.
     """
-    ahead = controller if believed is None else controller.with_feedforward(feed_forward(believed, reference))
-    run = simulate(robot, ahead, reference, sensing, seed)
-    tick = sample_ticks(len(reference.t), 1 if sensing is None else sensing.every)
-    return np.sqrt(np.mean((run.q - reference.at(tick)[0]) ** 2, axis=0))
+    run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
+    return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))

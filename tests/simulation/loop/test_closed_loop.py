@@ -15,7 +15,7 @@ from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots
 from calib.rooms.closed_loop import controllers
 from calib.rooms.closed_loop.controllers import Reference
-from calib.rooms.closed_loop.simulation import Plant, Sensing, forward_dynamics, simulate
+from calib.rooms.closed_loop.simulation import Plant, Sensing, feed_forward, forward_dynamics, simulate, tracking_error
 from calib.transforms import displace
 
 HIGH = np.array([2.0, 1.2, 1.2, 2.0, 1.5, 2.0])
@@ -261,9 +261,8 @@ def test_the_truths_are_those_of_the_library():
 
 
 def test_the_better_model_tracks_better():
-    from calib.rooms.closed_loop.simulation import tracking_error
-
     plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion()
     rough = replace(plant, parameters=1.2 * plant.parameters)
-    none, poor, good = (tracking_error(plant, one, controller, reference) for one in (None, rough, plant))
+    ahead = (None, feed_forward(rough, reference), feed_forward(plant, reference))
+    none, poor, good = (tracking_error(plant, controller, reference, one) for one in ahead)
     assert np.all(good < poor) and np.all(poor < none)
