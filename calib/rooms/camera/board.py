@@ -28,10 +28,10 @@ from calib.data.poses import BOARD
 from calib.errors import require
 
 KINDS = ("charuco", "chessboard", "apriltag")
-DICTIONARIES = (
-    *(f"{bits}x{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
-)  # fmt: skip
+DICTIONARIES = {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)} | {
+    "apriltag_16h5": 30, "apriltag_25h9": 35, "apriltag_36h10": 2320, "apriltag_36h11": 587,
+}  # fmt: skip
+"""Number of markers in each dictionary."""
 MIN_CORNERS = 8  # corners that make an image useful
 
 
@@ -45,26 +45,23 @@ class Board:
     rows: Annotated[int, Whole(2)] = 7
     square: Annotated[float, Real(above=0, most=2.0, quantity="length")] = 0.03
     marker: Annotated[float, Real(least=0, most=2.0, quantity="length")] = 0.0
-    dictionary: Annotated[str, OneOf(DICTIONARIES)] = "5x5_100"
+    dictionary: Annotated[str, OneOf(tuple(DICTIONARIES))] = "5x5_100"
 
     def __post_init__(self) -> None:
         if max(self.columns, self.rows) > 100:
             raise ValueError(f"{self.columns} x {self.rows} squares: the limit is 100 per row")
-        if self.kind == "charuco" and not 0.3 * self.square <= self.marker <= 0.9 * self.square:
+        least, most = {"charuco": (0.3, 0.9), "apriltag": (0.05, 2.0)}.get(self.kind, (0.0, np.inf))
+        if not least * self.square <= self.marker <= most * self.square:
+            what = "side of a marker" if self.kind == "charuco" else "gap between two tags"
             raise ValueError(
-                f"marker = {self.marker:g}: the markers of a charuco board lie in its white squares: marker "
-                f"must be between 0.3 and 0.9 of square = {self.square:g}"
-            )
-        if self.kind == "apriltag" and not 0.05 * self.square <= self.marker <= 2.0 * self.square:
-            raise ValueError(
-                f"marker = {self.marker:g}: the gap between two tags of an apriltag grid must be 0.05 to 2 times "
+                f"marker = {self.marker:g}: the {what} must be between {least:g} and {most:g} of "
                 f"square = {self.square:g}"
             )
         words = f"{self.columns} x {self.rows} squares look the same upside down; an even and an odd number do not"
         require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, words, ValueError)
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")
-        if self.dictionary in DICTIONARIES and self.tags > (count := _dictionary_size(self.dictionary)):
+        if self.tags > (count := DICTIONARIES.get(self.dictionary, self.tags)):
             raise ValueError(f"{self.tags} markers are needed, the dictionary {self.dictionary} has {count}")
 
     @property
@@ -97,12 +94,6 @@ def corners(board: Board) -> np.ndarray:
         return np.array([(x + a, y + b, 0.0) for x, y in first for a, b in own])
     across, down = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
     return board.square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
-
-
-def _dictionary_size(name: str) -> int:
-    """Return the number of markers in a dictionary."""
-    known = {"apriltag_16h5": 30, "apriltag_25h9": 35, "apriltag_36h10": 2320, "apriltag_36h11": 587}
-    return known[name] if name in known else int(name.rsplit("_", 1)[1])
 
 
 def read_board(path: str | Path) -> Board:

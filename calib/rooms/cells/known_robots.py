@@ -31,7 +31,6 @@ def _fourier(
         base: ω [rad/s].
         duration, rate: [s], [Hz].
     """
-    sines, cosines = np.asarray(sines, dtype=float), np.asarray(cosines, dtype=float)
     t = np.arange(round(duration * rate) + 1) / rate
     speed = base * np.arange(1, sines.shape[1] + 1)
     sin, cos = np.sin(np.outer(t, speed)), np.cos(np.outer(t, speed))

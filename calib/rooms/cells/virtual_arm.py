@@ -70,20 +70,19 @@ class MovingArm:
         return model + self.unmodelled.cable_torques(q, self.effort)
 
 
-def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors | None = None) -> MovingArm:
+def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors = UNMODELLED) -> MovingArm:
     """Return the moving true arm of a cell.
 
     Args:
         cell: whose true geometry it has.
         robot: its name in the library.
         seed: of what is wrong with the nominal masses.
-        unmodelled: torques that no model holds; None for the usual ones (`UNMODELLED`).
+        unmodelled: torques that no model holds.
 
     Raises:
         CalibError: where the library holds no masses for it.
     """
     nominal = cell.nominal
-    beyond = UNMODELLED if unmodelled is None else unmodelled
     if nominal.inertias is None:
         raise CalibError(f"the library holds no masses for {robot}, so that its motion cannot be simulated")
     rng = np.random.default_rng([seed, 71])
@@ -101,12 +100,12 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors |
     omega = 2 * np.pi * BANDWIDTH
     note = (
         f"masses off their nominal by {2 * MASS:.0%}, centres by {1e3 * SHIFT:g} mm (1 sigma); {source}; torque noise "
-        f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits{beyond.note}"
+        f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits{unmodelled.note}"
     )
     return MovingArm(
         chain, plant, IdentificationModel(plant.bodies, plant.terms, LINK),
         Plant(bodies_of(nominal), tuple(terms), told),
-        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note, beyond,
+        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note, unmodelled,
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from calib.rooms.cells.unmodelled import PositionErrors
 from calib.transforms import pose
 
 ORDERS = (2, 3)
+CMM, NO_ERRORS = SimulatedInstrument(), PositionErrors()
 
 
 def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed: int) -> Deflection:
@@ -45,20 +46,19 @@ MODELLED = 0.7  # share of it where `UNMODELLED` comes on top
 UNMODELLED = PositionErrors(gear=4e-4, backlash=5e-5, growth=5e-5, droop=5e-5, seed=2)  # our choice
 
 
-def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedInstrument | None = None) -> Cell:
+def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedInstrument = CMM) -> Cell:
     """Return the simulated cell of a robot: the study's for the LWR4+, otherwise a perturbed one by seed.
 
     A third of what is hidden, in squares at the tool (LWR4+: 0.34 of 0.65 mm rms, UR5: 0.08 of 0.13 mm), is of kinds
     that no model of this toolkit holds (`UNMODELLED`).
     """
-    instrument = instrument or SimulatedInstrument()
     if robot == "lwr4plus":
         return lwr4plus_cell(instrument, MODELLED, UNMODELLED)
     return perturbed_cell(load(robot), seed, instrument, unmodelled=replace(UNMODELLED, gear=0.2 * UNMODELLED.gear))
 
 
 def lwr4plus_cell(
-    instrument: SimulatedInstrument | None = None, hidden: float = 1.0, unmodelled: PositionErrors | None = None
+    instrument: SimulatedInstrument = CMM, hidden: float = 1.0, unmodelled: PositionErrors = NO_ERRORS
 ) -> Cell:
     """Return the paper's cell: truth is the calibrated column of Table 2, instrument its optical CMM.
 
@@ -66,11 +66,10 @@ def lwr4plus_cell(
     Table 1 leave about the paper's 0.80 mm and 0.10 deg (Table 3) on poses they have not seen.
 
     Args:
-        instrument: another one than the paper's.
+        instrument: what measures; the paper's by default.
         hidden: scale of the hidden part; 0 for a rigid arm.
-        unmodelled: what no model holds; None for nothing.
+        unmodelled: what no model holds.
     """
-    unmodelled = unmodelled or PositionErrors()
     _, calibrated = lwr4plus.table_2()
     true = lwr4plus.arm(calibrated)
     stiff = np.full(true.n, hidden * COMPLIANCE), np.full(true.n, hidden * AMPLITUDE)
@@ -85,17 +84,17 @@ def lwr4plus_cell(
         f"{hidden * COMPLIANCE * 1e6:g} µrad/(N m) and two harmonics of {hidden * AMPLITUDE * 1e3:g} mrad per joint"
         f"{unmodelled.note}"
     )
-    return Cell(lwr4plus.nominal_chain(), truth, instrument or SimulatedInstrument(), note, unmodelled)
+    return Cell(lwr4plus.nominal_chain(), truth, instrument, note, unmodelled)
 
 
 def perturbed_cell(
     nominal: Chain,
     seed: int = 0,
-    instrument: SimulatedInstrument | None = None,
+    instrument: SimulatedInstrument = CMM,
     *,
     size: float = 1.0,
     hidden: float = 0.2,
-    unmodelled: PositionErrors | None = None,
+    unmodelled: PositionErrors = NO_ERRORS,
 ) -> Cell:
     """Return a cell whose true arm deviates normally from nominal in every element.
 
@@ -105,9 +104,8 @@ def perturbed_cell(
         instrument: what measures.
         size: scale of the deviations (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets).
         hidden: scale of the hidden deflections, in those of the LWR4+.
-        unmodelled: what no model holds; None for nothing.
+        unmodelled: what no model holds.
     """
-    unmodelled = unmodelled or PositionErrors()
     rng = np.random.default_rng(seed)
     true = _perturbed(nominal, rng, size)
     span = float(np.linalg.norm(forward(nominal, np.zeros((1, nominal.n)))[0, :3, 3])) + 0.5
@@ -123,7 +121,7 @@ def perturbed_cell(
         f"{size * ANGLE * 1e3:g} mrad, joint offsets of {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
         f"{unmodelled.note}"
     )
-    return Cell(nominal, truth, instrument or SimulatedInstrument(), note, unmodelled)
+    return Cell(nominal, truth, instrument, note, unmodelled)
 
 
 def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
@@ -138,7 +136,7 @@ def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0)
 def rigid(cell: Cell) -> Cell:
     """Return the cell without hidden deflections and unmodelled errors."""
     still = cell.truth.deflection.with_coefficients(np.zeros(len(cell.truth.deflection.terms)))
-    return replace(cell, truth=replace(cell.truth, deflection=still), unmodelled=PositionErrors())
+    return replace(cell, truth=replace(cell.truth, deflection=still), unmodelled=NO_ERRORS)
 
 
 def _random_pose(rng: np.random.Generator, distance: float) -> np.ndarray:

@@ -23,14 +23,14 @@ import numpy as np
 from calib.data.signals.filtering import Decimator, curvature, kept, low_pass, slope
 from calib.data.signals.motion import Motion
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import Diverged, NotConverged, UsageError
+from calib.errors import Diverged, NotConverged
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.triangles import condition_numbers
 from calib.estimation.whiteness import scatter
 from calib.identification.methods.least_squares import samples_of, weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.prior import residual_inflation
-from calib.rooms.studies.methods.simulated_robot import with_friction
+from calib.rooms.studies.methods.simulated_robot import serial_arm, with_friction
 
 BLOCK = 1000  # samples at a time
 
@@ -45,9 +45,7 @@ class _MaximumLikelihood(Method):
         Raises:
             UsageError: for a model whose rows have no slopes by q, v and a.
         """
-        model = problem.model
-        if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-            raise UsageError(f"method '{self.name}' needs motor torques of a serial arm; otherwise take wls or tls")
+        model = serial_arm(problem, self.name)
         return attempted(self.name, problem, lambda: self._estimate(problem, model))
 
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:

@@ -172,7 +172,7 @@ def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationMod
     """
     model = problem.model
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-        raise UsageError(f"method '{method}' simulates a serial arm with motor torques")
+        raise UsageError(f"method '{method}' needs motor torques of a serial arm; otherwise take wls or tls")
     return model
 
 
