@@ -346,21 +346,14 @@ def _covariance(path: Path, chain: Chain) -> np.ndarray | None:
 
 
 def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
-    deflection = corrections.deflection
-    table: dict[str, Any] = {}
-    if deflection.reference is not None:
-        table["reference"] = deflection.reference.values.tolist()
-    table["term"] = [
-        {
-            "element": term.element,
-            "basis": term.basis,
-            "joint": corrections.chain.joint_names[term.source],
-            "order": term.order,
-            "coefficient": float(value),
-        }
+    deflection, names = corrections.deflection, corrections.chain.joint_names
+    terms = [
+        {"element": term.element, "basis": term.basis, "joint": names[term.source], "order": term.order,
+         "coefficient": float(value)}
         for term, value in zip(deflection.terms, np.asarray(deflection.coefficients))
-    ]
-    return table
+    ]  # fmt: skip
+    reference = None if deflection.reference is None else deflection.reference.values.tolist()
+    return {"reference": reference, "term": terms}
 
 
 def _deflection(table: Any, chain: Chain, where: str) -> Deflection:

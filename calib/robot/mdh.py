@@ -221,11 +221,8 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
 
 def _entry(row: Row, expected: int) -> dict[str, Any]:
     """Return the [[joint]] table of a row, without default values (the four parameters are always written)."""
-    entry: dict[str, Any] = {"name": row.name}
-    if row.kind != "revolute":
-        entry["kind"] = row.kind
-    if row.index != expected:
-        entry["index"] = row.index
+    usual: dict[str, Any] = {"kind": "revolute", "index": expected}
+    entry = {"name": row.name} | {key: getattr(row, key) for key in usual if getattr(row, key) != usual[key]}
     for key in ("alpha", "d", "beta", "theta", "r"):
         if (value := getattr(row, key)) is not None:
             entry[key] = tables.spelled(value) if AXES[key][0] == "r" else value

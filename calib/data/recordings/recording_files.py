@@ -187,19 +187,13 @@ def read_recording(
     recording = _reader(Path(file), (start, stop))(Path(file), joints, options)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
-    if joints is not None:
-        _check_names(recording, joints)
-    return check_recording(earlier(recording, options.lag), joints)
-
-
-def _check_names(recording: Recording, joints: Joints) -> None:
-    """Refuse a recording whose number of joints differs from the robot's."""
-    if recording.n != len(joints.names):
+    if joints is not None and recording.n != len(joints.names):
         message = (
             f"has {recording.n} joints ({', '.join(recording.joint_names)}), the robot has {len(joints.names)} "
             f"({', '.join(joints.names)}): is this another robot's recording?"
         )
         refuse_data(recording.file, message)
+    return check_recording(earlier(recording, options.lag), joints)
 
 
 def _reader(path: Path, ends: Ends) -> Reader:

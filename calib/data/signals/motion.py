@@ -7,7 +7,7 @@ recorded (on the even grid): what filters them is the parallel decimation, which
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +24,7 @@ from calib.data.schema import Joints
 from calib.data.signals import filtering
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
 from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample
-from calib.errors import MeasurementError, UsageError, refuse_data, refused_as
+from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, require
 from calib.files import check_regular
 from calib.records import frozen
 
@@ -181,9 +181,8 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
     less = q if np.array_equal(faster, cutoff) else _smooth(sampled, faster, options.order)
     v = _differences(filtering.slope, less, sampled, options.width)
     while options.band is None and decimator.factor > 1 and not len(filtering.kept(sampled.segment[mask], decimator)):
-        decimator = filtering.design_decimator(
-            sampled.rate, decimator.factor // 2, options.decimator
-        )  # whose window fits
+        # whose window fits
+        decimator = filtering.design_decimator(sampled.rate, decimator.factor // 2, options.decimator)
     if not len(filtering.kept(sampled.segment[mask], decimator)):
         raise filtering.too_short(int(mask.sum()), decimator)
     inside = _span(mask)
@@ -246,16 +245,14 @@ def thin(motion: Motion) -> Motion:
     """
     index = filtering.kept(motion.segment, motion.decimator)
     efforts = {
-        name: None
-        if (value := getattr(motion, name)) is None
-        else filtering.decimate(value, motion.decimator, motion.segment)
-        for name in ("effort", "tau_link", "tau_motor")
+        name: filtering.decimate(value, motion.decimator, motion.segment)
+        for name in ("effort", "tau_link", "tau_motor", "weight")
+        if (value := getattr(motion, name)) is not None
     }
     picked = {name: value[index] for name in ROWS if (value := getattr(motion, name)) is not None}
     rate = motion.rate / motion.decimator.factor
     whole = filtering.design_decimator(rate, 1)
-    weight = filtering.decimate(motion.weight, motion.decimator, motion.segment)
-    return replace(motion, **(picked | efforts | {"weight": weight}), rate=rate, decimator=whole)
+    return replace(motion, **(picked | efforts), rate=rate, decimator=whole)
 
 
 def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
@@ -277,11 +274,9 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
     """Return the positions (N, n) low-passed at each joint's cut-off (n,) [Hz], segment by segment."""
-    q = sampled.series["q"]
-    result = np.empty_like(q)
-    for own in _segments(sampled):
-        for j, f in enumerate(cutoff):
-            result[own, j] = filtering.low_pass(q[own, j], sampled.rate, float(f), order)
+    result = np.array(sampled.series["q"])
+    for own, (j, f) in product(_segments(sampled), enumerate(cutoff)):
+        result[own, j] = filtering.low_pass(result[own, j], sampled.rate, float(f), order)
     return result
 
 
@@ -322,13 +317,12 @@ def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, fil
     rate = sampled.rate
     if options.band is None:
         return filtering.design_decimator(rate, cutoffs.factor, options.decimator)
-    if not 0 < options.band < rate / 2:
-        message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
-        refuse_data(file, message)
+    words = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
+    require(options.band < rate / 2, words, MeasurementError, file)
     if (factor := filtering.factor_for(rate, options.band)) > len(sampled.t):
         message = f"a band of {options.band:g} Hz keeps one of {factor} samples; there are only {len(sampled.t)}"
         refuse_data(file, f"{message}: raise the band, or leave it out")
-    return filtering.design_decimator(rate, filtering.factor_for(rate, options.band), options.decimator)
+    return filtering.design_decimator(rate, factor, options.decimator)
 
 
 def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.ndarray:

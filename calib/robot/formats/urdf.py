@@ -184,12 +184,8 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
             f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value",
         )
     if joint_names and (absent := [name for name in joint_names if name not in actuated]):
-        held = ", ".join(actuated)
-        refuse_robot(
-            tree.where,
-            f"joint '{absent[0]}' is not between '{base}' and '{tip}'{suggestion(absent[0], actuated)} "
-            f"(found there: {held})",
-        )
+        there = f"{suggestion(absent[0], actuated)} (found there: {', '.join(actuated)})"
+        refuse_robot(tree.where, f"joint '{absent[0]}' is not between '{base}' and '{tip}'{there}")
 
 
 def _longest(tree: UrdfTree, base: str) -> str:
