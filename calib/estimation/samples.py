@@ -88,112 +88,61 @@ def stack(
     return Samples(named.names, named.units, matrix, target, present)
 
 
-def gls(data: Samples, noise: np.ndarray | None = None, inflation: float = 1.0) -> SampleFit:
-    """Estimate x = argmin Σ_k e_kᵀ S⁻¹ e_k, rows whitened by the Cholesky factor of S (Aitken 1935).
+def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np.ndarray] | None = None) -> SampleFit:
+    """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
+
+    S, weights and x alternate until x moves by less than 1e-4 of its standard deviation. Starts from a row-wise Cauchy
+    fit with median spreads, because a covariance estimated from all samples would hide the outliers that made it. The
+    covariance of x is that of the M-estimator, `robust.variance_factor`.
 
     Args:
         data: the samples.
-        noise: (n, n) S in units of y; None: estimated from the residuals and iterated (Zellner 1962).
         inflation: >= 1, see `linear`; one number for all joints.
-    """
-    return _iterate(data, by_joint(data), "none", None, noise, inflation)
-
-
-def irls(
-    data: Samples,
-    loss: str = "huber",
-    gate: float | None = 0.999,
-    noise: np.ndarray | None = None,
-    inflation: float = 1.0,
-    solve: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> SampleFit:
-    """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
-
-    Starts from a row-wise Cauchy fit with median spreads, because a covariance estimated from all samples would hide
-    the outliers that made it. The covariance of x is that of the M-estimator, `robust.variance_factor`.
-
-    Args:
-        data, noise, inflation: as in `gls`.
-        loss: one of `robust.LOSSES`.
-        gate: probability of a good sample to stay in; None: no gate.
         solve: triangle [R z; 0 ρ] of a round -> its x (p,); None: that of least squares. Other functions keep x within
             constraints; the covariance ignores these.
     """
-    return _iterate(data, row_irls(data), loss, gate, noise, inflation, solve)
+    start = row_irls(data)
+    left = np.sqrt(_share_left(data, start.group_std))
+    covariance, values = np.diag(start.group_std**2), start.estimate.values
+    for _ in range(ROUNDS):
+        residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
+        size = _sizes(residual, covariance, data.present)
+        weights = robust.weigh(size, data.joints)
+        covariance = _scatter(data, residual, weights * _consistent(data), weights)
+        factor, last = _factor(data, covariance, weights), values
+        values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
+        if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
+            return _pack(data, values, covariance, size, weights, factor, inflation)
+    raise NotConverged("the weights of the samples do not converge", values)
 
 
-def by_joint(data: Samples) -> LinearFit:
-    """Estimate x by WLS with one converged variance per joint: `linear.wls` of the samples' rows."""
-    return wls(_triangles(data, np.ones(data.target.shape)))
-
-
-def row_irls(data: Samples, loss: str = "cauchy") -> LinearFit:
-    """Estimate x with one weight per row, w(|ρ| / σ_j), σ_j = 1.4826 · median |ρ| of joint j.
+def row_irls(data: Samples) -> LinearFit:
+    """Estimate x with one Cauchy weight per row, w(|ρ| / σ_j), σ_j = 1.4826 · median |ρ| of joint j.
 
     For outliers that hit single joints. Its covariance is that of weighted rows, without the M-estimator's factor.
-
-    Args:
-        data: the samples.
-        loss: one of `robust.LOSSES`.
     """
     weights = np.ones(data.target.shape)
     values = wls(_triangles(data, weights), _spreads(data, data.target)).estimate.values
     for _ in range(ROUNDS):
         residual = data.target - data.matrix @ values
         std = _spreads(data, residual)
-        fit = wls(_triangles(data, robust.weights(np.abs(residual) / std, loss)), std)
+        fit = wls(_triangles(data, robust.weights(np.abs(residual) / std, "cauchy")), std)
         step, values = fit.estimate.values - values, fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
             return LinearFit(fit.estimate, std, fit.condition, fit.condition_normalised)
-    raise NotConverged("the weights of the rows do not converge; try the Huber loss", values)
-
-
-@dataclass(frozen=True)
-class _Weighing:
-    """Weighing of samples: loss, gate, and whether S is stated."""
-
-    loss: str
-    gate: float | None
-    stated: bool
-
-    @property
-    def robust(self) -> bool:
-        return self.loss != "none" or self.gate is not None
-
-
-def _iterate(
-    data: Samples, start: LinearFit, loss: str, gate: float | None, noise: np.ndarray | None, inflation: float,
-    solve: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> SampleFit:  # fmt: skip
-    """Alternate S, weights and x until x moves by less than 1e-4 of its standard deviation."""
-    how, std = _Weighing(loss, gate, noise is not None), start.group_std
-    left = np.sqrt(_share_left(data, std))
-    covariance = np.diag(std**2) if noise is None else shaped(noise, (len(std),) * 2, "noise covariance")
-    values = start.estimate.values
-    for _ in range(ROUNDS):
-        residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
-        size = _sizes(residual, covariance, data.present)
-        weights = robust.weigh(size, data.joints, loss, gate)
-        if not how.stated:
-            covariance = _scatter(data, residual, weights * _consistent(data, how), weights)
-        factor, last = _factor(data, covariance, weights), values
-        values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
-        if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
-            return _pack(data, how, values, covariance, size, weights, factor, inflation)
-    raise NotConverged("the weights of the samples do not converge; try the other loss or a wider gate", values)
+    raise NotConverged("the weights of the rows do not converge", values)
 
 
 def _pack(
-    data: Samples, how: _Weighing, values: np.ndarray, noise: np.ndarray, size: np.ndarray, weights: np.ndarray,
-    factor: np.ndarray, inflation: float,
+    data: Samples, values: np.ndarray, noise: np.ndarray, size: np.ndarray, weights: np.ndarray, factor: np.ndarray,
+    inflation: float,
 ) -> SampleFit:  # fmt: skip
     """Return the fit with the covariance of the chosen estimator."""
     _, inverse, conditions = solve_triangle(factor, data.names)
-    variance = robust.variance_factor(size, data.joints, how.loss, how.gate) if how.robust else 1.0
-    squares = np.sum(weights * _consistent(data, how) * size**2)
+    squares = np.sum(weights * _consistent(data) * size**2)
     dof = int(data.joints[weights > 0.0].sum() / inflation) - len(values)
     residual_std = float(np.sqrt(squares / np.sum(weights * data.joints)))
-    covariance = variance * inflation * inverse @ inverse.T
+    covariance = robust.variance_factor(size, data.joints) * inflation * inverse @ inverse.T
     estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
     outliers = (weights == 0.0) & (data.joints > 0)
     fit = LinearFit(estimate, np.sqrt(np.diag(noise)), *conditions)
@@ -260,9 +209,9 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
     return np.maximum(1.0 - taken / np.maximum(triangles.rows, 1), 1e-3)
 
 
-def _consistent(data: Samples, how: _Weighing) -> np.ndarray:
+def _consistent(data: Samples) -> np.ndarray:
     """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
-    each = [robust.consistency(n, how.loss, how.gate) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    each = [robust.consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
     return np.array(each)[data.joints]
 
 

@@ -361,15 +361,10 @@ def _cross_validation(
     ]
     data, prior = triangulate(rows), candidates.prior
     base = data.parameters - len(every)
-    group, place, start, number = np.full(data.parameters, -1), {}, base, 0
-    for name, terms in offered.items():
-        place[name] = list(range(start, start + len(terms)))
-        for k, one in enumerate(terms):
-            if k and _joints(one) != _joints(terms[k - 1]):
-                number += 1
-            group[start + k] = number
-        start += len(terms)
-        number += 1
+    kinds = [(name, _joints(one)) for name, terms in offered.items() for one in terms]
+    steps = np.cumsum([one != other for one, other in pairwise(kinds[:1] + kinds)])  # a ridge per step and joints
+    group = np.concatenate([np.full(base, -1), steps]).astype(int)
+    place = {own: [base + k for k, (name, _) in enumerate(kinds) if name == own] for own in offered}
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
     return CrossValidation(
         data,
