@@ -164,7 +164,6 @@ def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"gains": [10, 1111111111111111111111111]}, None),
         ({"gains": [10, 0]}, "gains: expected finite numbers other than zero"),
         ({"filter": {"order": 2.0}}, "filter.order: expected a whole number from 1 to 12, found 2.0"),
         ({"recording": {"names": {"torqe": "x"}}}, "names: 'torqe' is not a known name .did you mean 'torque'"),
@@ -180,10 +179,7 @@ def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
         ({"gain_identification": {"loaded": "a"}}, "there is no 'unloaded'; needed are unloaded, loaded"),
     ],
 )
-def test_identify_options_that_cannot_be(table: dict[str, Any], words: str | None) -> None:
-    if words is None:
-        assert identify_options.parse_options(table).every.gains == (10.0, 1111111111111111111111111.0)
-        return
+def test_identify_options_that_cannot_be(table: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         identify_options.parse_options(table)
 
@@ -194,6 +190,7 @@ def test_what_holds_for_every_recording_is_handed_down_to_one() -> None:
     own = found.file_settings("x/a.npz")
     assert (own.filter.band, own.filter.order, own.gains, own.payload) == (7.0, 2, (1.0,), ())
     assert found.file_settings("b.npz").filter.band == 5.0
+    assert identify_options.parse_options({"gains": [10, 10**25]}).every.gains == (10.0, 1e25)
 
 
 @FEW

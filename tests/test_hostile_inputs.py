@@ -17,20 +17,8 @@ from calib.robot.kinematics import forward
 FIT = ("fit", "arm.urdf", "m.csv", "--model", "frames", "--out", "o")
 IDENTIFY = ("identify", "arm.toml", "l.npz", "--friction", "standard", "--out", "o")
 BAG = ("identify", "arm.toml", "bag", "--out", "o")
-SELECT = (
-    "select",
-    "arm.urdf",
-    "-m",
-    "6",
-    "--candidates",
-    "20",
-    "--method",
-    "detmax",
-    "--kind",
-    "position",
-    "--out",
-    "o.csv",
-)
+FEW = ("-m", "6", "--candidates", "20", "--method", "detmax")
+SELECT = ("select", "arm.urdf", *FEW, "--kind", "position", "--out", "o.csv")
 Spoil = Callable[[Path], object]
 
 

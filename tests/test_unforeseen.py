@@ -25,6 +25,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (KeyError("axis"), 4, "internal error: KeyError: 'axis'; a bug report was written: calib-bug-"),
         (PermissionError(13, "Permission denied", "/x/y.csv"), 2, "/x/y.csv: Permission denied"),
+        (OSError(28, "No space left on device"), 2, "No space left"),
         (MemoryError("Unable to allocate 373. GiB"), 2, "Unable to allocate 373. GiB"),
         (BrokenPipeError(32, "Broken pipe"), 141, ""),
     ],
@@ -63,11 +64,6 @@ def test_debug_shows_the_traceback(monkeypatch) -> None:
 @pytest.mark.parametrize("word", ["", "m\udcff.csv"])
 def test_a_word_that_is_empty_or_no_utf8_is_refused(word, capsys) -> None:
     assert cli.run(["formats", word]) == 2 and "formats" in capsys.readouterr().err
-
-
-def test_a_full_disk_is_no_bug(monkeypatch, capsys) -> None:
-    monkeypatch.setattr("calib.procedure.formats.describe", failing(OSError(28, "No space left on device")))
-    assert cli.run(["formats", "mdh"]) == 2 and "No space left" in capsys.readouterr().err
 
 
 def test_warnings_of_others_are_kept_and_ours_pass() -> None:

@@ -90,6 +90,10 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.ExcitationSettings(goals=("foo=3",)), "goal 'foo=3': 'foo' is unknown; use raw"),
         (lambda: calib.ExcitationSettings(hard=("logdet",)), "goal 'logdet': expected NAME=NUMBER"),
         (lambda: calib.load(""), "the robot's name is empty"),
+        (lambda: calib.FitSettings(holdout=1.5), "holdout: expected a share"),
+        (lambda: calib.FitSettings(model="geometri"), "model: expected one of"),
+        (lambda: calib.SelectionSettings(index="O9"), "O9"),
+        (lambda: calib.ExcitationSettings(period=-1.0), "period"),
     ],
 )
 def test_an_argument_of_another_type_is_refused_by_its_name(call, words):
@@ -148,7 +152,9 @@ def test_a_fit_is_what_the_command_writes(fitted, cell, tmp_path, capsys):
 
 def test_measurements_and_robots_in_memory_are_the_same(fitted, cell):
     robot = calib.load("ur5")
-    again = calib.fit_geometry(robot, calib.read_poses(cell / "measured.csv", robot), fitted.settings)
+    blocks = calib.read_poses(cell / "measured.csv", robot)
+    assert len(blocks[0]) == len(calib.read_poses(cell / "measured.csv", "ur5")[0]) == 60
+    again = calib.fit_geometry(robot, blocks, fitted.settings)
     np.testing.assert_array_equal(again.estimate.values, fitted.estimate.values)
     np.testing.assert_array_equal(again.robot.covariance, fitted.robot.covariance)
 
@@ -182,6 +188,7 @@ def test_what_readers_return_may_stand_among_files(fitted, cell):
 def test_a_robot_prints_as_a_short_table(fitted):
     lines = str(fitted.robot).splitlines()
     assert len(lines) == 8 and "calibrated" in lines[0] and " revolute [rad] " in lines[2]
+    assert len(repr(fitted)) < 120 and "ur5" in repr(fitted)
     assert repr(calib.load("ur5")).startswith("<CalibratedChain ur5: 6 joints, nominal geometry")
 
 
@@ -293,26 +300,6 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
     assert (made / "2-poses/poses.csv").read_bytes() == (tmp_path / "command/2-poses/poses.csv").read_bytes()
     with pytest.raises(calib.CalibError, match="given twice"):
         calib.run_sessions(["script", "script/session.toml"])
-
-
-def test_wrong_settings_are_refused_where_they_are_made():
-    with pytest.raises(calib.CalibError, match="holdout: expected a share"):
-        calib.FitSettings(holdout=1.5)
-    with pytest.raises(calib.CalibError, match="model: expected one of"):
-        calib.FitSettings(model="geometri")
-
-
-def test_what_the_search_packages_refuse_is_a_calib_error():
-    """``poses`` and ``trajectories`` raise errors of their own; a script needs only one `except`."""
-    with pytest.raises(calib.CalibError, match="O9"):
-        calib.select_poses("ur5", 5, calib.SelectionSettings(index="O9"))
-    with pytest.raises(calib.CalibError):
-        calib.design_excitation("tx40", calib.ExcitationSettings(period=-1.0))
-
-
-def test_results_have_a_short_representation_and_readers_take_names(fitted, cell):
-    assert len(repr(fitted)) < 120 and "ur5" in repr(fitted)
-    assert len(calib.read_poses(cell / "measured.csv", "ur5")[0]) == 60
 
 
 def test_poses_chosen_without_constraints_say_what_they_keep_and_what_is_not_checked():

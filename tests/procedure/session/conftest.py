@@ -2,7 +2,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from sessions import begin, edit, go_on
+from sessions import begin, copy_of, edit, go_on
 
 from calib.procedure.session.folder import Session, open_session
 from calib.rooms.cells import demo
@@ -31,19 +31,10 @@ def finished_folder(planned_folder: Path, tmp_path_factory: pytest.TempPathFacto
     return folder
 
 
-@pytest.fixture
-def planned(planned_folder: Path, tmp_path: Path) -> Session:
-    shutil.copytree(planned_folder, tmp_path / "cell")
-    return open_session(tmp_path / "cell")
+planned, finished = copy_of("planned_folder"), copy_of("finished_folder")
 
 
 @pytest.fixture
 def measured(planned: Session) -> Session:
     demo.simulate_measurements(planned, virtual_cell("lwr4plus"), 1)
     return planned
-
-
-@pytest.fixture
-def finished(finished_folder: Path, tmp_path: Path) -> Session:
-    shutil.copytree(finished_folder, tmp_path / "cell")
-    return open_session(tmp_path / "cell")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sessions import begin, edit, go_on
+from sessions import begin, copy_of, edit, go_on, kinds
 
 from calib import cli
 from calib.errors import MeasurementError
@@ -20,10 +20,6 @@ from calib.rooms.cells.truth import torque_errors
 from calib.rooms.cells.virtual_cells import virtual_cell
 
 QUICK = {"period": 6.0, "harmonics": 5, "starts": 1, "evaluations": 100, "repeats": 2, "rate": 250.0}
-
-
-def kinds(session: Session) -> dict[str, str]:
-    return {state.step.name: state.kind for state in steps.states(open_session(session.folder))}
 
 
 @pytest.fixture(scope="module")
@@ -59,22 +55,7 @@ def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory
     return folder
 
 
-@pytest.fixture
-def waiting(waiting_folder: Path, tmp_path: Path) -> Session:
-    shutil.copytree(waiting_folder, tmp_path / "cell")
-    return open_session(tmp_path / "cell")
-
-
-@pytest.fixture
-def recorded(recorded_folder: Path, tmp_path: Path) -> Session:
-    shutil.copytree(recorded_folder, tmp_path / "cell")
-    return open_session(tmp_path / "cell")
-
-
-@pytest.fixture
-def whole(whole_folder: Path, tmp_path: Path) -> Session:
-    shutil.copytree(whole_folder, tmp_path / "cell")
-    return open_session(tmp_path / "cell")
+waiting, recorded, whole = (copy_of(f"{name}_folder") for name in ("waiting", "recorded", "whole"))
 
 
 def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from both_ways import same
-from sessions import go_on
+from sessions import go_on, kinds
 from without_figures import run
 
 from calib.procedure.session import steps
@@ -26,18 +26,14 @@ def cell(tmp_path: Path) -> Path:
     return tmp_path / "cell"
 
 
-def _standing(cell: Path) -> dict[str, str]:
-    return {state.step.name: state.kind for state in steps.states(open_session(cell))}
-
-
 def test_an_older_session_stands_where_it_stood_and_goes_on(cell: Path) -> None:
-    standing = _standing(cell)
+    standing = kinds(open_session(cell))
     assert set(list(standing.values())[:-2]) == {steps.DONE}, "nothing is made again"
     assert list(standing)[-2:] == ["export", "certificate"]
     before = (cell / "8-dynamics/metrics.json").read_bytes()
     session = open_session(cell)
     assert go_on(session) is None
-    assert set(_standing(cell).values()) == {steps.DONE}
+    assert set(kinds(open_session(cell)).values()) == {steps.DONE}
     assert (cell / "8-dynamics/metrics.json").read_bytes() == before
     assert "0.038 mm" in (cell / "certificate.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
     assert {half: one.level for half, one in session.verdicts().stages.items()} == {

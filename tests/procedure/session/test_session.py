@@ -9,7 +9,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from sessions import edit, go_on, quiet
+from sessions import edit, go_on, kinds, quiet
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
@@ -18,10 +18,6 @@ from calib.procedure.session import certificate, commands, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.formats.urdf_tree import with_comment
 from calib.robot.library import load
-
-
-def kinds(session: Session) -> dict[str, str]:
-    return {state.step.name: state.kind for state in steps.states(open_session(session.folder))}
 
 
 def words(session: Session, name: str) -> str:
