@@ -340,14 +340,6 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Filled:
-    """A non-empty list of tables."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return {**handler(source), "min_length": 1}
-
-
-@dataclass(frozen=True)
 class Hidden:
     """A field that files cannot set: its name is an unknown key."""
 

@@ -5,8 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.options import command
-from calib.cli.shared import Out, Seed, check_destination, progress, say, say_written
+from calib.cli.shared import Out, Seed, check_destination, command, progress, say, say_written
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
 
 app = typer.Typer()

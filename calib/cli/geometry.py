@@ -5,8 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.options import command
-from calib.cli.shared import Out, Seed, check_destination, exit_failed, numbers, progress, say, say_written
+from calib.cli.shared import Out, Seed, check_destination, command, exit_failed, numbers, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 
 app = typer.Typer()

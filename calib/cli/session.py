@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.options import command
-from calib.cli.shared import Seed, exit_failed, reporting, say
+from calib.cli.shared import Seed, command, exit_failed, reporting, say
 from calib.errors import CalibError, UsageError, command_line, require
 from calib.procedure.session.answers import Answers
 

@@ -4,8 +4,7 @@ import typer
 from rich.table import Table
 
 from calib.cli import _command
-from calib.cli.options import command
-from calib.cli.shared import MAX_LINES, say
+from calib.cli.shared import MAX_LINES, command, say
 
 LISTINGS = {"formats", "explain"}  # what they print is what was asked for
 

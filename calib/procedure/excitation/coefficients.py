@@ -23,9 +23,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MinLen
 
 from calib.config import parse, read_toml
-from calib.config_types import Expect, Filled, Name, OneOf, Positive, Real, Whole
+from calib.config_types import Expect, Name, OneOf, Positive, Real, Whole
 from calib.errors import UsageError, require
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
@@ -57,7 +58,7 @@ class TrajectoryFile:
     family: Annotated[str, OneOf(("fourier", "bspline"))]
     period: Positive
     rate: Positive
-    joint: Annotated[tuple[_JointTable, ...], Filled()]
+    joint: Annotated[tuple[_JointTable, ...], MinLen(1)]
     repeat: Annotated[int, Whole(1)] = 1
     degree: Annotated[int, Whole(1, 20)] = 5
 

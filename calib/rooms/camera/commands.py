@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.options import command
-from calib.cli.shared import Out, progress, say
+from calib.cli.shared import Out, command, progress, say
 
 app = typer.Typer()
 Millimetres = typer.Option(metavar="MM")

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import typer
 
-from calib.cli.options import command
-from calib.cli.shared import Seed, exit_failed, reporting
+from calib.cli.shared import Seed, command, exit_failed, reporting
 from calib.errors import command_line
 
 app = typer.Typer()

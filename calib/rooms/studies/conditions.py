@@ -44,8 +44,10 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
+from annotated_types import MinLen
+
 from calib.config import parse, read_toml, strict
-from calib.config_types import Filled, Name, OneOf, Real, Spread, Text, Whole
+from calib.config_types import Name, OneOf, Real, Spread, Text, Whole
 from calib.errors import UsageError, require, suggestion
 from calib.identification.methods.registry import METHODS, method_named
 
@@ -83,7 +85,7 @@ class StudyFile:
     """The content of a study file; see the module for the keys."""
 
     name: Name
-    noise: Annotated[tuple[Noise, ...], Filled()]
+    noise: Annotated[tuple[Noise, ...], MinLen(1)]
     robot: Robots
     about: Text = ""
     decimation: Wholes = (1,)

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.options import command
-from calib.cli.shared import say
+from calib.cli.shared import command, say
 from calib.errors import UsageError, command_line
 
 app = typer.Typer()
