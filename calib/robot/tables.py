@@ -103,17 +103,13 @@ def finite_limits(joint: Any) -> dict[str, float]:
     return {key: value for key in LIMITS if np.isfinite(value := getattr(joint, key))}
 
 
-def _plain(value: Any) -> Any:
-    """Return `value` with arrays and tuples as lists, numpy numbers as Python numbers, tables without None."""
+def _stated(value: Any) -> Any:
+    """Return plain values without the keys of tables that are None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    return value.item() if isinstance(value, np.generic) else value
+        return {str(key): _stated(entry) for key, entry in value.items() if entry is not None}
+    return [_stated(entry) for entry in value] if isinstance(value, list) else value
 
 
 def dumps(table: Mapping[str, Any]) -> str:
     """Return a table as TOML text, with floats in full precision (repr)."""
-    return tomlkit.dumps(_plain(table))
+    return tomlkit.dumps(_stated(config.plain_values(table)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from calib.data.signals.filtering import factor_for
+from calib.data.signals.filtering import factor_for, longest
 from calib.data.signals.resampling import Resampled
 from calib.errors import refuse_data
 from calib.records import frozen
@@ -54,11 +54,9 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     Args:
         dynamics: f_dyn if known [Hz] (the bandwidth of the position loop); else estimated from the data.
     """
-    longest = np.bincount(sampled.segment).argmax()
-    start, stop = (int(i) for i in np.searchsorted(sampled.segment, [longest, longest + 1]))
-    own = slice(start, stop)
+    own = longest(sampled.segment)
     window_length = 4.0  # length of the spectra's windows [s]
-    size = min(stop - start, max(64, int(window_length * sampled.rate)))
+    size = min(own.stop - own.start, max(64, int(window_length * sampled.rate)))
     f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
     active = _active(sampled.series["q"][own])

@@ -72,20 +72,28 @@ def factor_for(rate: float, band: float) -> int:
 
 def kept(segment: np.ndarray, decimator: Decimator) -> np.ndarray:
     """Return the indices (M,) of the samples that `decimate` keeps, given rising segment numbers (N,)."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
     h, r = decimator.reach, decimator.factor
-    parts = [np.arange(a + h, b - h, r) for a, b in pairwise(edges)]
-    return np.concatenate(parts)
+    return np.concatenate([np.arange(own.start + h, own.stop - h, r) for own in segments(segment)])
+
+
+def segments(segment: np.ndarray) -> list[slice]:
+    """Return the slices of the samples with the same segment number, given rising numbers (N,)."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
+    return [slice(int(start), int(stop)) for start, stop in pairwise(edges)]
+
+
+def longest(segment: np.ndarray) -> slice:
+    """Return the slice of the longest segment, given rising segment numbers (N,)."""
+    return max(segments(segment), key=lambda own: own.stop - own.start)
 
 
 def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | None = None) -> np.ndarray:
     """Return `values` (N, ...) filtered and decimated to the samples `kept` (M, ...), segment by segment."""
     values = np.asarray(values, dtype=float)
     segment = np.zeros(len(values), dtype=int) if segment is None else segment
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
     parts = [np.empty((0, *values.shape[1:]))]
-    for a, b in pairwise(edges):
-        parts += [np.moveaxis(part, -1, 0) for part in decimate_blocks([np.moveaxis(values[a:b], 0, -1)], decimator)]
+    for own in segments(segment):
+        parts += [np.moveaxis(part, -1, 0) for part in decimate_blocks([np.moveaxis(values[own], 0, -1)], decimator)]
     return np.concatenate(parts)
 
 

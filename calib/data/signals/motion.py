@@ -7,7 +7,7 @@ recorded (on the even grid): what filters them is the parallel decimation, which
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -129,10 +129,8 @@ class Motion:
 
     def in_band(self, values: np.ndarray) -> np.ndarray:
         """Return `values` (N, ...) low-passed to the identification band, at the full rate, segment by segment."""
-        parts = [
-            filtering.low_pass(values[self.segment == i], self.rate, min(self.band, USABLE * self.rate / 2))
-            for i in np.unique(self.segment)
-        ]
+        cutoff = min(self.band, USABLE * self.rate / 2)
+        parts = [filtering.low_pass(values[own], self.rate, cutoff) for own in filtering.segments(self.segment)]
         return np.concatenate(parts)
 
     def standstill(self, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
@@ -275,7 +273,7 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
     """Return the positions (N, n) low-passed at each joint's cut-off (n,) [Hz], segment by segment."""
     result = np.array(sampled.series["q"])
-    for own, (j, f) in product(_segments(sampled), enumerate(cutoff)):
+    for own, (j, f) in product(filtering.segments(sampled.segment), enumerate(cutoff)):
         result[own, j] = filtering.low_pass(result[own, j], sampled.rate, float(f), order)
     return result
 
@@ -284,7 +282,7 @@ def _differences(
     of: Callable[[np.ndarray, float, int], np.ndarray], q: np.ndarray, sampled: Resampled, width: int
 ) -> np.ndarray:
     """Return slopes or curvatures (N, n) of q (N, n), segment by segment."""
-    return np.concatenate([of(q[own], sampled.rate, width) for own in _segments(sampled)])
+    return np.concatenate([of(q[own], sampled.rate, width) for own in filtering.segments(sampled.segment)])
 
 
 def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
@@ -293,18 +291,13 @@ def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file
     edge = filtering.border(sampled.rate, float(cutoff.min()))
     edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))
     edge = max(edge, options.width)
-    for own in _segments(sampled):
+    for own in filtering.segments(sampled.segment):
         inside[own.start + edge : max(own.start + edge, own.stop - edge)] = True
     if not inside.any():
         why = "the filters' ends" if options.borders is None else f"borders = {options.borders:g}"
         message = f"no part without a gap is longer than {2 * edge / sampled.rate:.3g} s, the part removed by {why}"
         refuse_data(file, f"{message}: record longer, or lower the borders")
     return inside
-
-
-def _segments(sampled: Resampled) -> list[slice]:
-    edges = np.searchsorted(sampled.segment, np.append(np.unique(sampled.segment), np.inf))
-    return [slice(int(start), int(stop)) for start, stop in pairwise(edges)]
 
 
 def _span(mask: np.ndarray) -> np.ndarray | slice:

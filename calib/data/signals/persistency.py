@@ -7,6 +7,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.spatial import KDTree
 
+from calib.data.signals.filtering import longest
 from calib.data.signals.motion import Motion
 from calib.errors import listing
 
@@ -37,12 +38,11 @@ def report_excitation(motion: Motion) -> ExcitationReport:
 
     One frequency cannot separate inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
     """
-    longest = int(np.bincount(motion.segment).argmax())
-    start, stop = (int(i) for i in np.searchsorted(motion.segment, [longest, longest + 1]))
+    own = longest(motion.segment)
     # samples beyond which positions are thinned to what their own low-pass filter left: four times f_q
     max_samples = 100_000
-    thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > max_samples else 1
-    q = motion.q[start:stop:thin] - motion.q[start:stop:thin].mean(axis=0)
+    thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if own.stop - own.start > max_samples else 1
+    q = motion.q[own][::thin] - motion.q[own][::thin].mean(axis=0)
     still = np.ptp(q, axis=0) < MIN_TRAVEL
     unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
     singular = np.linalg.svd(unit[:: max(1, len(unit) // MAX_STATES)], compute_uv=False)

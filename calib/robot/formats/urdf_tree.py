@@ -263,7 +263,7 @@ def read(source: str, where: str) -> UrdfTree:
         refuse_robot(f"{where}, line {root.line}", f"the root element is <{root.tag}>, a URDF has <robot>")
     if macro := next((node for node in root.children if _is_macro(node)), None):
         refuse_robot(f"{where}, line {macro.line}", f"found <{macro.tag}>: this is a xacro file; {XACRO}")
-    bodies = {}
+    bodies: dict[str, np.ndarray | None] = {}
     for node in root.all("link"):
         name = _fresh(node, bodies, where)
         bodies[name] = _body(node, where)
@@ -341,18 +341,9 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     place = f"{where}, line {node.line}, joint '{name}'"
     if kind not in KINDS:
         refuse_robot(place, f"type '{kind}' is not one of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
-    ends = [_end(node, role, links, place) for role in ("parent", "child")]
-    return JointTag(
-        name=name,
-        kind=kind,
-        parent=ends[0],
-        child=ends[1],
-        origin=origin(node, place),
-        axis=_axis(node, kind, place),
-        mimic=_mimic(node, place),
-        limits=_limits(node, kind, place),
-        node=node,
-    )
+    parent, child = (_end(node, role, links, place) for role in ("parent", "child"))
+    axis, limits = _axis(node, kind, place), _limits(node, kind, place)
+    return JointTag(name, kind, parent, child, origin(node, place), axis, _mimic(node, place), limits, node)
 
 
 def _end(node: Node, role: str, links: Iterable[str], place: str) -> str:
