@@ -11,30 +11,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from calib import files
+from calib import files, folders
 from calib.errors import UsageError, refused_as
-from calib.folders import (
-    CERTIFICATE,
-    COVARIANCE,
-    ESTIMATE,
-    METRICS,
-    REPORT,
-    InFolder,
-    check_target,
-    write_covariance,
-    write_staged,
-)
+from calib.folders import CERTIFICATE, COVARIANCE, ESTIMATE, METRICS, REPORT, InFolder
 from calib.geometry import installation
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
+from calib.procedure.kinematic_stage import tables
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
-from calib.procedure.kinematic_stage.validation import Arms, Assessment, write_errors
+from calib.procedure.kinematic_stage.validation import Arms, Assessment
 from calib.records import read_json, read_record, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
@@ -92,7 +82,7 @@ class FitFolder:
         chosen = replace(settings, loss=found.loss or settings.loss)
         if found.discrepancy is not None:
             learnt = np.concatenate([block.q for block in inputs.fit])
-            expected = ErrorModel(cell, *read_covariance(self.path, cell), learnt, found.discrepancy)
+            expected = ErrorModel(cell, *tables.read_covariance(self.path, cell), learnt, found.discrepancy)
         start = install(inputs.chain, inputs.fit, inputs.known)
         nominal = polish_frames(start, inputs.fit, chosen).cell
         return Arms(nominal, cell, calibrated.read(self.path).chain, expected)
@@ -120,7 +110,7 @@ class ValidationFolder:
 
     def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Any]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return the metrics."""
-        write_errors(self.errors, inputs.chain, found.validation)
+        tables.write_errors(self.errors, inputs.chain, found.validation)
         files.write_json(self.rows, rows)
         files.write_json(self.judged, found.record)
         return found.record
@@ -154,7 +144,7 @@ def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
     """Refuse, before any work is done, a folder that is not for a fit, or that contains one of its inputs."""
-    check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
+    folders.check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
 def write_folder(
@@ -169,7 +159,7 @@ def write_folder(
         if plots is not None:
             plots(outcome, folder)
 
-    return write_staged(out, OURS, write)
+    return folders.write_staged(out, OURS, write)
 
 
 def _write_all(outcome: Outcome, folder: Path) -> None:
@@ -185,10 +175,10 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
             urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
         else:
             files.write(folder / name, urdf_write.write_new(geometry))
-    table = estimate_table(fit, outcome.selection.nominal.cell)
-    files.write_table(folder / ESTIMATE, HEADER, table.rows())
-    write_covariance(folder / COVARIANCE, table.names, table.covariance)
-    write_residuals(outcome, folder / RESIDUALS)
+    table = tables.estimate_table(fit, outcome.selection.nominal.cell)
+    files.write_table(folder / ESTIMATE, tables.HEADER, table.rows())
+    folders.write_covariance(folder / COVARIANCE, table.names, table.covariance)
+    tables.write_residuals(outcome, folder / RESIDUALS)
     files.write_json(folder / METRICS, metrics(outcome))
 
 

@@ -17,11 +17,9 @@ from calib.errors import UsageError, require
 from calib.geometry.observability import Observation, observation, targets_of
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
+from calib.procedure.measuring import prediction as forecast
 from calib.procedure.measuring.pose_limits import Limits, read_limits
-from calib.procedure.measuring.prediction import Prediction, SelectionPrediction, beside, by_count
-from calib.procedure.measuring.prediction import predicted as foretold
-from calib.procedure.measuring.prediction import table as outlook_table
-from calib.procedure.measuring.prediction import write as write_prediction
+from calib.procedure.measuring.prediction import Prediction, SelectionPrediction
 from calib.procedure.measuring.run import Drivable, Exchange, Run, RunSettings, drivable
 from calib.procedure.measuring.run import lines as ways
 from calib.procedure.robot_kinds import joints_of
@@ -221,19 +219,21 @@ def _outlook(
     past = [] if before is None else [before]
 
     def known(chosen: np.ndarray) -> Prediction:
-        return foretold(seen, np.concatenate([free.jacobian(chosen), *past]), typical, m)
+        return forecast.predicted(seen, np.concatenate([free.jacobian(chosen), *past]), typical, m)
 
     blind = None
     if limits.sight is not None:
         other = select_poses(None, m, replace(search, method="detmax", climbs=0), space=free, existing=before)
         blind = other.value, known(other.joints)
-    return PoseOutlook(known(q), by_count(seen, space.jacobian(candidates), typical, before), blind, comparable)
+    return PoseOutlook(
+        known(q), forecast.by_count(seen, space.jacobian(candidates), typical, before), blind, comparable
+    )
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
     """Return the files written next to a selection's CSV: the prediction, and figures by name."""
     figures = () if not plots else FIGURES if chosen is None else chosen.figures
-    predicted = {} if chosen is not None and chosen.prediction is None else {"prediction": beside(out)}
+    predicted = {} if chosen is not None and chosen.prediction is None else {"prediction": forecast.beside(out)}
     return predicted | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
 
 
@@ -245,9 +245,9 @@ def targets(out: Path, plots: bool) -> files.Results:
 def write(chosen: Chosen, path: Path) -> Path:
     """Write the chosen poses to a CSV with the joints' names [rad or m], and their predicted accuracy next to it."""
     if chosen.prediction is not None:
-        write_prediction(chosen.prediction, path)
+        forecast.write(chosen.prediction, path)
     else:
-        beside(path).unlink(missing_ok=True)  # an earlier selection's
+        forecast.beside(path).unlink(missing_ok=True)  # an earlier selection's
     return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
 
 
@@ -293,7 +293,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
     """Return table rows of the predicted accuracy, and of the loss by line-of-sight constraints if there are any."""
-    rows = outlook_table(chosen.outlook.poses, chosen.outlook.others)
+    rows = forecast.table(chosen.outlook.poses, chosen.outlook.others)
     if chosen.outlook.blind is None:
         return rows
     (index, blind), one = chosen.outlook.blind, chosen.outlook.poses

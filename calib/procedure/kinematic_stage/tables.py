@@ -4,25 +4,32 @@ The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In t
 rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from calib import files, folders
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import UsageError
 from calib.geometry.accuracy import NATURE
 from calib.geometry.installation import Installation
-from calib.geometry.observation import layout, observe, prepare
+from calib.geometry.observation import layout, observe, predict, prepare
 from calib.geometry.residuals import inverse_right_jacobian
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.kinematic_stage.comparison import INTERVAL, Comparison, interval_cells
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.robot.calibrated import Deflection
-from calib.transforms import rotation_vector
+from calib.robot.chain import Chain
+from calib.transforms import invert, rotation_vector
 from calib.units import ERRORS
 
+PLACES = tuple(
+    f"{name} [{unit}]"
+    for head, unit in (("", "m"), ("to_nominal_", "mm"), ("to_calibrated_", "mm"))
+    for name in (f"{head}x", f"{head}y", f"{head}z")
+)
 HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd")
 
 
@@ -172,3 +179,34 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
             outlier = int((file, number) in named and label == "fit")
             result.append([label, file, number, station, tool, *row, weights.get(key), outlier, *next(stated)])
     return result
+
+
+def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
+    """Write the errors of both arms at every unseen row; for measured positions, with position and direction.
+
+    Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
+    puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.
+    """
+    rows: list[list[object]] = []
+    for name, each in validation.items():
+        q = np.concatenate([block.q for block in each.blocks])
+        numbers = [int(row) for block in each.blocks for row in block.rows]
+        sizes = [found.main for found in each.errors]
+        if len(sizes[0]) == len(q):
+            places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
+            cells = np.column_stack([q, *(1e3 * size for size in sizes), places, interval_cells(each)])
+            rows += [[name, number, *values] for number, values in zip(numbers, cells)]
+    joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
+    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
+
+
+def _places(found: Comparison, number: int) -> np.ndarray:
+    """Return measured position [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions."""
+    block = found.blocks[number]
+    if not isinstance(block, Positions):
+        return np.full((len(block), 9), np.nan)
+    ready = [prepare(cell, [block])[0] for cell in found.cells]
+    base = invert(found.cells[1].stations[ready[1].station])
+    ways = [1e3 * (predict(cell, one).point.T - block.position) for cell, one in zip(found.cells, ready)]
+    turn = base[:3, :3].T
+    return np.hstack([block.position @ turn + base[:3, 3], *(way @ turn for way in ways)])

@@ -12,29 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from calib import files
-from calib.data.poses.measurements import Positions
 from calib.errors import Finding, finding
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
-from calib.geometry.observation import predict, prepare
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict, catalogue, level_of, lines_of, sentence
-from calib.procedure.kinematic_stage.comparison import (
-    INTERVAL,
-    MARGIN,
-    Comparison,
-    compare,
-    compare_unseen,
-    interval_cells,
-)
+from calib.procedure.kinematic_stage.comparison import MARGIN, Comparison, compare, compare_unseen
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, ValidationMetrics
 from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.chain import Chain
-from calib.transforms import invert
 
 RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry explains the measurements
 
@@ -183,11 +172,6 @@ def _doubts(
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 OUTLIER_SIGMAS = 8.0  # our choice
 ARM = {"urdf": "URDF alone", "corrections": "with joint corrections"}
-PLACES = tuple(
-    f"{name} [{unit}]"
-    for head, unit in (("", "m"), ("to_nominal_", "mm"), ("to_calibrated_", "mm"))
-    for name in (f"{head}x", f"{head}y", f"{head}z")
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,34 +329,3 @@ def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
         yield finding("interval-coverage", file=name, **values)
         if beyond := int(found.beyond.sum()):
             yield finding("outside-fitted-range", file=name, beyond=beyond, poses=count, joints=found.joints)
-
-
-def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
-    """Write the errors of both arms at every unseen row; for measured positions, with position and direction.
-
-    Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
-    puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.
-    """
-    rows: list[list[object]] = []
-    for name, each in validation.items():
-        q = np.concatenate([block.q for block in each.blocks])
-        numbers = [int(row) for block in each.blocks for row in block.rows]
-        sizes = [found.main for found in each.errors]
-        if len(sizes[0]) == len(q):
-            places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
-            cells = np.column_stack([q, *(1e3 * size for size in sizes), places, interval_cells(each)])
-            rows += [[name, number, *values] for number, values in zip(numbers, cells)]
-    joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
-    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
-
-
-def _places(found: Comparison, number: int) -> np.ndarray:
-    """Return measured position [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions."""
-    block = found.blocks[number]
-    if not isinstance(block, Positions):
-        return np.full((len(block), 9), np.nan)
-    ready = [prepare(cell, [block])[0] for cell in found.cells]
-    base = invert(found.cells[1].stations[ready[1].station])
-    ways = [1e3 * (predict(cell, one).point.T - block.position) for cell, one in zip(found.cells, ready)]
-    turn = base[:3, :3].T
-    return np.hstack([block.position @ turn + base[:3, 3], *(way @ turn for way in ways)])

@@ -19,20 +19,8 @@ from calib.errors import RobotError, UsageError, listing, refused_as, require
 from calib.extensions import needed
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
-from calib.procedure.measuring.constraints_file import (
-    CELL,
-    DEFAULTS,
-    JOINT_MARGIN,
-    MARGIN,
-    MOTION,
-    VIEW_UNCHECKED,
-    CameraTable,
-    CollisionTable,
-    ConstraintsFile,
-    InstrumentTable,
-    TargetTable,
-    rising,
-)
+from calib.procedure.measuring import constraints_file
+from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.description import MAX_TURN, remarks
@@ -66,7 +54,7 @@ class Limits:
     constraints: tuple[PoseConstraint, ...] = ()
     notes: tuple[str, ...] = field(default=())
     collision: Any = None
-    clearance: float = MARGIN
+    clearance: float = constraints_file.MARGIN
     sight: Sight | None = None
     checked: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
@@ -113,9 +101,10 @@ def read_limits(
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
     """
-    if unknown := sorted(set(without) - {*DEFAULTS, *CELL}):
-        raise UsageError(f"without {unknown[0]}: there are {', '.join((*DEFAULTS, *CELL))}")
-    stated, where = read(ConstraintsFile, given, "constraints", MOTION)
+    known = (*constraints_file.DEFAULTS, *constraints_file.CELL)
+    if unknown := sorted(set(without) - {*known}):
+        raise UsageError(f"without {unknown[0]}: there are {', '.join(known)}")
+    stated, where = read(ConstraintsFile, given, "constraints", constraints_file.MOTION)
     limits = limits_of(stated, cell, source, where, without)
     if stated.camera is None:
         return limits
@@ -129,7 +118,8 @@ def _with_camera(
     """Return the limits with the camera's view of the board added, if camera and board are known."""
     unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     if stated.unknown:
-        return replace(limits, unchecked=(*unchecked, f"{VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"))
+        words = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(stated.unknown)})"
+        return replace(limits, unchecked=(*unchecked, words))
     with refused_as(UsageError, RobotError, "{}"):
         view = needed("camera_view")(stated, cell.chain, where, folder)
     arm = replace(view.cell, stations=np.eye(4)[None])
@@ -162,7 +152,7 @@ def limits_of(
         margin = 0.0 if "joint-margin" in absent else _joint_margin(stated.joints, where)
         lower, upper, wide = _joints(stated.joints, cell, where, margin)
         model, checked, notes = _collision(stated, cell, source, where, absent)
-        found = (*_target(stated.target, cell), *_orientation(stated, cell, where))
+        found = (*_target(stated, cell), *_orientation(stated, cell, where))
         sight = _sight(stated, cell, where, None if "view" in absent else model) if seen else None
     kept = (f"{100 * margin:g} % of each joint's range to its limits", *checked) if margin else checked
     if sight is not None:
@@ -192,7 +182,7 @@ def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[s
 
 
 def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
-    share = number(spans.get("margin", JOINT_MARGIN), f"{where}: joints.margin")
+    share = number(spans.get("margin", constraints_file.JOINT_MARGIN), f"{where}: joints.margin")
     if not 0.0 <= share < 0.5:
         raise UsageError(f"{where}: joints.margin: expected a share of the range from 0 to below 0.5, found {share:g}")
     return share
@@ -232,19 +222,19 @@ def _joints(
 def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, float]:
     low, high = (number(side, where, quantity) for side in value)
     with refused_as(UsageError, ValueError, "{}"):
-        rising((low, high), where)
+        constraints_file.rising((low, high), where)
     return low, high
 
 
-def _target(stated: TargetTable, cell: Installation) -> list[PoseConstraint]:
-    target, slope, result = Target(cell), TargetJacobian(cell), []
-    low, high = stated.heights
+def _target(stated: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
+    table, target, slope, result = stated.target, Target(cell), TargetJacobian(cell), []
+    low, high = table.heights
     if low is not None:
         result.append(constraints.height(target, low, np.inf if high is None else high, slope))
-    if stated.axis_distance is not None:
-        result.append(constraints.axis_distance(target, stated.axis_distance, slope))
-    if stated.reach is not None:
-        result.append(constraints.reach(target, stated.reach, jacobian=slope))
+    if table.axis_distance is not None:
+        result.append(constraints.axis_distance(target, table.axis_distance, slope))
+    if table.reach is not None:
+        result.append(constraints.reach(target, table.reach, jacobian=slope))
     return result
 
 
