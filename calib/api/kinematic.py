@@ -130,11 +130,11 @@ class GeometryFit(Judged, fit.Outcome):
             q: (m, n) joint values [rad or m].
             tool: which of the fit's tools.
         """
-        found, q, torque = self.selection.fit, *self._poses(q)
-        sigma = pose_sigmas(found.cell, q, found.free, found.estimate.covariance, torque, -1, tool)
+        found, poses = self.selection.fit, self._poses(q)
+        sigma = pose_sigmas(found.cell, poses, found.free, found.estimate.covariance, -1, tool)
         if self.expected is not None:
-            sigma[:, 0] = self.expected.position_sigma(q, torque, -1, tool)
-        return PredictedPoses(self.robot.forward(q, torque) @ found.cell.tools[tool], sigma)
+            sigma[:, 0] = self.expected.position_sigma(poses, -1, tool)
+        return PredictedPoses(self.robot.forward(poses.q, poses.torque) @ found.cell.tools[tool], sigma)
 
     @one_blas_thread()
     def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
@@ -152,14 +152,13 @@ class GeometryFit(Judged, fit.Outcome):
         """
         if self.expected is None:
             raise UsageError("no expected errors for this fit: at least 20 measured positions are needed")
-        q, torque = self._poses(q)
-        return self.expected.position_sigma(q, torque, tool=tool)
+        return self.expected.position_sigma(self._poses(q), tool=tool)
 
-    def _poses(self, q: Any) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return joint values as an array (m, n), and gravity torques (m, n) [N m] there if masses are known."""
+    def _poses(self, q: Any) -> PoseMeasurements:
+        """Return poses at joint values (m, n), with gravity torques (m, n) [N m] if masses are known."""
         chain = self.inputs.chain
         q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
-        return q, gravity_of(chain, q)
+        return PoseMeasurements(q, chain.joint_names, torque=gravity_of(chain, q))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

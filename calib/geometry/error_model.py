@@ -86,19 +86,16 @@ class ErrorModel:
     learnt: np.ndarray
     discrepancy: Discrepancy
 
-    def position_sigma(
-        self, q: np.ndarray, torque: np.ndarray | None = None, station: int = 0, tool: np.ndarray | int = 0
-    ) -> np.ndarray:
-        """Return the standard deviation of the tool position error (m,) [m], all axes together, at q (m, n) [rad or m].
+    def position_sigma(self, rows: PoseMeasurements, station: int = 0, tool: np.ndarray | int = 0) -> np.ndarray:
+        """Return the standard deviation of the tool position error (m,) [m], all axes together, at poses.
 
         Args:
-            q: joint values.
-            torque: (m, n) gravity torques [N m], for compliance terms.
+            rows: joint values (m, n), and gravity torques for compliance terms.
             station: index of the station of reference; -1 for the arm's base.
             tool: which of its tools, one or (m,).
         """
-        own = pose_sigmas(self.cell, q, self.free, self.covariance, torque, station, tool)[:, 0] ** 2
-        return self._sigma(own, q)
+        own = pose_sigmas(self.cell, rows, self.free, self.covariance, station, tool)[:, 0] ** 2
+        return self._sigma(own, rows.q)
 
     def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
         """Return `position_sigma` on measured rows (m,) [m].
@@ -111,7 +108,7 @@ class ErrorModel:
         """
         ready = prepare(cell, [block])[0]
         if not placed_anew:
-            return self.position_sigma(block.q, block.torque, ready.station, ready.tool)
+            return self.position_sigma(block, ready.station, ready.tool)
         own, now = layout(self.cell), layout(cell)
         kinds = np.array(own.kinds)[self.free]
         stays = ~np.isin(kinds, ("station", "tool"))

@@ -9,6 +9,7 @@ deflection coefficients (E).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -260,34 +261,26 @@ def stack(found: Sequence[Part], sigmas: Sequence[np.ndarray]) -> tuple[np.ndarr
 
 
 def pose_sigmas(
-    cell: Installation,
-    q: np.ndarray,
-    free: np.ndarray,
-    covariance: np.ndarray,
-    torque: np.ndarray | None = None,
-    station: int = 0,
-    tool: np.ndarray | int = 0,
+    cell: Installation, at: PoseMeasurements, free: np.ndarray, covariance: np.ndarray, station: int = 0, tool: Any = 0
 ) -> np.ndarray:
     """Return sigmas (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
 
     Args:
         cell: the fitted installation.
-        q: (m, n) [rad or m].
-        free: (f,) positions in the parameter vector (`calib.geometry.observation`).
+        at: joint values (m, n), and gravity torques for compliance terms.
+        free: (f,) positions in the parameter vector.
         covariance: (f, f) of steps along them.
-        torque: (m, n) gravity torques [N m], for compliance terms.
         station: index of the station of reference; -1 for the arm's base.
         tool: which of its tools, one or (m,).
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    result, whole = [np.zeros((0, 2))], PoseMeasurements(q, cell.chain.joint_names, torque=torque)
+    result = [np.zeros((0, 2))]
     chunk = 500  # poses at once: the Jacobian has a column per parameter
-    for first in range(0, len(q), chunk):
-        rows = np.arange(first, min(first + chunk, len(q)))
-        own = take(whole, rows)
-        block = _ready(cell, own, station, np.broadcast_to(tool, len(q))[rows])
+    for first in range(0, len(at), chunk):
+        part = np.arange(first, min(first + chunk, len(at)))
+        block = _ready(cell, take(at, part), station, np.broadcast_to(tool, len(at))[part])
         jacobian = target_jacobian(cell, predict(cell, block), free, station, block.tool, block.bases)
-        spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(own))
+        spread = (root.T @ jacobian.reshape(len(free), -1)).reshape(len(root), 2, 3, len(part))
         result.append(np.sqrt(np.sum(spread**2, axis=(0, 2))).T)
     return np.concatenate(result)

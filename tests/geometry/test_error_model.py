@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.poses.measurements import Positions
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry import error_model
 from calib.geometry.accuracy import errors
 from calib.geometry.error_model import END_SHARE, ErrorModel, learn_errors
@@ -33,6 +33,10 @@ def learnt(block: Positions, *model: str) -> tuple[ErrorModel, Installation]:
     return model, selected.fit.cell
 
 
+def at(q: np.ndarray) -> PoseMeasurements:
+    return PoseMeasurements(q, load("ur5").joint_names)
+
+
 @pytest.fixture(scope="module")
 def found() -> tuple[ErrorModel, Installation]:
     return learnt(measured(1, 150, 1.6, 5e-4))
@@ -52,7 +56,7 @@ def test_the_covariance_of_the_parameters_alone_would_be_far_too_small(found):
     block = measured(2, 400, 1.6, 5e-4)
     from calib.geometry.observation import pose_sigmas
 
-    alone = pose_sigmas(cell, block.q, model.free, model.covariance)[:, 0]
+    alone = pose_sigmas(cell, block, model.free, model.covariance)[:, 0]
     assert np.mean(errors(cell, [block]).main < model.discrepancy.radius * alone) < 0.8
 
 
@@ -92,13 +96,13 @@ def test_without_a_profile_errors_are_even_as_in_results_of_earlier_versions(fou
     even = replace(model, discrepancy=replace(model.discrepancy, profile=(), placed=None))
     still = tuple(((0.0,), (0.0,)) for _ in range(6))
     same = replace(model, discrepancy=replace(model.discrepancy, profile=still))
-    assert even.position_sigma(model.learnt[:5]) == pytest.approx(same.position_sigma(model.learnt[:5]))
+    assert even.position_sigma(at(model.learnt[:5])) == pytest.approx(same.position_sigma(at(model.learnt[:5])))
 
 
 def test_sigma_grows_away_from_what_was_learnt_and_extrapolation_is_named(found):
     model, _ = found
     inside, outside = model.learnt[:50], model.learnt[:50] + 1.5
-    assert np.median(model.position_sigma(outside)) > 1.5 * np.median(model.position_sigma(inside))
+    assert np.median(model.position_sigma(at(outside))) > 1.5 * np.median(model.position_sigma(at(inside)))
     assert not error_model.outside(inside, model.learnt).any()
     assert error_model.outside(outside, model.learnt).any(axis=1).all()
 
@@ -126,7 +130,7 @@ def test_outside_a_range_the_interval_grows_by_its_end_and_not_where_frames_are_
     q = np.repeat(model.learnt[:1], 3, axis=0)
     low, first = np.quantile(model.learnt[:, 0], [0.0, END_SHARE])
     q[:, 0] = [low + 0.01, low - 0.25 * (first - low), low - (first - low)]
-    assert wide.position_sigma(q) / plain.position_sigma(q) == pytest.approx([1.0, 1.5, 2.0])
+    assert wide.position_sigma(at(q)) / plain.position_sigma(at(q)) == pytest.approx([1.0, 1.5, 2.0])
     block = replace(measured(2, 3, 1.6, 0.0), q=q)
     anew = [each.sigma_on(cell, block, placed_anew=True) for each in (wide, plain)]
     assert anew[0] == pytest.approx(anew[1])

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
+from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import Targets
 from calib.errors import Finding, UsageError, finding
 from calib.geometry import installation, inverse
@@ -330,11 +331,10 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
 
 
 def _reason(
-    chain: Chain, reached: bool, beyond: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray,
-    singular: bool,
-) -> str:  # fmt: skip
+    chain: Chain, good: bool, beyond: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool
+) -> str:
     """Return why a target is not reached, from the remaining errors (2,) [m, rad]; else which joints extrapolate."""
-    if reached:
+    if good:
         names = [name for name, out in zip(chain.joint_names, beyond) if out]
         return sentence(finding("command-extrapolates", joints=names)) if names else ""
     rest = {"left": left[0], "turn": None if np.isnan(left[1]) else left[1]}
@@ -360,14 +360,14 @@ def _predicted_sigmas(
         keep = ~np.isin(free, layout(cell).index("tool"))
         free, covariance = free[keep], covariance[np.ix_(keep, keep)]
         cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
-    torque = None if goal.torques is None else goal.torques(q)
+    poses = PoseMeasurements(q, cell.chain.joint_names, torque=None if goal.torques is None else goal.torques(q))
     station = -1 if frame == "base" else _station(fitted, frame)
-    own = pose_sigmas(cell, q, free, covariance, torque, station, number)
+    own = pose_sigmas(cell, poses, free, covariance, station, number)
     own[:, 1] = np.nan if goal.dof == 3 else own[:, 1]
     if fitted.learnt is None or fitted.discrepancy is None:
         return own, np.full((len(q), 2), np.nan)
     errors = ErrorModel(cell, free, covariance, fitted.learnt, fitted.discrepancy)
-    sigma = errors.position_sigma(q, torque, station, number)
+    sigma = errors.position_sigma(poses, station, number)
     return own, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
 
 

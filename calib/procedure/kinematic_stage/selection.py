@@ -161,13 +161,14 @@ def choose(
     found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
     comparable = float(found.history[0]) if method == "polish" else found.value
     notes += [] if view is None else [view.assumed]
+    pool = Exchange(space.jacobian, candidates, before, index)
     driven = drivable(
-        chain, found.joints, Exchange(space.jacobian, candidates, before, index), limits, settings.run, settings.seed,
+        chain, found.joints, pool, limits, settings.run, settings.seed,
         lambda words: progress and progress(0, 1, words),
     )  # fmt: skip
     found, run = _driven(found, driven), driven.run
     notes += [driven.words] if driven.replaced else []
-    outlook = _outlook(jacobian, limits, search, m, driven.q, candidates, before, comparable)
+    outlook = _outlook(jacobian, limits, search, driven.q, pool, comparable)
     return Chosen(
         chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
         settings.run, view is not None,
@@ -203,31 +204,23 @@ def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> n
 
 
 def _outlook(
-    seen: Observation,
-    limits: Limits,
-    search: SearchSettings,
-    m: int,
-    q: np.ndarray,
-    candidates: np.ndarray,
-    before: np.ndarray | None,
-    comparable: float,
+    seen: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, pool: Exchange, comparable: float
 ) -> PoseOutlook:
     """Return the predicted accuracy with chosen poses q (m, n), with other numbers, and without line of sight."""
-    space, free = limits.space(seen), limits.space(seen, sight=False)
+    free, before = limits.space(seen, sight=False), pool.before
     stream = np.random.default_rng([search.seed, 2])
     typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
     past = [] if before is None else [before]
 
     def known(chosen: np.ndarray) -> Prediction:
-        return forecast.predicted(seen, np.concatenate([free.jacobian(chosen), *past]), typical, m)
+        return forecast.predicted(seen, np.concatenate([free.jacobian(chosen), *past]), typical, len(q))
 
     blind = None
     if limits.sight is not None:
-        other = select_poses(None, m, replace(search, method="detmax", climbs=0), space=free, existing=before)
+        other = select_poses(None, len(q), replace(search, method="detmax", climbs=0), space=free, existing=before)
         blind = other.value, known(other.joints)
-    return PoseOutlook(
-        known(q), forecast.by_count(seen, space.jacobian(candidates), typical, before), blind, comparable
-    )
+    others = forecast.by_count(seen, pool.jacobian(pool.candidates), typical, before)
+    return PoseOutlook(known(q), others, blind, comparable)
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:

@@ -10,7 +10,7 @@ import pytest
 from sessions import begin
 
 from calib.cli import run
-from calib.data.poses.measurements import Distances
+from calib.data.poses.measurements import Distances, PoseMeasurements
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
@@ -194,7 +194,9 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     start = install(cell.cell.nominal, [block])
     table = layout(start)
     found = fit(start, [block], table.rigid_index)
-    stated = pose_sigmas(found.cell, everywhere, found.free, found.estimate.covariance, station=-1)[:, 0]
+    stated = pose_sigmas(
+        found.cell, PoseMeasurements(everywhere, block.joint_names), found.free, found.estimate.covariance, station=-1
+    )[:, 0]
     assert 0.4 < np.median(stated / predicted.spread) < 2.5  # the noise of the arm is our choice there
     assert np.corrcoef(np.log(stated), np.log(predicted.spread))[0, 1] > 0.5
 
