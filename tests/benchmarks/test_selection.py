@@ -1,22 +1,22 @@
 """Speed of pose selection: run with `pytest tests/benchmarks/test_selection.py --benchmark-only -s`."""
 
-import poses_arm
+import library_arm
 import pytest
 
 from poses.convex import bound
 from poses.select import select_poses
 
 CASES = {
-    "17 of 2000, pose": (2000, 17, poses_arm.jacobian),
-    "30 of 2000, position only": (2000, 30, poses_arm.point_jacobian),
-    "100 of 20000, pose": (20000, 100, poses_arm.jacobian),
+    "17 of 2000, pose": (2000, 17, library_arm.jacobian),
+    "30 of 2000, position only": (2000, 30, library_arm.point_jacobian),
+    "100 of 20000, pose": (20000, 100, library_arm.jacobian),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_select(benchmark, case):
     count, m, function = CASES[case]
-    jacobians = function(poses_arm.random_poses(count, 0))
+    jacobians = function(library_arm.random_poses(count, 0))
     chosen = benchmark.pedantic(select_poses, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
     random = chosen.efficiency * (chosen.random_baseline / chosen.value) ** 2
     figures = {"efficiency": chosen.efficiency, "random": random, "bound_gap": chosen.bound.gap}
@@ -27,6 +27,6 @@ def test_select(benchmark, case):
 @pytest.mark.parametrize("case", CASES)
 def test_bound(benchmark, case):
     count, m, function = CASES[case]
-    jacobians = function(poses_arm.random_poses(count, 0))
+    jacobians = function(library_arm.random_poses(count, 0))
     result = benchmark.pedantic(bound, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
     benchmark.extra_info["gap"] = result.gap

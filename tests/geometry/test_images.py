@@ -22,7 +22,7 @@ from calib.robot.library import load
 from calib.rooms.camera.board_and_lens import board_poses
 from calib.rooms.camera.camera_guess import complete_camera
 from calib.rooms.camera.lens import Lens
-from calib.rooms.camera.optics import BoardShape
+from calib.rooms.camera.optics import SHAPE, BoardShape
 from calib.rooms.camera.pixels import Pixels
 from calib.rooms.camera.robust_placement import place_robustly
 from calib.rooms.cells import camera_cell as camera
@@ -43,15 +43,15 @@ def study(mounting: str = IN_HAND, count: int = 40, seed: int = 0, encoder: floa
     return cell, camera.photograph(cell, camera.views(cell, count, seed), 0.05, seed)
 
 
-def started(cell, block):
+def started(cell, block, *others):
     block = complete_camera(cell.cell.nominal, block)
-    start = install(cell.cell.nominal, [block])
+    start = install(cell.cell.nominal, [block, *others])
     return block, start, layout(start).rigid_index
 
 
-def fitted(cell, block, **more):
-    block, start, candidates = started(cell, block)
-    return block, fit(start, [block], candidates, **more)
+def fitted(cell, block, *others, **more):
+    block, start, candidates = started(cell, block, *others)
+    return block, fit(start, [block, *others], candidates, **more)
 
 
 @pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
@@ -135,15 +135,12 @@ def test_a_print_of_another_size_is_measured_beside_another_instrument():
     plain, _ = study()
     shape = BoardShape(1.002, 0.05, 0.0, -0.04)
     cell = camera.camera_cell(plain.cell, IN_HAND, shape=shape, reach_of_arm=0.75)
-    q = camera.views(cell, 40, 3)
-    free = ("scale", "bend_xx", "bend_xy", "bend_yy")
-    block = replace(camera.photograph(cell, q, 0.05, 3), lens=cell.lens, known=True, free=free)
+    block = camera.photograph(cell, camera.views(cell, 40, 3), 0.05, 3)
+    block = replace(block, lens=cell.lens, known=True, free=SHAPE)
     points = measure(virtual_cell_points(cell), camera.views(cell, 40, 4), 5)
-    block = complete_camera(cell.cell.nominal, block)
-    start = install(cell.cell.nominal, [block, points])
-    found = fit(start, [block, points], layout(start).rigid_index)
+    block, found = fitted(cell, block, points)
     values = dict(zip(found.estimate.names, zip(found.estimate.values, found.estimate.sigma)))
-    for name, true in zip(("scale", "bend_xx", "bend_xy", "bend_yy"), shape.values):
+    for name, true in zip(SHAPE, shape.values):
         value, sigma = values[f"{block.target}.{name}"]
         assert abs(value - true) < 4.0 * sigma
         assert sigma < (2e-4 if name == "scale" else 5e-3)
@@ -166,15 +163,11 @@ def test_two_cameras_see_one_board():
     two = replace(
         camera.photograph(two_cell, camera.views(two_cell, 25, 7), 0.05, 7), station="other camera", model="fisheye"
     )
-    blocks = [complete_camera(cell.cell.nominal, each) for each in (one, replace(two, tool_names=("other board",)))]
-    start = install(cell.cell.nominal, blocks)
-    assert start.optics.lens_names == ("camera", "other camera")
-    found = fit(start, blocks, layout(start).rigid_index)
-    assert position_errors(cell.cell, placed_like(found.cell), found.cell.chain)[2] < 0.03
-
-
-def placed_like(cell):
-    return replace(cell, stations=cell.stations[:1], tools=cell.tools[:1])
+    two = complete_camera(cell.cell.nominal, replace(two, tool_names=("other board",)))
+    _, found = fitted(cell, one, two)
+    assert found.cell.optics.lens_names == ("camera", "other camera")
+    own = replace(found.cell, stations=found.cell.stations[:1], tools=found.cell.tools[:1])
+    assert position_errors(cell.cell, own, found.cell.chain)[2] < 0.03
 
 
 @pytest.mark.slow
@@ -236,11 +229,7 @@ def test_without_images_that_contradict_all_others_the_fit_is_good_and_half_of_t
 @pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_images_settles_wherever_the_camera_stands(seed):
     """Far boards of small images: what an image is off by shrinks slowly from fit to fit; planted are encoders only."""
-    lens = Lens("pinhole", np.array([1250.0, 1252.0, 640.0, 508.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (1280, 1024))
-    instrument = SimulatedInstrument(encoder_sigma=1e-5)
-    cell = camera.camera_cell(
-        rigid(virtual_cell("lwr4plus", instrument=instrument)), TO_HAND, lens=lens, reach_of_arm=0.75
-    )
+    cell = camera.camera_cell(rigid(virtual_cell("lwr4plus")), TO_HAND, lens=camera.DEMO_LENS, reach_of_arm=0.75)
     block = camera.photograph(cell, camera.views(cell, 30, seed, camera.Views((0.25, 0.6))), 0.03, seed)
     _, found = fitted(cell, block)
     noise = found.pieces[0].part.noise

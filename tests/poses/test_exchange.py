@@ -3,8 +3,8 @@
 from functools import cache
 from itertools import combinations
 
+import library_arm
 import numpy as np
-import poses_arm
 import pytest
 
 from poses.candidates import draw_candidates
@@ -16,7 +16,7 @@ from poses.indices import observability
 from poses.information import prepared
 from poses.select import SearchSettings, random_baseline, select_poses
 
-ARM = poses_arm.jacobian(poses_arm.random_poses(400, 0))
+ARM = library_arm.jacobian(library_arm.random_poses(400, 0))
 
 
 @cache
@@ -33,14 +33,14 @@ def log_det_of(jacobians):
 @pytest.mark.parametrize(
     ("function", "m"),
     [
-        pytest.param(poses_arm.jacobian, 17, marks=pytest.mark.slow),
-        (poses_arm.point_jacobian, 17),
-        (poses_arm.jacobian, 30),
-        pytest.param(poses_arm.point_jacobian, 30, marks=pytest.mark.slow),
+        pytest.param(library_arm.jacobian, 17, marks=pytest.mark.slow),
+        (library_arm.point_jacobian, 17),
+        (library_arm.jacobian, 30),
+        pytest.param(library_arm.point_jacobian, 30, marks=pytest.mark.slow),
     ],
 )
 def test_sandwich(function, m):
-    jacobians = function(poses_arm.random_poses(600, 2))
+    jacobians = function(library_arm.random_poses(600, 2))
     chosen = select_poses(jacobians, m, SearchSettings(seed=1))
     assert chosen.random_baseline < chosen.value
     p = jacobians.shape[2]
@@ -188,11 +188,11 @@ def test_candidates_keep_limits_and_predicate():
     def upper_half(q):
         return q[:, 0] > 0
 
-    q = draw_candidates(poses_arm.LOWER, poses_arm.UPPER, 500, upper_half, seed=3)
+    q = draw_candidates(library_arm.LOWER, library_arm.UPPER, 500, upper_half, seed=3)
     assert q.shape == (500, 7) and upper_half(q).all()
-    assert (q >= poses_arm.LOWER).all() and (q <= poses_arm.UPPER).all()
-    assert (q == draw_candidates(poses_arm.LOWER, poses_arm.UPPER, 500, upper_half, seed=3)).all()
-    assert (q != draw_candidates(poses_arm.LOWER, poses_arm.UPPER, 500, upper_half, seed=4)).any()
+    assert (q >= library_arm.LOWER).all() and (q <= library_arm.UPPER).all()
+    assert (q == draw_candidates(library_arm.LOWER, library_arm.UPPER, 500, upper_half, seed=3)).all()
+    assert (q != draw_candidates(library_arm.LOWER, library_arm.UPPER, 500, upper_half, seed=4)).any()
     spread = draw_candidates(np.zeros(2), np.ones(2), 1024)
     counts = np.histogram2d(*spread.T, bins=16, range=[[0, 1], [0, 1]])[0]
     assert counts.min() == counts.max() == 4  # a net: every box holds its share, which random points never do

@@ -1,7 +1,7 @@
 """Claims on the observability indices."""
 
+import library_arm
 import numpy as np
-import poses_arm
 import pytest
 
 from poses.errors import BadInput
@@ -34,7 +34,7 @@ def test_gradient_is_the_central_difference(W, index):
 
 
 def test_only_o1_ranks_sets_alike_in_other_units():
-    sets = poses_arm.jacobian(poses_arm.random_poses(40 * 17, 5)).reshape(40, 17, 6, -1)
+    sets = library_arm.jacobian(library_arm.random_poses(40 * 17, 5)).reshape(40, 17, 6, -1)
     scale = 10.0 ** np.random.default_rng(6).uniform(-2, 2, sets.shape[-1])
     orders = {i: [np.argsort([observability(W * c, i) for W in sets]) for c in (1.0, scale)] for i in INDICES}
     assert (orders["O1"][0] == orders["O1"][1]).all()

@@ -24,7 +24,7 @@ name = "small"
 robot = "rv2sq"
 methods = ["ols", "wls"]
 runs = 12
-duration = 4.0
+duration = 2.0
 resimulated = 0
 [[noise]]
 name = "1"

@@ -24,13 +24,13 @@ robot = "rv2sq"
 methods = ["wls", "iv"]
 runs = 3
 runs_loop = 2
-duration = 4.0
+duration = 2.0
 [[noise]]
 name = "1"
 sigma_q = "1e-4 deg"
 sigma_tau = 0.05
 """
-SHORT = Condition("short", "rv2sq", np.deg2rad(1e-4), 0.05, duration=4.0, resimulated=0)
+SHORT = Condition("short", "rv2sq", np.deg2rad(1e-4), 0.05, duration=2.0, resimulated=0)
 
 
 def written(folder: Path, text: str = FILE) -> Path:

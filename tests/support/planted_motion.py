@@ -4,6 +4,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
@@ -12,6 +13,7 @@ from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.rows import Case, make_case
+from calib.robot import description
 from calib.robot.chain import Chain, Element, Joint
 
 N = 3
@@ -111,3 +113,9 @@ def write(folder: Path, name: str, seed: int, **how) -> Path:
     path = folder / name
     np.savez(path, **{**series(seed), **how})
     return path
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """Return the planted arm's robot.toml."""
+    return description.write(tmp_path / "planted.toml", arm())

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
 
-import excited_arm as arm
+import library_arm as arm
 import numpy as np
 import pinocchio_model as model
 import pytest

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-import excited_arm as arm
+import library_arm as arm
 import numpy as np
 import pytest
 from differences import check

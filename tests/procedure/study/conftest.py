@@ -1,5 +1,5 @@
 """Fixtures of the planted arm."""
 
-from planted_files import robot
+from planted_motion import robot
 
 __all__ = ["robot"]

@@ -1,4 +1,4 @@
-"""A robot for the tests: the LWR4+ of the library as callables, and a two-joint arm written out by hand."""
+"""The LWR4+ of the library as callables: torques for excitation, measured poses or positions for pose selection."""
 
 from functools import cache, partial
 
@@ -7,22 +7,31 @@ import numpy as np
 from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.geometry.observability import observation, targets_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import sweep, tip_jacobian
 from calib.robot.library import load
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], total, Jubien et al. 2014 as quoted in facts
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]
+CHAIN = load("lwr4plus")
+LOWER, UPPER = CHAIN.sampling_limits()
+jacobian, point_jacobian = (
+    observation(targets_of(CHAIN, [(0.05, 0.02, 0.11)]), kind, (5e-5, 2e-4)) for kind in ("pose", "position")
+)
+
+
+def random_poses(count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(LOWER, UPPER, (count, len(LOWER)))
 
 
 @cache
 def lwr(v0: float = 0.05) -> tuple[base.BaseModel, np.ndarray, Chain]:
     """Return the base model with 64 columns (43 inertial, Fv Fc off), its parameters, and the chain."""
-    chain = load("lwr4plus")
-    model = IdentificationModel(bodies_of(chain), drives.standard(["Fv Fc off"] * 7, v0))
+    model = IdentificationModel(bodies_of(CHAIN), drives.standard(["Fv Fc off"] * 7, v0))
     found = base.find(model)
-    values = np.concatenate([standard_parameters(chain), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
-    return base.BaseModel(model, found), found.transform @ values, chain
+    values = np.concatenate([standard_parameters(CHAIN), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
+    return base.BaseModel(model, found), found.transform @ values, CHAIN
 
 
 def tool_points(chain: Chain, q: np.ndarray) -> np.ndarray:
