@@ -21,23 +21,14 @@ from calib.estimation.triangles import condition_numbers
 from calib.extensions import needed
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.loop import LoopResults
+from calib.identification.loop import LoopResults, per_joint
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
-from calib.identification.prior import (
-    TEMPERING,
-    FirstFit,
-    Prior,
-    find_prior,
-    residual_inflation,
-    rods,
-    scaled,
-    tempered_prior,
-)
-from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
-from calib.identification.settings import IdentificationSettings, make_model, per_joint, require_simulable
-from calib.identification.time_folds import estimate, regimes
+from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
+from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
+from calib.identification.settings import IdentificationSettings, make_model, require_simulable
+from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
@@ -201,20 +192,8 @@ def _identified(
     say("essential parameters")
     gone = _essential(found, settings)
     condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
-    return Identification(
-        dynamics,
-        base,
-        found,
-        gone,
-        friction,
-        settings,
-        problem.rows,
-        problem.terms,
-        condition,
-        problem.prior,
-        ripples,
-        loop,
-    )
+    rows, terms, prior = problem.rows, problem.terms, problem.prior
+    return Identification(dynamics, base, found, gone, friction, settings, rows, terms, condition, prior, ripples, loop)
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
@@ -341,21 +320,6 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
             )
     squares = np.array([case.noise**2 for case in cases if case.noise is not None])
     return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
-
-
-def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
-    """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a fit that always exists."""
-    count = rows[0].target.shape[1]
-    data = pool(triangulate(rows), count)
-    std, tau = np.ones(count), np.ones(count)
-    values = np.zeros(data.parameters)
-    for _ in range(4):
-        values, _ = estimate(data, std, tau, np.full(data.parameters, -1))
-        residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
-        used = np.concatenate([part.present for part in rows]).sum(axis=0)
-        std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
-        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
-    return FirstFit(std, residual_inflation(rows, values), values)
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:

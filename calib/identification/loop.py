@@ -40,17 +40,18 @@ recording, relative to the options file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
 from calib.config import strict
 from calib.config_types import Flag, Name, Names, OneOf, Positive, Real, Spread, Whole
-from calib.errors import Finding, UsageError, require
+from calib.errors import Finding, refuse_option, require
 from calib.records import Array, Number, Unbounded, frozen, stored
 
+T = TypeVar("T")
 MAX_SHIFT_SIGMAS = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
 FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
 FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what is fed forward; the floor: measured
@@ -110,10 +111,14 @@ class LoopSettings:
 
     def per_joint(self, key: str, n: int) -> np.ndarray:
         """Return the values (n,) of a key that has one value or n."""
-        found = getattr(self, key)
-        if len(found) not in (1, n):
-            raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
-        return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()
+        return np.array(per_joint(getattr(self, key), n, f"[loop] {key}"), dtype=float)
+
+
+def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
+    """Return n values from a list of one or n."""
+    if len(values) not in (1, n):
+        refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
+    return tuple(values) * n if len(values) == 1 else tuple(values)
 
 
 def check_loop(table: Any) -> Any:

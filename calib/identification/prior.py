@@ -46,7 +46,7 @@ from calib.estimation.constrained import within
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
-from calib.identification.time_folds import CrossValidation, Regimes
+from calib.identification.time_folds import CrossValidation, Regimes, estimate
 from calib.records import frozen
 from calib.robot.chain import Chain
 
@@ -188,6 +188,21 @@ def find_prior(
         {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name}, source,
         FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])), tempering,
     )  # fmt: skip
+
+
+def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
+    """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a fit that always exists."""
+    count = rows[0].target.shape[1]
+    data = pool(triangulate(rows), count)
+    std, tau = np.ones(count), np.ones(count)
+    values = np.zeros(data.parameters)
+    for _ in range(4):
+        values, _ = estimate(data, std, tau, np.full(data.parameters, -1))
+        residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
+        used = np.concatenate([part.present for part in rows]).sum(axis=0)
+        std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
+        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
+    return FirstFit(std, residual_inflation(rows, values), values)
 
 
 def weighing(

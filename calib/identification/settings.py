@@ -1,8 +1,8 @@
 """Settings of an identification: drive terms, weights of the rows, and elimination of parameters."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 
@@ -16,12 +16,11 @@ from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
 from calib.identification.friction.friction_ladder import NAMES
-from calib.identification.loop import LoopSettings, check_loop
+from calib.identification.loop import LoopSettings, check_loop, per_joint
 from calib.identification.methods.parameter_constraints import ConstraintSettings
 from calib.identification.methods.registry import METHODS
 from calib.robot.chain import Chain
 
-T = TypeVar("T")
 RULES = ("none", "rsd", "f", "both")
 PRIORS = ("auto", "none", "cad")
 WEIGHTS = ("residuals", "repeats")
@@ -151,13 +150,6 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
     for coupling in settings.couplings:
         if coupling.joints[0] == coupling.joints[1]:
             raise UsageError(f"coupling: joint {coupling.joints[0] + 1} is coupled with itself; name two joints")
-
-
-def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
-    """Return n values from a list of one or n."""
-    if len(values) not in (1, n):
-        refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
-    return tuple(values) * n if len(values) == 1 else tuple(values)
 
 
 def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:

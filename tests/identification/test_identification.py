@@ -10,8 +10,9 @@ from calib.errors import CalibError, MeasurementError, UsageError
 from calib.identification.friction.friction_ladder import FrictionCandidates, select_friction
 from calib.identification.gains import identify_gains
 from calib.identification.geometry_uncertainty import standstill_shift
-from calib.identification.identify import chain_states, common_decimator, find_base, first_fit, identify
+from calib.identification.identify import chain_states, common_decimator, find_base, identify
 from calib.identification.prediction import Dynamics, predict, score
+from calib.identification.prior import first_fit
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, Payload, make_model
 

@@ -182,8 +182,7 @@ def share_of_nominal(
     grid = _coarse(t)
     torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
     q, v, a = (_smooth(place, order) for order in range(3))
-    bodies, parameters = bodies_of(chain), standard_parameters(chain)
-    bodies = bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))
+    bodies, parameters = bodies_under(chain, gravity), standard_parameters(chain)
     rigid = inverse_dynamics(bodies, parameters, q, v, a)
     other = None
     if static:
@@ -204,6 +203,12 @@ def share_of_nominal(
         if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > min_sign_correlation:
             share[j] = common / max(power, 1e-12)
     return share
+
+
+def bodies_under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
+    """Return the bodies of a chain under a stated gravity [m/s²]; None: the chain's own."""
+    bodies = bodies_of(chain)
+    return bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))
 
 
 def _smooth(values: np.ndarray, order: int = 0, half_width: int = 10) -> np.ndarray:

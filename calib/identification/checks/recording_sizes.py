@@ -20,13 +20,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
-from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.estimation.whiteness import inflation
 from calib.identification.checks.recorded_motion import (
     MotionSamples,
     basis,
+    bodies_under,
     drive_columns,
     share_of_nominal,
     take_samples,
@@ -254,7 +255,7 @@ def compare_sizes(
     if v is not None:
         speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
     counted = motion.sampling.clock.kind == "counted"
-    bodies = _under(chain, gravity)
+    bodies = bodies_under(chain, gravity)
     many, few = (take_samples(case, bodies, count) for count in (MAX_LAG_SAMPLES, MAX_SAMPLES))
     lag = None if many is None else lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
@@ -264,7 +265,7 @@ def compare_sizes(
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
     """Return joints with reversed torques, or positions relative to another joint's; see `compare_sizes`."""
-    few = take_samples(case, _under(chain, gravity), MAX_SAMPLES)
+    few = take_samples(case, bodies_under(chain, gravity), MAX_SAMPLES)
     return None if few is None else wrong_joints(few)
 
 
@@ -295,8 +296,3 @@ def _speed_ratio(
     independent_errors = 6
     sigma = np.hypot(np.sqrt(((seen - ratio * own) ** 2).sum(axis=0) / power / independent_errors), dated)
     return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows
-
-
-def _under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
-    bodies = bodies_of(chain)
-    return bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))

@@ -88,8 +88,7 @@ def _alone(whole: Lag, halves: Sequence[Lag], max_lag_difference: float = 0.5) -
 
 
 def _part(samples: MotionSamples, part: slice) -> MotionSamples:
-    picked = {name: getattr(samples, name)[part] for name in ("index", "q", "v", "a")}
-    return MotionSamples(**picked, effort=samples.effort, velocity=samples.velocity, bodies=samples.bodies)
+    return replace(samples, **{name: getattr(samples, name)[part] for name in ("index", "q", "v", "a")})
 
 
 def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:

@@ -22,6 +22,7 @@ is told apart, and whether an order stays at all, time blocks that are left out 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -163,9 +164,8 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     return Ripple(joint, taken, _terms(joint, taken, nodes, track), frozen(values), best)
 
 
-def _family(turns: int) -> tuple[tuple[int, ...], ...]:
-    """Return the orders per turn of a gear's ripple, in sets that are tested together."""
-    n = turns
+def _family(n: int) -> tuple[tuple[int, ...], ...]:
+    """Return the orders per turn of the ripple of a gear with n motor turns per turn, in sets tested together."""
     return tuple(
         one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= MAX_ORDER
     )  # fmt: skip
@@ -180,13 +180,11 @@ def _terms(
     for source, order in waves:
         reach = (-np.inf, np.inf) if track is None else (track.q[:, source].min(), track.q[:, source].max())
         label = f"{joint + 1}" if source == joint else f"{joint + 1}q{source + 1}"
-        for m, node in enumerate(nodes):
-            for way, sign in ((1.0, "+"), (-1.0, "-")):
-                for shape, name in (("sine_band", "Rs"), ("cosine_band", "Rc")):
-                    settings = (order, *edges[m : m + 3], way, *reach)
-                    acts = ((joint, ((source, 1.0),)),)
-                    title = f"{name}{label}.{order}{sign}{node:g}Hz"
-                    found.append(DriveTerm(title, shape, acts, tuple(float(x) for x in settings)))
+        shapes = ("sine_band", "Rs"), ("cosine_band", "Rc")
+        for (m, node), (way, sign), (shape, name) in product(enumerate(nodes), ((1.0, "+"), (-1.0, "-")), shapes):
+            settings = (order, *edges[m : m + 3], way, *reach)
+            title = f"{name}{label}.{order}{sign}{node:g}Hz"
+            found.append(DriveTerm(title, shape, ((joint, ((source, 1.0),)),), tuple(float(x) for x in settings)))
     return tuple(found)
 
 

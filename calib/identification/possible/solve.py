@@ -306,11 +306,9 @@ def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
 
 def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) -> Sequence[str]:
     """Return remarks on bodies thinner than a millimetre."""
-    found = []
-    for label, body in zip(model.bodies.labels, _bodies(problem, values)):
-        if pseudo_inertia.margin(body) < 1e-3:
-            found.append(f"body {label} is thinner than a millimetre: hardly realistic")
-    return found
+    bodies = zip(model.bodies.labels, _bodies(problem, values))
+    thin = [label for label, body in bodies if pseudo_inertia.margin(body) < 1e-3]
+    return [f"body {label} is thinner than a millimetre: hardly realistic" for label in thin]
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ from calib.data.schema import Joints
 from calib.data.signals.motion import Motion, make_motion
 from calib.errors import UsageError
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
-from calib.identification.identify import chain_states, common_decimator, find_base, first_fit
+from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions
+from calib.identification.prior import first_fit
 from calib.identification.rows import Case, make_case, observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain

@@ -97,7 +97,8 @@ def close_loops(
     for _, part, reference, every in stretches:
         own = _fed_forward(controller, loop, cad, bodies, part.motion, reference, every)
         if loop.reference_velocity == "difference":
-            reference = _differenced(reference)
+            late = np.diff(reference.q, axis=0) / reference.period  # by half a period
+            reference = replace(reference, v=np.vstack([reference.v[:1], late]))
         pairs.append((take(part, _inside(part.motion)), Loop(own, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
@@ -172,11 +173,6 @@ def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: fl
     place = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
     v, a = (spline(place, order) * motion.rate**order for order in (1, 2))
     return Reference(motion.t[0] + place / motion.rate, spline(place), v, a), every
-
-
-def _differenced(reference: Reference) -> Reference:
-    """Return the reference with velocities from backward differences of its positions, half a period late."""
-    return replace(reference, v=np.vstack([reference.v[:1], np.diff(reference.q, axis=0) / reference.period]))
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
-from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults, LoopSettings
+from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
 from calib.identification.methods.least_squares import CONSISTENT, CONSTRAINED, WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
 from calib.rooms.closed_loop.instrumental import Instrumental, identify_instrumental
@@ -77,23 +77,22 @@ class _Simulated(Method):
         if loop is None or not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
             raise UsageError("instruments from simulation support motor torques only")
         loops = close_loops(model.bodies, problem.cases, problem.decimator, loop, problem.cad)
-        return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, model, loop, loops))
+        inertia = loop.per_joint("inertia", model.n) if loop.inertia else None
 
-    def _estimate(
-        self, problem: IdentificationProblem, plain: MethodEstimate, model: IdentificationModel, loop: LoopSettings,
-        loops: ClosedLoops,
-    ) -> MethodEstimate:  # fmt: skip
-        found = identify_instrumental(
-            model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
-            inertia=loop.per_joint("inertia", model.n) if loop.inertia else None, positive=loop.positive,
-            constraints=problem.constrained if self.takes_constraints else None,
-        )  # fmt: skip
-        result = replace(
-            plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
-            simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
-            held=found.constrained,
-        )  # fmt: skip
-        return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": found})
+        def estimate() -> LoopEstimate:
+            found = identify_instrumental(
+                model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
+                inertia=inertia, positive=loop.positive,
+                constraints=problem.constrained if self.takes_constraints else None,
+            )  # fmt: skip
+            result = replace(
+                plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
+                simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
+                held=found.constrained,
+            )  # fmt: skip
+            return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": found})
+
+        return attempted_in_loop(self.name, problem, loops, estimate)
 
 
 IV = _Simulated(
@@ -134,21 +133,17 @@ class LoopTest:
 
     def findings(self, taken: bool) -> list[Finding]:
         """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
-        if self.failure:
+        if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
-        if self.found is None:
-            return []
         noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
-        return noticed + (_blurred(self) if taken else _biased(self.found))
+        return noticed + (_blurred(self.found, self.loops) if taken else _biased(self.found))
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
-    """Return the result of instruments from simulation on an estimate's problem; an empty one without a loop.
+    """Return the result of instruments from simulation on an estimate's problem, whose loop is stated.
 
     An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
-    if problem.loop is None:
-        return LoopTest()
     found = estimate if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None else None
     if found is None:
         try:
@@ -188,12 +183,12 @@ def _biased(found: Instrumental) -> list[Finding]:
     return [finding("least-squares-biased", p=found.verdict.p, names=names)]
 
 
-def _blurred(test: LoopTest) -> list[Finding]:
+def _blurred(found: Instrumental, loops: ClosedLoops) -> list[Finding]:
     """Return a finding on joints where W is not its true value plus noise, as instruments assume."""
-    if test.found is None or test.loops is None or not test.found.estimator.measured:
+    if not found.estimator.measured:
         return []
-    noise, max_blur = test.loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
-    widths = {one.acts[0][0]: one.settings[-1] for one in test.found.plant.terms if one.shape == "sign"}
+    noise, max_blur = loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
+    widths = {one.acts[0][0]: one.settings[-1] for one in found.plant.terms if one.shape == "sign"}
     blurred = [(j, noise[j] / width) for j, width in widths.items() if noise[j] > max_blur * width]
     joints = [f"{size:.2g} at joint {j + 1}" for j, size in blurred]
     return [finding("noisy-signs", joints=joints)] if joints else []
@@ -251,12 +246,12 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
     )  # fmt: skip
 
 
-def _metrics(test: LoopTest, beside: bool) -> LoopMetrics | None:
-    """Return the metrics of a test by simulation; None if no loop was stated."""
+def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
+    """Return the metrics of a test by simulation."""
     found, loops = test.found, test.loops
     notes = () if loops is None else loops.notes
     if found is None or loops is None:
-        return LoopMetrics(test.failure, notes) if test.failure or notes else None
+        return LoopMetrics(test.failure, notes)
     identified, strength = loops.identified, found.strength
     return LoopMetrics(
         "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),

@@ -14,10 +14,11 @@ from calib.errors import Finding, UsageError, finding
 from calib.identification.friction.passivity import MIN_ENERGY_SHARE
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
+from calib.identification.loop import per_joint
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.rows import Case
-from calib.identification.settings import IdentificationSettings, per_joint
+from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.identify import Assessment, Errors, ModelFindings, errors_of
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
 from calib.procedure.dynamic_stage.verdict import (
