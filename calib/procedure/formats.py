@@ -9,59 +9,50 @@ from calib.config import schema
 from calib.errors import UsageError
 from calib.extensions import merged
 
-TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+TOPICS: Mapping[str, tuple[str, str]] = {
     "measurements": (
         "CSV files of measured poses, positions, distances",
-        ("calib.data.poses.pose_files", "calib.data.poses.robodk"),
+        "calib.data.poses.pose_files calib.data.poses.robodk",
     ),
     "targets": (
         "targets of calib compensate, and the commands it writes",
-        ("calib.data.poses.pose_lists", "calib.procedure.kinematic_stage.compensation"),
+        "calib.data.poses.pose_lists calib.procedure.kinematic_stage.compensation",
     ),
-    "options": ("the TOML file of calib fit --options", ("calib.data.poses.fit_options",)),
+    "options": ("the TOML file of calib fit --options", "calib.data.poses.fit_options"),
     "identify-options": (
         "the TOML file of calib identify --options",
-        ("calib.identification.identify_options", "calib.identification.loop"),
+        "calib.identification.identify_options calib.identification.loop",
     ),
     "identified": (
         "the folder that calib identify writes",
-        (
-            "calib.identification.model_file",
-            "calib.procedure.dynamic_stage.verdict",
-            "calib.procedure.dynamic_stage.geometry_tables",
-        ),
+        "calib.identification.model_file calib.procedure.dynamic_stage.verdict "
+        "calib.procedure.dynamic_stage.geometry_tables",
     ),
     "exports": (
         "what calib export --into writes",
-        ("calib.procedure.export.delivery", "calib.identification.possible.solve"),
+        "calib.procedure.export.delivery calib.identification.possible.solve",
     ),
-    "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.measuring.constraints_file",)),
-    "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
+    "constraints": ("the TOML file of calib select --constraints", "calib.procedure.measuring.constraints_file"),
+    "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", "calib.robot.mdh calib.robot.tables"),
     "robot": (
         "robot.toml as calib fit writes it",
-        ("calib.robot.description", "calib.geometry.installation", "calib.robot.calibrated"),
+        "calib.robot.description calib.geometry.installation calib.robot.calibrated",
     ),
-    "session": ("a session's folder and its session.toml", ("calib.procedure.session.folder",)),
-    "limits": (
-        "the TOML file of calib excite --limits and calib plan --limits",
-        ("calib.procedure.excitation.limits",),
-    ),
-    "waypoints": ("the CSV of calib plan --waypoints", ("calib.procedure.excitation.planning",)),
+    "session": ("a session's folder and its session.toml", "calib.procedure.session.folder"),
+    "limits": ("the TOML file of calib excite --limits and calib plan --limits", "calib.procedure.excitation.limits"),
+    "waypoints": ("the CSV of calib plan --waypoints", "calib.procedure.excitation.planning"),
     "excitation": (
         "trajectory.toml of calib excite, and what calib recall writes",
-        ("calib.procedure.excitation.coefficients", "calib.procedure.excitation.recall"),
+        "calib.procedure.excitation.coefficients calib.procedure.excitation.recall",
     ),
     "recordings": (
         "recordings of motion, for calib identify",
-        (
-            "calib.data.recordings.recording_options",
-            "calib.data.recordings.recording_files",
-            "calib.data.recordings.archives",
-            "calib.data.recordings.bags",
-        ),
+        "calib.data.recordings.recording_options calib.data.recordings.recording_files "
+        "calib.data.recordings.archives calib.data.recordings.bags",
     ),
     **merged("topics"),
 }
+"""Topic → what it is, and the modules whose docstrings describe it."""
 
 SCHEMAS: Mapping[str, tuple[str, str]] = {
     "options": ("calib.data.poses.fit_options", "FitOptions"),
@@ -72,13 +63,7 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     **merged("schemas"),
 }
 """Topic → module and dataclass of the TOML files that people write."""
-_KINDS = {
-    "string": "text",
-    "number": "number",
-    "integer": "whole number",
-    "boolean": "true or false",
-    "object": "table",
-}
+_KINDS = {"string": "text", "integer": "whole number", "boolean": "true or false", "object": "table"}
 
 
 def overview() -> list[str]:
@@ -94,7 +79,7 @@ def describe(topic: str) -> str:
     """
     if topic not in TOPICS:
         raise UsageError(f"unknown format '{topic}'; known: {', '.join(TOPICS)}")
-    parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1]]
+    parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1].split()]
     if topic == "session":
         from calib.procedure.session.settings import example
 

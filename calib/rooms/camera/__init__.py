@@ -18,12 +18,7 @@ OFFERS = {
 TOPICS = {
     "images": (
         "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
-        (
-            "calib.rooms.camera.pictures.image_folders",
-            "calib.rooms.camera.board",
-            "calib.rooms.camera.lens",
-            "calib.rooms.camera.pixels",
-            "calib.rooms.camera.pictures.image_bags",
-        ),
+        "calib.rooms.camera.pictures.image_folders calib.rooms.camera.board calib.rooms.camera.lens "
+        "calib.rooms.camera.pixels calib.rooms.camera.pictures.image_bags",
     )
 }

@@ -6,5 +6,5 @@ up so that methods can be ranked (`summary`).
 """
 
 OFFERS = {"commands": "commands:app", "topics": ":TOPICS", "schemas": ":SCHEMAS", "methods": "methods:METHODS"}
-TOPICS = {"study": ("the TOML file of calib study", ("calib.rooms.studies.conditions",))}
+TOPICS = {"study": ("the TOML file of calib study", "calib.rooms.studies.conditions")}
 SCHEMAS = {"study": ("calib.rooms.studies.conditions", "StudyFile")}
