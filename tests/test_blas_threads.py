@@ -36,25 +36,17 @@ def found() -> dict[str, Any]:
     return json.loads(python(blas_threads.__file__))
 
 
-def test_a_call_has_one_thread_and_gives_back_the_callers(found):
-    assert (found["before"], found["call"], found["after"]) == ([3], [1], [3])
-    assert found["nested"] == [[1], [1]]
-
-
-def test_they_are_given_back_after_an_exception(found):
-    assert found["after an exception"] == [3] == found["at the end"]
-
-
-def test_a_generator_has_one_while_it_works_and_the_caller_his_between(found):
-    assert found["steps"] == [[1], [3], [1]] and found["after steps"] == [3]
-
-
-def test_calls_that_overlap_have_one_until_the_last_ends(found):
-    assert found["overlapping"] == [[1], [1], [1], [3]]
-
-
-def test_a_callers_own_limit_counts(found):
-    assert found["caller's limit"] == [[2], [2]]
+@pytest.mark.parametrize(
+    ("when", "threads"),
+    [
+        ("before", [3]), ("call", [1]), ("after", [3]), ("nested", [[1], [1]]), ("after an exception", [3]),
+        ("at the end", [3]), ("steps", [[1], [3], [1]]), ("after steps", [3]), ("overlapping", [[1], [1], [1], [3]]),
+        ("caller's limit", [[2], [2]]),
+    ],
+)  # fmt: skip
+def test_a_call_or_a_generators_step_has_one_thread_and_gives_back_the_callers(found, when, threads):
+    """Calls that overlap have one until the last ends; a caller's own limit counts."""
+    assert found[when] == threads
 
 
 @pytest.mark.parametrize("name", ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"])
