@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from calib.api.rendering import Judged, data_frame, listed, optional, progress_shown
+from calib.api.rendering import Judged, Progress, data_frame, listed, optional, progress_shown
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -121,7 +121,7 @@ def identify_dynamics(
     tip: str | None = None,
     seed: int = 0,
     on_read: Callable[[inputs.IdentificationInputs], None] | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> DynamicsModel:
     """Identify a robot's dynamics on its geometry, and judge them on unseen motion.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Judged, data_frame, listed, optional, progress_shown, saved
+from calib.api.rendering import Judged, Progress, data_frame, listed, optional, progress_shown, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from calib.procedure.report.page import Page, Section
 
-Progress = Callable[[str], None]
 Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import optional, progress_shown, saved
+from calib.api.rendering import Progress, optional, progress_shown, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -25,9 +24,6 @@ from trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Progress = Callable[[str], None]
-
 
 Sampled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 

@@ -21,6 +21,8 @@ from tempfile import TemporaryDirectory
 
 from calib.errors import refused_as
 
+Progress = Callable[[str], None]
+
 
 def listed(given: object | Sequence[object]) -> list:
     """Return one argument, or several (nested), as a flat list."""
@@ -34,7 +36,7 @@ def optional(given: Any) -> Any:
     return Path(given) if isinstance(given, str) else given
 
 
-def progress_shown(progress: Callable[[str], None] | None) -> Callable[[str], None] | None:
+def progress_shown(progress: Progress | None) -> Progress | None:
     """Return the progress reporter: the given one; by default a line under the cell in a notebook; else None."""
     notebook = sys.modules.get("IPython")
     if progress is not None or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):

@@ -154,7 +154,7 @@ def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
     say(fleet.table(outcomes), result=True)
     say(*fleet.remarks(outcomes))
     say(fleet.summary(outcomes, time.perf_counter() - started))
-    if code := fleet.worst_code(outcomes):
+    if code := max(one.code for one in outcomes):
         raise typer.Exit(code)
 
 

@@ -180,8 +180,3 @@ def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
     parts += [f"{counts[state]} {words}" for state, words in ((WAITS, "waiting"), (FAILED, "failed")) if counts[state]]
     return f"{', '.join(parts)}; {seconds:.1f} s"
-
-
-def worst_code(outcomes: Sequence[FleetRow]) -> int:
-    """Return the exit code of all sessions: the first occurring of 4, 3, 2 (error), 1 (verdict fail), 0."""
-    return max((one.code for one in outcomes), default=0)

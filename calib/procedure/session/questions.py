@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
-from calib.config_types import Real
+from calib.config_types import OneOf, Real
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import UsageError, one_of, require
 from calib.extensions import needed
@@ -199,10 +199,6 @@ def _lengths(text: str, count: int, most: float, expected: str = "x,y,z in metre
     return values
 
 
-def _cone(text: str) -> str:
-    return text if any(map(str.isalpha, text)) else f"{text} deg"
-
-
 def _direction(text: str) -> Any:
     return text.lower() if text.lower() in AXES else [Real(quantity="1").read(part) for part in text.split(",")]
 
@@ -231,9 +227,7 @@ def _obstacles(text: str) -> list[dict[str, Any]]:
 
 
 def _mounting(text: str) -> str:
-    held = text.lower().replace("-", " ").replace("_", " ")
-    require(held in (IN_HAND, TO_HAND), f"expected {IN_HAND} (the arm carries the camera), {TO_HAND}", ValueError)
-    return held
+    return OneOf((IN_HAND, TO_HAND)).read(text.lower().replace("-", " ").replace("_", " "))
 
 
 def _file(read: str, text: str) -> str:
@@ -263,7 +257,7 @@ def _turned(name: str, most: float, text: str, known: dict[str, str]) -> dict[st
 
 _KEYS: dict[str, tuple[str, Any]] = {  # of the limits file, and how the answer is read
     "instrument_at": ("instrument.xyz", partial(_lengths, count=3, most=MAX_FAR)),
-    "cone": ("instrument.sight", _cone),
+    "cone": ("instrument.sight", lambda text: text if any(map(str.isalpha, text)) else f"{text} deg"),
     "facing": ("target.facing", _direction),
     "box": ("collision.box", _box),
     "obstacles": ("obstacle", _obstacles),

@@ -284,7 +284,8 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
     The session has to be locked.
     """
     clear_staging(session)
-    _move_export(session)
+    with suppress(OSError):  # the folder of a session with the other stages is missing, or this one has files
+        os.replace(session.path(EXPORT[not session.dynamic]), session.path(session.export))
     while True:
         state = next((each for each in states(session) if each.kind not in (DONE, KEPT)), None)
         if state is None or state.kind == WAITING:
@@ -324,9 +325,3 @@ def forget(session: Session, step: SessionStep) -> None:
     """Mark a step and all steps after it to be run again."""
     there = _steps_of(session)
     session.write_state(read_state(session).without(*(later.name for later in there[there.index(step) :])))
-
-
-def _move_export(session: Session) -> None:
-    """Rename the folder of the export after dynamics were switched on or off in ``session.toml``."""
-    with suppress(OSError):  # the other folder is missing, or this one has files
-        os.replace(session.path(EXPORT[not session.dynamic]), session.path(session.export))
