@@ -74,7 +74,7 @@ class Table:
         return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [plain_text(str(cell)) for cell in cells]
 
     def block(self, head: str) -> np.ndarray | None:
-        """Return columns head1, head2, … as (m, n) floats; None without any."""
+        """Return the columns head1, head2, … as one array (m, n); None if the table has none of them."""
         names = [name for name in self.header if name.startswith(head) and name[len(head) :].isdigit()]
         return np.column_stack([self.numbers(name) for name in names]) if names else None
 
@@ -111,7 +111,7 @@ class Table:
         unit = own or unit
         if unit and unit.lower() not in known:
             expected = ", ".join(name for name in known if name.isascii())
-            self.fail(f"unit [{unit}] is none of {expected}", name)
+            self.fail(f"unit [{unit}] is not one of {expected}", name)
         return known[unit.lower()] if unit else 1.0
 
     def where(self, keep: np.ndarray) -> Table:

@@ -61,7 +61,7 @@ class Joints:
 
     @staticmethod
     def of(given: Joints | Sequence[str]) -> Joints:
-        """Return `given`, or revolute joints without limits of these names."""
+        """Return the joints; from names alone, revolute joints without limits."""
         return given if isinstance(given, Joints) else Joints(tuple(given))
 
     def __post_init__(self) -> None:

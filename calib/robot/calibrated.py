@@ -67,7 +67,7 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
-    """Deflection terms with their coefficients (E,); gravity torques (m, n) are given with the poses if needed.
+    """Deflection terms (joint corrections) with their coefficients (E,).
 
     Attributes:
         terms: the E effects.
@@ -100,7 +100,7 @@ def _name(term: Term, chain: Chain) -> str:
 
 
 def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
-    """Return the bases b (E, m) of all terms at joint values q (m, n).
+    """Return the value of each term's basis function (E, m) at joint values q (m, n).
 
     Args:
         deflection: the terms, with their reference chain.
@@ -121,7 +121,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
             result[e] = q[:, term.source]
     if where := [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]:
         if (chain := deflection.reference) is None:
-            raise CalibError("sag terms need the reference chain of the deflection")
+            raise CalibError("sag terms need the chain that levers are taken from (reference)")
         gravity = chain.gravity / np.linalg.norm(chain.gravity)
         across = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))  # (z × u) · ĝ = (ĝ × z) · u
         links, place = joint_frames(chain, q), {name: k for k, name in enumerate(chain.names)}

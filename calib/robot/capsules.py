@@ -95,7 +95,7 @@ def _beyond(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
 
 
 def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
-    """Return the signed distances (...) [m] without normals, in a third of the time."""
+    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, without normals."""
     local = _seen_from(obstacle, points)
     if obstacle.kind == "sphere":
         return np.linalg.norm(local, axis=-1) - obstacle.size[0]
@@ -189,7 +189,7 @@ class _Lines:
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """Arm of capsules with walls and obstacles; same methods as `calib.robot.collision.Collision`.
+    """Collision model of an arm of capsules, walls and obstacles; same methods as `calib.robot.collision.Collision`.
 
     Attributes:
         chain: the arm.

@@ -64,7 +64,7 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
     wide = {joint.name: max(-joint.lower, joint.upper) for joint in chain.joints if joint.unit != "m"}
     if wide := {name: angle for name, angle in wide.items() if MAX_TURN < angle < np.inf}:
         furthest = max(wide.values())
-        found.append(f"{listing(wide, 4)}: limits up to {furthest:g} rad in the robot's description; degrees?")
+        found.append(f"{listing(wide, 4)}: limits up to {furthest:g} rad in the robot's description; are they degrees?")
     masses = () if chain.inertias is None else chain.inertias
     if bare := [joint.name for joint, body in zip(chain.joints, masses) if not body.any()]:
         found.append(f"body after {listing(bare, 4)}: mass not stated, taken as zero")
@@ -93,7 +93,9 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
     # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
     max_density = 1000.0
     if total > max_density * length**3:
-        lines.append(f"its bodies weigh {total:.4g} kg, the stretched arm is {length:.3g} m long: grams?")
+        lines.append(
+            f"its bodies weigh {total:.4g} kg, the stretched arm is {length:.3g} m long: are the masses in grams?"
+        )
     return tuple(lines)
 
 
@@ -108,13 +110,13 @@ def _impossible(body: np.ndarray, length: float, rounding: float = 1e-6, max_exc
     if mass <= 0.0:
         return f"no mass (M = {mass:g} kg)" if mass == 0.0 else f"a negative mass (M = {mass:g} kg)"
     if np.linalg.norm(first) > mass * length:
-        return f"a centre of mass beyond the arm ({np.linalg.norm(first) / mass:.3g} m from its joint: millimetres?)"
+        return f"a centre of mass beyond the arm ({np.linalg.norm(first) / mass:.3g} m from its joint: in millimetres?)"
     xx, xy, xz, yy, yz, zz = body[:6]
     about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     moments = np.linalg.eigvalsh(about - (first @ first * np.eye(3) - np.outer(first, first)) / mass)
     if moments[2] > mass * length**2:
         reach = np.sqrt(moments[2] / mass)
-        return f"an inertia too large for the arm (radius of gyration {reach:.3g} m: kg mm²?)"
+        return f"an inertia too large for the arm (radius of gyration {reach:.3g} m: is it in kg mm²?)"
     if moments[0] < -rounding * mass * length**2:
         return f"a negative moment of inertia ({moments[0]:.3g} kg m² about its centre of mass)"
     if moments[2] > (1.0 + max_excess) * (moments[0] + moments[1]) + rounding * mass * length**2:

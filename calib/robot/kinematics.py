@@ -233,7 +233,7 @@ def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) ->
 
 
 def _rotate(rotation: np.ndarray, axis: int, angle: np.ndarray | float) -> np.ndarray:
-    """Return frames rotated about one of their own axes (two columns change)."""
+    """Return frames rotated about one of their axes by an angle."""
     cosine, sine = np.cos(angle), np.sin(angle)
     one, two = (axis + 1) % 3, (axis + 2) % 3
     result = np.empty_like(rotation)

@@ -130,9 +130,9 @@ def test_a_cell_that_is_no_number_is_named(write, cell, words):
 @pytest.mark.parametrize(
     ("heading", "dimension", "unit", "words"),
     [
-        ("x [furlong]", "length", "", "is none of"),
-        ("x [deg]", "length", "", "is none of"),
-        ("x [m]", "angle", "", "is none of"),
+        ("x [furlong]", "length", "", "is not one of"),
+        ("x [deg]", "length", "", "is not one of"),
+        ("x [m]", "angle", "", "is not one of"),
         ("x [mm]", "length", "m", r"header states \[mm\], the options state m"),
         ("xx", "length", "", r"'x' is missing"),
     ],

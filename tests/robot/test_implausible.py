@@ -67,7 +67,7 @@ def test_impossible_bodies_are_named(change, said):
     ("limits", "words"),
     [
         ({"velocity": 0.0}, "a: velocity 0 in the robot's description is not a limit; ignored"),
-        ({"lower": -360.0, "upper": 360.0}, "a: limits up to 360 rad in the robot's description; degrees?"),
+        ({"lower": -360.0, "upper": 360.0}, "a: limits up to 360 rad in the robot's description; are they degrees?"),
     ],
 )
 def test_limits_of_zero_or_of_many_turns_are_remarks(limits, words):

@@ -1,4 +1,4 @@
-"""Meaning of the columns of a measurement file, by our names, the robot's joint names, and the options."""
+"""Columns of a measurement file: which quantity each of them contains, by its name and the options."""
 
 import re
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table and the options to read it with.
+    """A table of a file, and the options for reading it.
 
     Attributes:
         table: as the file has it.
@@ -52,11 +52,11 @@ class Sheet:
     suffixes: tuple[str, ...] = SUFFIXES
 
     def fail(self, message: str, column: str | None = None) -> NoReturn:
-        """Refuse the file, or a column of it."""
+        """Raise the error for the file, or for one of its columns."""
         self.table.fail(message, column)
 
     def find(self, name: str) -> str:
-        """Return the file's name for our column `name`; "" if the file has no such column."""
+        """Return the file's name of the toolkit's column `name`; "" if the file has no such column."""
         theirs = self.options.columns.get(name, name)
         return theirs if theirs in self.table else ""
 
@@ -161,7 +161,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Layout:
-    """File's names of the columns to read.
+    """Names of a file's columns that are read, by what they contain.
 
     Attributes:
         kind: one of `KINDS`.
@@ -197,7 +197,7 @@ class Layout:
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
-    """Return the columns of a table to be read for a robot with these joints.
+    """Return which columns of a table are read, for a robot with these joints.
 
     Raises:
         MeasurementError: where a column is missing or mapped in vain, or the header allows several kinds, or several
@@ -207,7 +207,7 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     found = _layout(sheet, joints)
     numbers = (*found.joints, *(name for names in found.positions for name in names), *found.orientation)
     if twice := sorted({name for name in numbers if numbers.count(name) > 1}):
-        message = "is read as two different columns: is one of them mapped by mistake? See [columns]"
+        message = "is read as two different columns: correct [columns] in the options"
         sheet.fail(message, twice[0])
     if found.kind == "pose":
         _check_one_source(sheet, found.positions[0], found.orientation)

@@ -95,7 +95,9 @@ class CameraOptions:
     mounting: Annotated[str, OneOf(("auto", IN_HAND, TO_HAND))] = "auto"
     intrinsics: Annotated[str, OneOf(("auto", "given", "fit"))] = "auto"
     model: Annotated[str, OneOf(("pinhole", "fisheye"))] = "pinhole"
-    board: Annotated[tuple[Annotated[str, OneOf(("scale", "bend"))], ...], Expect("a list of scale, bend")] = ()
+    board: Annotated[
+        tuple[Annotated[str, OneOf(("scale", "bend"))], ...], Expect("a list of 'scale', 'bend' or both")
+    ] = ()
 
 
 @strict

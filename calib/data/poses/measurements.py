@@ -19,7 +19,7 @@ from calib.records import frozen
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurements:
-    """m measured rows of one kind from one file, with the fields common to all kinds.
+    """Measurements of one kind from one file, m rows: the fields that all kinds share.
 
     Attributes:
         q: (m, n) joint values [rad or m], columns as in ``joint_names``.
@@ -102,7 +102,7 @@ class PoseMeasurements:
 
     @property
     def measured(self) -> np.ndarray:
-        """(m, k) numbers by which measurements at the same joint values differ."""
+        """(m, k) measured numbers of each row, by which repeated rows are recognised."""
         return np.zeros((len(self), 0))
 
     @property
@@ -121,7 +121,7 @@ _COUNTS = {"tool": 0, "group": 0, "rows": 1}  # whole numbers, and what they cou
 
 @dataclass(frozen=True, eq=False)
 class Positions(PoseMeasurements):
-    """p in the station's frame.
+    """Positions of the tool point, measured in the station's frame.
 
     Attributes:
         position: (m, 3) [m].
@@ -143,7 +143,7 @@ class Positions(PoseMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Poses(Positions):
-    """p and R in the station's frame.
+    """Poses of the tool frame, measured in the station's frame.
 
     Attributes:
         quaternion: (m, 4) x y z w of unit norm.
@@ -165,7 +165,7 @@ class Poses(Positions):
 
 @dataclass(frozen=True, eq=False)
 class GroupedMeasurements(PoseMeasurements):
-    """Rows with relative measurements within groups, without an instrument.
+    """Measurements within groups of rows, for which no instrument has to be placed.
 
     Attributes:
         group: (m,) index of the socket, plane, pair or bar centre.
@@ -185,7 +185,7 @@ class GroupedMeasurements(PoseMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Distances(GroupedMeasurements):
-    """|p_a - p_b| of the two rows of a group.
+    """Distances |p_a - p_b| between the tool points of the two rows of a group.
 
     Attributes:
         distance: (m,) [m], the same in both rows of a pair; so is ``sigma`` (m,).
@@ -206,7 +206,7 @@ class Distances(GroupedMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Bars(GroupedMeasurements):
-    """|p - c| with one unknown point c per group (a ball bar's other end).
+    """Distances |p - c| from the tool point to one unknown point per group (the other end of a ball bar).
 
     Attributes:
         distance: (m,) [m], with ``sigma`` (m,).
@@ -223,7 +223,7 @@ class Bars(GroupedMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Sockets(GroupedMeasurements):
-    """p is one unknown fixed point per group; ``sigma`` (m, 3).
+    """Rows of a group whose tool points coincide, in a socket of unknown position; ``sigma`` (m, 3).
 
     Attributes:
         links: known distances between sockets, each (group, group, distance [m]).
@@ -238,7 +238,7 @@ class Sockets(GroupedMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Planes(GroupedMeasurements):
-    """p lies on one unknown plane per group; ``sigma`` (m,) along its normal."""
+    """Rows of a group whose tool points lie on one unknown plane; ``sigma`` (m,) is along its normal."""
 
     kind: ClassVar[str] = "plane"
 

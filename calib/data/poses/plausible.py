@@ -84,7 +84,7 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
 
 
 def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) -> PoseMeasurements:
-    """Return a block in memory with the notes of the checks that files undergo; refuse what they refuse."""
+    """Return measurements in memory with the notes of the checks; refuse them where a file would be refused."""
     q, joints = np.asarray(block.q), tuple(block.joint_names)
     place = block.file or "measurements in memory"
     message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"

@@ -72,7 +72,7 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
     common: dict[str, Any] = {
         "group": group, "group_names": names, "tool": tool, "tool_names": tool_names, "file": table.file,
         "rows": table.rows,
-        "notes": (f"one row alone determines nothing: {layout.kind} {', '.join(single[:5])}",) if single else (),
+        "notes": (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",) if single else (),
     }  # fmt: skip
     stated = None if options.sigma.position is None else np.tile(options.sigma.position, (len(q), 1))
     if layout.kind == Sockets.kind:
@@ -152,7 +152,7 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
 
 
 def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndarray) -> Positions:
-    """Return the block with its measurements relative to the base frame that was measured with every row.
+    """Return measurements expressed in the base frame that was measured with every row.
 
         p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
         Σ_p = R_bᵀ (Σ_t + Σ_b + [l]× Σ_rb [l]×ᵀ) R_b,  l = p_t - p_b;   Σ_r = R_bᵀ (Σ_rt + Σ_rb) R_b
@@ -286,7 +286,7 @@ def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
     position = sheet.numbers(names, POSITION, gaps)
     empty = np.isnan(position)
     partial = empty & ~empty.all(axis=1, keepdims=True)
-    message = f"is empty, others of {', '.join(names)} are not; leave all of them empty for a target not seen"
+    message = f"is empty, others of {', '.join(names)} are not: leave all of them empty where a target was not seen"
     refuse(sheet.table, partial, names, lambda row, k: message)
     return position
 

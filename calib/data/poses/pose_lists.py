@@ -80,7 +80,7 @@ def write_poses(
 
 
 def filled_in(path: Path, joints: int) -> bool:
-    """Return whether a list of planned poses also has measurements, added by the user."""
+    """Return whether the user has entered measurements into a list of planned poses."""
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:]
     return any(cell.strip() for line in lines for cell in re.split("[,;\t]", line)[joints:])
 
@@ -105,7 +105,7 @@ def read_poses(
 
 
 def check_planned(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
-    """Return the notes of `calib.data.poses.plausible.check_joints`; a plan may repeat one pose."""
+    """Check planned joint values and return the notes of `check_joints`; a plan may repeat one pose."""
     moves = np.ptp(q, axis=0).max() > BOUNDS.min_travel
     return plausible.check_joints(q if moves else q[:1], sheet, columns, robot)
 
@@ -142,7 +142,7 @@ def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _matched(these: np.ndarray, those: np.ndarray, near: float) -> np.ndarray:
-    """Return which rows of `those` are within `near` (largest joint difference) of a row of `these`."""
+    """Return the mask of rows of `those` with a row of `these` within `near` (largest joint difference)."""
     distance, _ = KDTree(these).query(those, p=math.inf)
     return distance <= near
 
@@ -176,7 +176,7 @@ def _explain(
 
 
 def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the measured column (n,) that best fits each planned joint, and its sign (n,).
+    """Return which measured column fits each planned joint best (n,), and its sign (n,).
 
     Each pair of columns is compared as two sets of numbers (mean distance to the nearest one, at most 1), so that order
     and completeness of the rows do not matter; the assignment minimises the sum.
@@ -198,7 +198,7 @@ SUFFIXES = ("", "_target")
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Targets from one file, m rows.
+    """Targets of a compensation from one file, m rows.
 
     Attributes:
         q: (m, n) nominal joint values [rad or m]; None where the file has none.

@@ -48,7 +48,7 @@ def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, e
 
 
 def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps (N,) [s] and positions (N, n) of an archive without torques: q_ref, else q."""
+    """Return the stamps (N,) [s] and reference positions (N, n) of an archive: q_ref, or q without it."""
     with _opened(path) as archive:
         found = find_names(tuple(archive.members), options, path)
         ours = "q_ref" if "q_ref" in found else "q"
@@ -102,11 +102,11 @@ class _Archive:
             shape, fortran, dtype = read(stream)
         size = prod(shape) * dtype.itemsize
         if dtype.hasobject:
-            self.fail("holds Python objects, which are not read (they could run code): save plain arrays", name)
+            self.fail("contains Python objects, which could run code and are not read: save plain arrays", name)
         if any(length < 0 for length in shape) or size > self.file.getinfo(member).file_size:
             self.fail(f"states the shape {shape}, but the file is shorter: is the copy complete?", name)
         if size > MAX_BYTES:
-            self.fail(f"holds {size / 1e9:.3g} GB, more than {MAX_BYTES / 1e9:g}: cut the recording", name)
+            self.fail(f"has {size / 1e9:.3g} GB, the limit is {MAX_BYTES / 1e9:g} GB: save a shorter recording", name)
         return stream, shape, fortran, dtype
 
     def read(self, name: str, rows: slice | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
@@ -219,7 +219,9 @@ def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: En
     if not 0 <= first < end <= len(t):
         archive.fail(f"is {first} to {end}, the file has {len(t)} samples", "use_range")
     whole = first == 0 and end == len(t)
-    return slice(first, end), [] if whole else [f"rows {first + 1} to {end} of {len(t)} are used, by its use_range"]
+    return slice(first, end), [] if whole else [
+        f"rows {first + 1} to {end} of {len(t)} are used, as its use_range states"
+    ]
 
 
 def _names(archive: _Archive) -> list[str]:

@@ -119,7 +119,7 @@ def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        refuse_data(path, f"this message has no {ours} for its joints, others have", ours, missing[0] + 1)
+        refuse_data(path, f"this message has no {ours}, other messages have", ours, missing[0] + 1)
     return np.array(values)
 
 

@@ -53,7 +53,7 @@ NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
 def check_recording(recording: Recording, joints: Joints | None = None) -> Recording:
-    """Return the recording with the notes of all checks, or refuse it.
+    """Return the recording with notes on odd values; refuse impossible ones.
 
     Raises:
         MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
@@ -118,7 +118,7 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     note = (
         f"row {recording.rows[row]}: the {columns[j]} is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
         f"{more}, the other rows are within "
-        f"{size[~rows, j].max():.4g} of its median: a spike of the log, not used"
+        f"{size[~rows, j].max():.4g} of its median: taken as a spike of the log and not used"
     )
     return _noted(recording.take(~rows), note)
 
@@ -165,7 +165,11 @@ def _check_time(recording: Recording) -> None:
         likely = next(
             (unit for unit, factor in units.items() if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate), ""
         )
-        hint = f"stamps look like {likely}; if so, state it (units: t = '{likely}')" if likely else "check the stamps"
+        hint = (
+            f"stamps look like {likely}; if so, state the unit (units: t = '{likely}')"
+            if likely
+            else "check the stamps"
+        )
         refuse_data(recording.file, f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", "t")
 
 
@@ -178,7 +182,8 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
         most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
     check_travel(
         recording.q, most, recording, _columns(recording, "q"), recording.joint_names, kinds,
-        lambda j, other: f"looks like {other}; if so, state it (header 'q{j + 1} [{other}]', or units: q = '{other}')",
+        lambda j, other: f"looks like {other}; if so, state the unit (header 'q{j + 1} [{other}]', or "
+        f"units: q = '{other}')",
     )  # fmt: skip
 
 
@@ -194,8 +199,9 @@ def _check_speed(recording: Recording) -> None:
     for j in np.flatnonzero(alike & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
         for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
-                message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, state it in header or units"
-                refuse_data(recording.file, message, _columns(recording, "v")[j])
+                found = f"v is {ratio[j]:.3g} times the slope of q: {wrong}"
+                words = f"{found}; if so, state the unit in the header or in units"
+                refuse_data(recording.file, words, _columns(recording, "v")[j])
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
@@ -242,8 +248,8 @@ def _still(recording: Recording) -> list[str]:
         travel = "is one number" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
         notes.append(
-            f"{recording.joint_names[j]} never moves (its position {travel}{effort}): what only its motion excites "
-            "cannot be identified from this file"
+            f"{recording.joint_names[j]} never moves (its position {travel}{effort}): parameters that only its "
+            "motion excites cannot be identified from this file"
         )
     return notes
 
@@ -268,13 +274,13 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
         )
         refuse_data(recording.file, message, _columns(recording, "effort")[j])
     notes = [
-        f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: another unit?"
+        f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: is it in another unit?"
         for j in np.flatnonzero(most > 1.2 * limit)
     ]
     if (most < 0.03 * limit)[known].all():
         notes.append(
-            "no torque reaches 3 % of its joint's limit: currents, or torques before the gear? If currents,"
-            " state kind = 'current': their gains are then identified"
+            "no torque reaches 3 % of its joint's limit. If these are currents, set kind = 'current': their gains are "
+            "then identified. If they are torques before the gear, multiply them by the gear ratio"
         )
     return notes
 

@@ -22,7 +22,7 @@ _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """N samples of n joints from one file, as they were logged.
+    """Logged samples from one file: N samples of n joints.
 
     Attributes:
         t: (N,) time since the file's first sample [s], strictly rising, not necessarily uniform; a part that was cut
@@ -163,7 +163,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
         for name in LATE
         if (value := getattr(recording, name)) is not None
     }
-    notes = (*recording.notes, f"torques are shifted {1e3 * lag:g} ms earlier, as stated by lag")
+    notes = (*recording.notes, f"torques are shifted {1e3 * lag:g} ms earlier, as the option lag states")
     return replace(recording, notes=notes, **moved).take(inside)
 
 
@@ -194,7 +194,7 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
         try:
             ends.append(float(part) if part.strip() else None)
         except ValueError as error:
-            message = f"{text}: '{part}' is not a time in seconds; write a cut as log.npz@0:9.4"
+            message = f"{text}: '{part}' is not a time in seconds; to use a part of a recording, write log.npz@0:9.4"
             raise UsageError(message) from error
     start, stop = ends
     if start is not None and start < 0.0:

@@ -72,7 +72,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
 
 
 def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps (N,) [s] and positions (N, n) of a table without torques: q_ref, else q."""
+    """Return the stamps (N,) [s] and reference positions (N, n) of a table: q_ref, or q without it."""
     table = _numbered_brackets(read_table(path, doubles=True))
     here = replace(options, names={key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")})
     found = _find(table, here, joints.names)
@@ -95,7 +95,7 @@ def _numbered_brackets(table: Table) -> Table:
 
 
 def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
-    """Return our name → indices of its columns, in the robot's order."""
+    """Return the column indices of each series, in the robot's order, by the toolkit's name."""
     found = {}
     for ours, synonyms in SYNONYMS.items():
         stems = (options.names[ours],) if ours in options.names else synonyms
@@ -161,7 +161,7 @@ def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions
     if options.rate:
         return np.arange(len(table)) / options.rate
     wanted = ", ".join(SYNONYMS["t"])
-    message = f"has no column of stamps ({wanted}), the options state no rate; found: {', '.join(table.header)}"
+    message = f"has no column of stamps ({wanted}), and the options state no rate; found: {', '.join(table.header)}"
     table.fail(message)
 
 

@@ -138,7 +138,7 @@ def stem_of(name: str) -> tuple[str, int | None]:
 
 
 def plain_stems(stems: Sequence[str]) -> dict[str, str]:
-    """Return stem → stem, and also the stem without leading words of `MEASURED` → stem, if only one fits."""
+    """Return a map from each stem, and from its form without leading words of `MEASURED` if unique, to it."""
     short: dict[str, list[str]] = {}
     for stem in stems:
         words = stem.split("_")
@@ -149,7 +149,7 @@ def plain_stems(stems: Sequence[str]) -> dict[str, str]:
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
-    """Return our name → the file's name, for all series of the file."""
+    """Return the file's name of each series in it, by the toolkit's name."""
     plain = {stem: member for member in reversed(members) if not (named := stem_of(member))[1] for stem in [named[0]]}
     plain = {name: plain[stem] for name, stem in plain_stems(tuple(plain)).items()}
     found = {}

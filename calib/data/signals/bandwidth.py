@@ -71,7 +71,7 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     position, why = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
     factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
     band = USABLE * sampled.rate / (2 * factor)
-    reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, to the next whole n_d = {factor})"]
+    reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"]
     return Cutoffs(dynamics, position, band, factor, frozen(np.sqrt(floor * sampled.rate / 2)), tuple(reasons))
 
 

@@ -18,7 +18,7 @@ MAX_STATES = 20_000  # states of a motion that are compared
 
 @dataclass(frozen=True)
 class ExcitationReport:
-    """Richness of the motion of the joints.
+    """How richly a motion excites the robot.
 
     Attributes:
         functions: number of independent functions of time in all positions (2 for one sine).
@@ -34,7 +34,7 @@ class ExcitationReport:
 
 
 def report_excitation(motion: Motion) -> ExcitationReport:
-    """Return the richness of a motion, from the positions of its longest segment.
+    """Return how richly a motion excites the robot, from the positions of its longest segment.
 
     One frequency cannot separate inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
     """
@@ -55,7 +55,9 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     if len(moving) and one_frequency:
         low, high = strongest.min(), strongest.max()
         hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
-        notes.append(f"each joint moves at one frequency ({hertz}): inertia looks like gravity or stiffness")
+        notes.append(
+            f"each joint moves at one frequency ({hertz}): inertia cannot be distinguished from gravity or stiffness"
+        )
     correlation = unit.T @ unit
     min_correlation = 0.98  # of two joints that move as one
     pairs = [f"{names[i]}–{names[j]}" for i, j in combinations(moving, 2) if abs(correlation[i, j]) > min_correlation]

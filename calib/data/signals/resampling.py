@@ -134,7 +134,7 @@ def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.nd
 
 
 def _lost(t: np.ndarray, step: float, late_samples: int = 15) -> np.ndarray:
-    """Return (N - 1,) how many samples are missing in each step: whole steps by which later stamps stay late.
+    """Return the number of samples missing in each step (N - 1,): whole steps by which later stamps stay late.
 
     `late_samples`: samples over which it is judged whether the stamps stay late.
     """
@@ -200,7 +200,9 @@ class SamplingReport:
         kind, times = self.clock.kind, self.clock.times
         if kind != "stamps":
             share = self.clock.roughness[kind]
-            lines.append(f"samples dated {kind}, not by stamps: positions {1 / share:.3g} times smoother")
+            lines.append(
+                f"samples are dated by the clock '{kind}', not by stamps: positions are {1 / share:.3g} times smoother"
+            )
         if kind == "counted" and abs(times - 1.0) > APART:
             lines.append(f"step from measured velocities / step from stamps: {times:.4g}")
         if self.repeated:

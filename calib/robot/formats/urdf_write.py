@@ -243,7 +243,7 @@ def _check_pair(nominal: Chain, calibrated: Chain) -> None:
     if nominal.joint_names != calibrated.joint_names or one != two:
         raise RobotError(
             f"the calibrated chain '{calibrated.name}' (joints {', '.join(calibrated.joint_names)}) does not move as "
-            f"the nominal '{nominal.name}' (joints {', '.join(nominal.joint_names)}); give its own nominal robot"
+            f"the nominal '{nominal.name}' (joints {', '.join(nominal.joint_names)}); give its nominal robot"
         )
 
 

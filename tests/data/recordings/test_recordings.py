@@ -72,7 +72,7 @@ def test_use_range_is_followed_unless_a_cut_says_otherwise(archive):
     path = archive(use_range=np.array([400, 2000]))
     recording = read_recording(path)
     assert len(recording) == 1600 and recording.t[0] == 2.0 and recording.rows[0] == 401
-    assert recording.notes == ("rows 401 to 2000 of 2400 are used, by its use_range",)
+    assert recording.notes == ("rows 401 to 2000 of 2400 are used, as its use_range states",)
     assert len(read_recording(f"{path}@0:12")) == 2400
     assert len(read_recording(path, options=RecordingOptions(use_range=False))) == 2400
 
@@ -205,7 +205,7 @@ def test_values_that_cannot_be(archive, series):
     tau[12, 1] = tau[80, 2] = np.nan
     error = refused(archive(tau=tau), r"found nan; .* \(and in 1 more rows\)")
     assert (error.row, error.column) == (13, "torque of b (joint 2)")
-    refused(archive(q=np.degrees(series["q"])), r"looks like deg; if so, state it \(header 'q1 \[deg\]'")
+    refused(archive(q=np.degrees(series["q"])), r"looks like deg; if so, state the unit \(header 'q1 \[deg\]'")
     refused(archive(dq=np.degrees(series["dq"])), "the velocities look like deg/s")
     refused(archive(q=np.degrees(series["q"]), dq=series["dq"]), "deg", None)
     tau = series["tau"].copy()
@@ -225,7 +225,7 @@ def test_what_is_odd_is_noted(archive, series):
     notes = read_recording(archive(tau=-series["tau"]), ROBOT).notes
     assert any("is their sign reversed?" in note for note in notes)
     notes = read_recording(archive(tau=series["tau"] / 80), ROBOT).notes
-    assert any("currents, or torques before the gear" in note for note in notes)
+    assert any("no torque reaches 3 % of its joint" in note for note in notes)
     notes = read_recording(archive(tau=series["tau"] * [10, 1, 1]), ROBOT).notes
     assert any("its limit is 100" in note for note in notes)
     narrow = Joints(("a", "b", "c"), lower=np.full(3, -0.1), upper=np.full(3, 0.1))
