@@ -125,6 +125,7 @@ class TorqueLimit:
         deviations: k.
         margin: a share of the limits besides.
         torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ, where that is cheaper than `product`; or None.
+        rows: names of the n rows; default joint 1, 2 ...
     """
 
     regressor: Regressor
@@ -137,6 +138,7 @@ class TorqueLimit:
     torque_product: TorqueProduct | None = None
     name: str = "torque"
     unit: str = "N m"
+    rows: tuple[str, ...] = ()
     joints: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -149,7 +151,8 @@ class TorqueLimit:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return tuple(f"joint {j + 1} {side}" for side in ("upper", "lower") for j in self.joints)
+        names = self.rows or tuple(f"joint {j + 1}" for j in range(len(self.limits)))
+        return tuple(f"{names[j]} {side}" for side in ("upper", "lower") for j in self.joints)
 
     @property
     def scale(self) -> np.ndarray:
@@ -169,7 +172,7 @@ class TorqueLimit:
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.joints)
-        signed, result = np.zeros(motion.q.shape), np.zeros((4, *motion.q.shape))
+        signed, result = np.zeros((len(motion), len(self.limits))), np.zeros((4, *motion.q.shape))
         signed[:, self.joints] = weights[:, :k] - weights[:, k:]
         if self.covariance is None and self.torque_product is not None:
             result[:3] = self.torque_product(motion.q, motion.v, motion.a, self.parameters, signed)

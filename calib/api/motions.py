@@ -15,6 +15,7 @@ from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
 from calib.errors import as_ours
+from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
@@ -105,6 +106,10 @@ class MotionPlan(planning.Planned):
         return "\n".join(folder.plan_lines(self))
 
 
+def _read(options: IdentifySettings | str | Path) -> IdentifyOptions:
+    return options_of(options) if isinstance(options, IdentifySettings) else read_options(options)
+
+
 @checked
 def design_excitation(
     robot: str | Path | CalibratedChain | Mechanism,
@@ -112,6 +117,7 @@ def design_excitation(
     *,
     model: DynamicsModel | MechanismResult | str | Path | None = None,
     limits: Tables | None = None,
+    options: IdentifySettings | str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -125,6 +131,8 @@ def design_excitation(
         settings: period, harmonics, goals, effort of the search, playback, seed.
         model: identified dynamics, in memory or in a folder: they predict the torques.
         limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``), or its tables.
+        options: of the identification that will follow, as `calib.identify_dynamics` takes them: its torque rows, drive
+            terms, couplings and payloads are what the motion is designed for.
         workers: local processes, or the address of a Dask scheduler.
         progress: called with a few words now and then.
 
@@ -143,7 +151,7 @@ def design_excitation(
             return stage.run(settings, model=place, limits=optional(limits), map=crew.map, progress=progress)
         designed = design.excite(
             cast(Any, robot), settings, model=place, limits=optional(limits), base=base, tip=tip,
-            map=crew.map_without(lost), progress=progress,
+            options=None if options is None else _read(options).settings, map=crew.map_without(lost), progress=progress,
         )  # fmt: skip
     return ExcitationDesign(**vars(replace(designed, notes=(*designed.notes, *map(str, lost)))))
 

@@ -72,6 +72,7 @@ def excite(
     settings: ExcitationSettings,
     model: Path | None = None,
     limits: Path | None = None,
+    options: Path | None = None,
     workers: str = "1",
     base: str | None = None,
     tip: str | None = None,
@@ -83,15 +84,17 @@ def excite(
         out: folder for the motion, its figures and metrics.json
         model: folder of an identification: predicts the torques
         limits: TOML: speeds, torques, workspace, collision, friction
+        options: TOML: options of the identification that will follow (rows, drives, couplings, payloads)
     """
     from calib.api.motions import design_excitation
     from calib.workers import finishing
 
-    check_destination("excite", robot, out, [robot, model, limits, *settings.existing])
+    check_destination("excite", robot, out, [robot, model, limits, options, *settings.existing])
     with progress() as say:
         designed = design_excitation(
-            robot, settings, model=model, limits=limits, base=base, tip=tip, workers=workers, progress=say
-        )
+            robot, settings, model=model, limits=limits, options=options, base=base, tip=tip, workers=workers,
+            progress=say,
+        )  # fmt: skip
         say("writing")
         with finishing():
             designed.save(out, plots=plots)

@@ -10,7 +10,7 @@ of pivots, so that no rounding of a BLAS library decides between equals.
 Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrated one, where it holds only nearly.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -302,6 +302,7 @@ def columns_at_rest(
     lower: np.ndarray,
     upper: np.ndarray,
     known: np.ndarray | None = None,
+    unused: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the indices (c,) of base columns that stay independent when some joints are at rest.
 
@@ -310,13 +311,14 @@ def columns_at_rest(
         resting: joint → its position at rest [rad or m]; None: one random position.
         lower, upper: (n,) finite limits of the random states at which columns are compared.
         known: (b, b) information of other motions, in which those joints may move.
+        unused: torque rows that do not count; default those of the resting joints.
     """
     states = random_samples(model.model, lower=lower, upper=upper)
     q, v, a = (np.array(x) for x in (states.q, states.v, states.a))
     for j, value in resting.items():
         q[:, j], v[:, j], a[:, j] = q[0, j] if value is None else value, 0.0, 0.0
     Y = model.regressor(q, v, a)
-    Y[:, list(resting)] = 0.0
+    Y[:, list(resting) if unused is None else unused] = 0.0
     rows = Y.reshape(-1, Y.shape[-1])
     if known is not None:
         values, V = np.linalg.eigh(known)

@@ -157,16 +157,18 @@ class TorqueSlack:
         joints: which.
         parameters: (b,) χ, of the regressor's columns.
         limits: (n,) τ_max [N m or N].
+        label: name; default: by the joints.
     """
 
     joints: tuple[int, ...]
     parameters: np.ndarray
     limits: np.ndarray
     smoothing: float = 1e-3
+    label: str = ""
 
     @property
     def name(self) -> str:
-        return "torque slack of joints " + ", ".join(str(j + 1) for j in self.joints)
+        return self.label or "torque slack of joints " + ", ".join(str(j + 1) for j in self.joints)
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         chosen = list(self.joints)

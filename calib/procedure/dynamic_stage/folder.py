@@ -12,7 +12,16 @@ import numpy as np
 from calib import files
 from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
-from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT, check_target, write_covariance, write_staged
+from calib.folders import (
+    COVARIANCE,
+    ESTIMATE,
+    METRICS,
+    REPORT,
+    check_target,
+    read_estimate,
+    write_covariance,
+    write_staged,
+)
 from calib.identification.gains import GainRecord
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
@@ -91,6 +100,10 @@ class IdentificationFolder:
         """Read the findings on the model; older folders contain them only as warnings."""
         metrics = self.metrics()
         return metrics.findings or ModelFindings(Resting(), metrics.warnings)
+
+    def essential(self) -> tuple[str, ...]:
+        """Read the names of the essential parameters."""
+        return tuple(row["name"] for row in read_estimate(self.path).rows if row.get("essential"))
 
     def errors(self) -> TorqueErrorModel | None:
         """Read the model's expected torque errors; None if they are unknown."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.config import Tables
 from calib.errors import UsageError, require
+from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.playback import Playback, check_playback, play
@@ -131,7 +132,10 @@ def torque_slack(joints: tuple[int, ...], given: ExcitationInputs, where: str) -
     values, limits = given.model.values, given.limits.torque
     if values is None or not np.isfinite(limits[list(joints)]).all():
         raise UsageError(f"{where}: needs torque limits, and a model or masses to predict torques")
-    return TorqueSlack(joints, values, limits)
+    exact = given.model.exact
+    rows = tuple(exact.limited[:, list(joints)].ravel().tolist())
+    label = f"torque slack of joints {', '.join(str(j + 1) for j in joints)}"
+    return TorqueSlack(rows, values, exact.of_rows(limits), label=label)
 
 
 @dataclass(frozen=True)
@@ -238,6 +242,7 @@ def excite(
     limits: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
+    options: IdentificationSettings | None = None,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Designed:
@@ -253,12 +258,13 @@ def excite(
         settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
+        options: of the identification that will follow: torque rows, drive terms, payloads.
         map: where the starts of the search run (`calib.workers`).
         progress: called with words.
 
     Ctrl-C ends the search; the best motion found so far is verified and returned.
     """
-    given = read_inputs(robot, settings, model, limits, base, tip)
+    given = read_inputs(robot, settings, model, limits, base, tip, options)
     try:
         return search_motion(given, settings, map, progress)
     except NothingFeasible as error:
@@ -425,8 +431,8 @@ def _constraints(
         notes = () if dynamics.friction else (f"{GUARD:.0%} of the torque limits are reserved for friction",)
     torque = [
         TorqueLimit(
-            one.regressor, one.regressor_gradient, dynamics.values, limits.torque, dynamics.covariance,
-            limits.deviations, margin, one.torque_gradient,
+            one.regressor, one.regressor_gradient, dynamics.values, one.of_rows(limits.torque), dynamics.covariance,
+            limits.deviations, margin, one.torque_gradient, rows=one.row_names,
         )
         for one in (dynamics.smooth, dynamics.exact)
     ]  # fmt: skip

@@ -1,22 +1,28 @@
-"""Inputs of an excitation: a robot's model and limits, locked joints, and earlier motions that count."""
+"""Inputs of an excitation: model to identify, loads, limits, locked joints, and earlier motions that count."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import BaseModel, columns_at_rest, information
-from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.base import columns_at_rest, information, standard_name
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.load_cases import LoadCases
+from calib.dynamics.regressor_model import Loads
 from calib.dynamics.shapes import V0
-from calib.errors import UsageError, require
+from calib.dynamics.torque_rows import MOTOR
+from calib.errors import UsageError, one_of, require
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.identify_options import FileSettings
 from calib.identification.model_file import from_table, read_table, refuse_currents
+from calib.identification.settings import IdentificationSettings, make_model
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
@@ -42,8 +48,8 @@ class ExcitedModel:
         notes: what a user should know.
     """
 
-    smooth: BaseModel
-    exact: BaseModel
+    smooth: LoadCases
+    exact: LoadCases
     values: np.ndarray | None
     covariance: np.ndarray | None
     friction: bool
@@ -56,7 +62,7 @@ class IdentifiableColumns:
 
     Attributes:
         columns: (c,) of the model's; None: all of them.
-        sigmas: (n,) infinite for torque rows that are left out; None: all rows count.
+        sigmas: (rows,) infinite for torque rows that are left out; None: all rows count.
         names: of the columns; notes: what a user should know.
     """
 
@@ -111,6 +117,7 @@ def read_inputs(
     limits: Tables | None = None,
     base: str | None = None,
     tip: str | None = None,
+    options: IdentificationSettings | None = None,
 ) -> ExcitationInputs:
     """Read robot, limits, model and earlier motions of an excitation.
 
@@ -118,37 +125,107 @@ def read_inputs(
         robot, base, tip: see `calib.robot.library`.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
+        options: of the identification that will follow: torque rows, drive terms, payloads.
 
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
     """
     chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
-    dynamics = read_model(chain, model, settings.drives, known)
+    dynamics = read_model(chain, model, settings.drives, known, options, settings.loads)
     locked = _read_locked(settings.lock, chain, known.positions)
     prior = read_prior(settings.existing, dynamics, chain)
-    return ExcitationInputs(chain, known, dynamics, locked, identifiable(dynamics, chain, locked, prior), prior)
+    columns = identifiable(dynamics, chain, locked, prior)
+    return ExcitationInputs(chain, known, dynamics, locked, _selected(columns, dynamics, settings, model), prior)
 
 
-def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimits) -> ExcitedModel:
-    """Return the model to excite: of an identification's folder, or the robot's own inertias and stated friction."""
+def read_model(
+    chain: Chain,
+    folder: Path | None,
+    sets: str,
+    limits: MotionLimits,
+    options: IdentificationSettings | None = None,
+    loads: Sequence[str] = (),
+) -> ExcitedModel:
+    """Return the model to excite: of an identification's folder, or the robot's own inertias and stated friction.
+
+    Args:
+        folder: of an identification; its torque rows count, and its payloads that `loads` names.
+        sets: drive terms of motor torques, where there are neither folder nor options.
+        options: of the identification that will follow, where there is no folder.
+        loads: see `ExcitationSettings`.
+
+    Raises:
+        UsageError: for torque rows without bodies, an unknown payload, or one without mass where torques are limited.
+    """
     if folder is not None:
-        return _identified(chain, folder)
-    linear = [joint.kind == "prismatic" for joint in chain.joints]
-    terms = drives.standard([sets] * chain.n, V0, linear)
+        if options is not None:
+            raise UsageError(f"model {folder}: states rows, drives and payloads itself; leave the options out")
+        return _identified(chain, folder, loads)
+    if options is None:
+        linear = [joint.kind == "prismatic" for joint in chain.joints]
+        model = IdentificationModel(bodies_of(chain), drives.standard([sets] * chain.n, V0, linear))
+    else:
+        model = make_model(chain, options)
+    _refuse_rows(model, "options")
+    model, left = _differentiable(model)
+    cases = _loads(loads, model, with_payloads=True)
     known = {} if limits.friction is None else dict(zip(("velocity", "sign"), limits.friction))
-    values, notes = None, ()
+    values, notes = None, list(left)
     if chain.inertias is not None:
         check_bodies(chain, limits.torque)
-        own = [known[one.shape][one.acts[0][0]] if one.shape in known else 0.0 for one in terms]
-        values = np.concatenate([standard_parameters(chain), own])
+        side = "motor" if model.torque_rows.with_motors else "link"  # where all friction counts, as the limits do
+        own = [known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
+               for one in model.columns]  # fmt: skip
+        payloads, said = _stated(options)
+        values = np.concatenate([standard_parameters(chain), *payloads, own])
+        notes += said
         if not known:
-            notes = ("friction is unknown (no model, no [friction]): torques are predicted without it",)
-    return _dynamics(IdentificationModel(bodies_of(chain), terms), values, bool(known), notes)
+            notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
+    return _dynamics(model, cases, values, bool(known), notes)
 
 
-def _identified(chain: Chain, folder: Path) -> ExcitedModel:
-    """Return the model of an identification's folder without its payloads, and the covariance of its columns."""
+def _refuse_rows(model: IdentificationModel, where: str) -> None:
+    rows = model.torque_rows
+    if not rows.has_bodies or rows.projection is not None:
+        raise UsageError(f"{where}: a motion cannot be designed for rows = '{rows.name}'; use motor, link or both")
+
+
+def _stated(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
+    """Return the ten parameters of each payload, and notes on what is assumed about them."""
+    result, notes = [], []
+    for label, load in ({} if options is None else options.payloads).items():
+        if load.mass is None:
+            raise UsageError(f"payload '{label}': state its mass, so that the motion keeps the torque limits with it")
+        if load.com is None:
+            notes.append(f"payload '{label}': no com is stated; torques are predicted with its mass at the tip")
+        result.append(replace(load, com=load.com or (0.0, 0.0, 0.0)).parameters)
+    return result, notes
+
+
+def _loads(texts: Sequence[str], model: IdentificationModel, with_payloads: bool) -> Loads:
+    """Return the payload labels of each run; by default none, then each payload alone if `with_payloads`."""
+    known = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0]
+    if not texts:
+        return ((), *((label,) for label in known)) if with_payloads and known else (None,)
+    result = []
+    for text in texts:
+        labels = () if text == "none" else tuple(part.strip() for part in text.split("+"))
+        for label in labels:
+            one_of(label, known, f"load '{text}': payload", UsageError)
+        result.append(labels)
+    return tuple(result)
+
+
+def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, list[str]]:
+    """Return the model without drive terms that have no derivatives, and a note that names them."""
+    left = [one.name for one in model.columns if not one.form.slopes]
+    notes = [f"the design does not include friction terms without derivatives: {', '.join(left)}"] if left else []
+    return replace(model, terms=tuple(one for one in model.columns if one.form.slopes)), notes
+
+
+def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedModel:
+    """Return the model of an identification's folder with the payloads of the loads, and its covariance."""
     refuse_currents(folder, "an excitation within torque limits")
     table = read_table(folder)
     try:
@@ -160,18 +237,19 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
             message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
             raise UsageError(message) from error
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
+    loads = _loads(texts, found.model, with_payloads=False)
+    run = {label for carried in loads for label in carried or ()}
+    values = dict(zip(found.model.names, found.values))
     bodies = bodies_of(chain).with_gravity(np.asarray(found.model.bodies.gravity))
-    numbers = found.values[: 10 * bodies.count]
-    terms = list(zip(found.model.columns, found.values[found.model.inertial :]))
-    kept = [(one, value) for one, value in terms if one.form.slopes]
-    left = [one.name for one, _ in terms if not one.form.slopes]
-    values = np.array([*numbers, *(value for _, value in kept)])
-    if not np.isfinite(values).all():
-        names = [*bodies.names, *(one.name for one, _ in kept)]
-        raise UsageError(f"{folder}: parameter {names[int(np.argmin(np.isfinite(values)))]} of the model is not finite")
-    notes = [f"predicted torques do not include friction terms without derivatives: {', '.join(left)}"] if left else []
-    model = IdentificationModel(bodies, tuple(one for one, _ in kept))
-    made = _dynamics(model, values, any(one.shape == "sign" for one, _ in kept))
+    for label in table.get("payloads", ()):
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1) if label in run else bodies
+    rows = MOTOR if found.model.torque_rows.projection is not None else found.model.torque_rows
+    model, notes = _differentiable(IdentificationModel(bodies, found.model.columns, rows))
+    own = np.array([values[name] for name in model.names])
+    if not np.isfinite(own).all():
+        name = model.names[int(np.argmin(np.isfinite(own)))]
+        raise UsageError(f"{folder}: parameter {name} of the model is not finite")
+    made = _dynamics(model, loads, own, any(one.shape == "sign" for one in model.columns), notes)
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
@@ -179,15 +257,17 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
 
 
 def _dynamics(
-    model: IdentificationModel, values: np.ndarray | None, friction: bool, notes: tuple[str, ...] = ()
+    model: IdentificationModel, loads: Loads, values: np.ndarray | None, friction: bool, notes: Sequence[str] = ()
 ) -> ExcitedModel:
     smoothed = (
         replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
     )
     smooth = replace(model, terms=tuple(smoothed))
-    found = base_parameters.find(model)
+    found = base_parameters.find(model, loads=loads)
     chosen = None if values is None else found.transform @ values
-    return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, None, friction, notes)
+    return ExcitedModel(
+        LoadCases(smooth, found, loads), LoadCases(model, found, loads), chosen, None, friction, tuple(notes)
+    )
 
 
 def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
@@ -235,16 +315,43 @@ def identifiable(
     if not locked:
         return IdentifiableColumns(None, None, names)
     known = None if prior is None else prior.information
-    kept = columns_at_rest(model.exact, locked, *chain.sampling_limits(), known)
-    sigmas = np.where(np.isin(np.arange(chain.n), list(locked)), np.inf, 1.0)
-    still = ", ".join(chain.joint_names[j] for j in locked)
+    still = np.isin(model.exact.joint_of_row, list(locked))
+    kept = columns_at_rest(model.exact, locked, *chain.sampling_limits(), known, np.flatnonzero(still))
+    sigmas = np.where(still, np.inf, 1.0)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
-        f"locked: {still}; torques of locked joints are not used (stiction); {len(kept)} of {len(names)} "
+        f"locked: {', '.join(chain.joint_names[j] for j in locked)}; torques of locked joints are not used "
+        f"(stiction); {len(kept)} of {len(names)} "
         f"columns are identifiable ({len(gone)} are regrouped or have no effect: {', '.join(gone[:12])}"
         f"{', ...' if len(gone) > 12 else ''})"
     )
     return IdentifiableColumns(kept, sigmas, tuple(names[k] for k in kept), (note,) if gone else ())
+
+
+def _selected(
+    found: IdentifiableColumns, model: ExcitedModel, settings: ExcitationSettings, folder: Path | None
+) -> IdentifiableColumns:
+    """Return the identifiable columns that the settings ask for: names, or those an identification found essential.
+
+    Raises:
+        UsageError: for an unknown parameter, or ``essential`` without a folder.
+    """
+    wanted = list(settings.columns)
+    if not wanted:
+        return found
+    if "essential" in wanted:
+        require(
+            folder is not None, "columns 'essential': needs --model with the folder of an identification", UsageError
+        )
+        wanted.remove("essential")
+        wanted += IdentificationFolder(cast(Path, folder)).essential()
+    standard = model.exact.model.names
+    short = {standard_name(name, standard): name for name in found.names}
+    for name in wanted:
+        one_of(standard_name(name, standard), short, "columns: parameter", UsageError)
+    chosen = {short[standard_name(name, standard)] for name in wanted}
+    kept = np.array([k for k, name in enumerate(model.exact.names) if name in chosen])
+    return replace(found, columns=kept, names=tuple(model.exact.names[k] for k in kept))
 
 
 def read_prior(paths: Sequence[str], model: ExcitedModel, chain: Chain) -> PriorMotions | None:

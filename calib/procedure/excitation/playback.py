@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.dynamics.base import BaseModel
+from calib.dynamics.load_cases import LoadCases
 from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
 from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
@@ -76,11 +76,14 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
     return replace(track, tau=_torque(dynamics.exact, dynamics.values, track))
 
 
-def _torque(model: BaseModel, values: np.ndarray, track: Setpoints) -> np.ndarray:
+def _torque(model: LoadCases, values: np.ndarray, track: Setpoints) -> np.ndarray:
+    """Return the motor torques (N, n), of the load with which each is largest."""
     parts = []
     for begin in range(0, len(track), BLOCK_ROWS):
         part = (np.ascontiguousarray(x[begin : begin + BLOCK_ROWS]) for x in (track.q, track.v, track.a))
-        parts.append(model.regressor(*part) @ values)
+        torque = (model.regressor(*part) @ values)[:, model.limited]  # (N, loads, n)
+        largest = np.abs(torque).argmax(axis=1, keepdims=True)
+        parts.append(np.take_along_axis(torque, largest, axis=1)[:, 0])
     return np.concatenate(parts)
 
 

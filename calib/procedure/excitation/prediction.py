@@ -102,7 +102,7 @@ def foretell(
         return None, ()
     sigmas = share * limits
     task = _task(given, settings.seed)
-    predict = partial(_prediction, given, sigmas, task)
+    predict = partial(_prediction, given, sigmas[given.model.exact.joint_of_row], task)
     own, spread = predict(problem.family, found.x, found.factor, settings.repeat)
     others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
     own_period = problem.family.period * found.factor
@@ -147,14 +147,15 @@ def _prediction(
     """Return the prediction for `repeat` periods of a motion, and the sigmas (c,) of the parameters."""
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
-    counted = np.ones(given.chain.n) if given.columns.sigmas is None else given.columns.sigmas
+    counted = np.ones(len(noise)) if given.columns.sigmas is None else given.columns.sigmas
     Y = _columns(given, given.model.exact.regressor(motion.q, motion.v, motion.a)) / (noise * counted)[:, None]
     W = Y.reshape(-1, Y.shape[2])
     rows = 2.0 * _band(motion, period) * period * repeat
     scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
     _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
     root = (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None] * np.sqrt(PERIOD_SAMPLES / rows)
-    torque = np.sqrt(np.mean(np.sum((task @ root) ** 2, axis=2), axis=0))
+    squares = np.mean(np.sum((task @ root) ** 2, axis=2), axis=0)
+    torque = np.sqrt(squares[given.model.exact.limited].max(axis=0))  # of the load for which it is largest
     share = float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
     return MotionPrediction(period * repeat, rows, torque, share), np.linalg.norm(root, axis=1)
 

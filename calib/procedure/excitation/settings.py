@@ -63,7 +63,11 @@ class ExcitationSettings:
         shortest: shortest period that the search may use [s]; default: the period is fixed
         harmonics: frequencies per joint, or control points of splines; default 12, or as many as are below resonance
         family: functions of time that describe the motion
-        drives: drive terms to identify, if no identified model states them
+        drives: drive terms to identify, if neither an identified model nor options state them
+        loads: payloads of one run: none, a label, or labels with +; the same motion runs once with each; repeatable.
+            Default: none, then each payload of the options
+        columns: parameters that the motion has to determine, or essential: those that the identification of the
+            model kept; repeatable. Default: all
         rate: of the controller [Hz]
         samples: instants over the period at which the search evaluates
         starts: random starts of the search
@@ -86,6 +90,8 @@ class ExcitationSettings:
     harmonics: Harmonics | None = None
     family: Annotated[str, OneOf(("fourier", "bspline"))] = "fourier"
     drives: Text = "Fv Fc off"
+    loads: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
     rate: Rate = 1000.0
     samples: Annotated[int, Whole(10, 100_000)] = 200
     starts: Starts = 4

@@ -87,7 +87,7 @@ def excite(session: Session, say: Say) -> list[str]:
             seed=session.settings.seed + (0 if first else VALIDATION_SEED), repeat=section.repeats, outlook=first,
         )  # fmt: skip
         designed = design.excite(
-            session.fit.path, settings, limits=limits,
+            session.fit.path, settings, limits=limits, options=options_of(session).settings,
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
