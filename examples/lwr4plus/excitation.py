@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
 
@@ -35,37 +35,41 @@ import excitation_figures as figures
 import numpy as np
 import study_options
 import study_tables
-from dynamics import TABLE_4
+from dynamics import PAYLOAD, TABLE_4
 from excitation_moves import moves, waypoint_spline
 
 from calib import files
+from calib.api.motions import ExcitationDesign
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.load_cases import LoadCases
 from calib.dynamics.torque_rows import BOTH, MOTOR
 from calib.estimation.linear import settled_std, wls
 from calib.estimation.triangles import combine
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
-from calib.procedure.excitation.limits import Points
+from calib.procedure.excitation.design import search_motion
+from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns, excited_model
+from calib.procedure.excitation.limits import read_motion_limits
+from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain, random_joints
 from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
 from calib.rooms.closed_loop.controllers import Reference
-from trajectories.constraints import TorqueLimit, box_limits
-from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
-from trajectories.design.optimise import design
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem
-from trajectories.design.verify import dense_motion, ensured
-from trajectories.fourier import fourier_family
-from trajectories.places import Workspace
+from trajectories.design.objectives import condition_numbers
 
 PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0  # of a trajectory and of a log [s]; of the controller [Hz]
 SPEEDS = (0.3, 0.45, 0.6, 0.9)  # of the plain moves, shares of the limits
 NOISE = np.repeat([0.003, 0.015], 7)  # of the limits, on joint and motor torques: D's weights (the truth's)
-LOADS = 2  # rows of the observation matrix: loaded, then empty
+RUNS = ((PAYLOAD,), ())  # of the same motion: loaded, then empty
+GOALS = {"A": ("raw=2",), "B": ("raw=35", "joint6=0.1", "joint7=0.1"), "D": ("logdet",)}  # A: as small as can be
+LIMITS = {
+    "without": ["joint-margin", "self-collision", "floor"], "target": {"axis_distance": 0.3, "height": -0.2},
+    "torque": {"margin": 0.0},
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,27 +98,6 @@ class Arm:
         """Return the larger of the motor torques' moduli with and without the payload (N, n)."""
         Y = dynamics.model(self.chain, MOTOR, v0=0.01).regressor(q, v, a)
         return np.abs(np.stack([Y @ self.values, Y @ self.without_payload])).max(axis=0)
-
-
-@dataclass(frozen=True, eq=False)
-class BothLoads:
-    """Rows of both loads, one below the other (N, 28, b): without the payload its columns are zero."""
-
-    model: IdentificationModel
-    kept: np.ndarray
-
-    @property
-    def mask(self) -> np.ndarray:
-        n = self.model.bodies.n
-        return (self.kept < 10 * n) | (self.kept >= 10 * (n + 1))
-
-    def __call__(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        loaded = self.model.regressor(q, v, a).transpose(2, 1, 0)[self.kept]
-        return np.concatenate([loaded, loaded * self.mask[:, None, None]], axis=1).transpose(2, 1, 0)
-
-    def product(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, ...]:
-        rows = self.model.rows
-        return self.model.regressor_gradient(q, v, a, G[:, :rows] + G[:, rows:] * self.mask, self.kept)
 
 
 @cache
@@ -160,50 +143,21 @@ class Plan:
         return f"{self.which}, {self.columns} columns"
 
 
-def problem(plan: Plan, arm: Arm) -> ExcitationProblem:
-    """Return the design problem of a plan."""
-    chain = arm.chain
-    _, base = arm.observed
-    smooth, motor = (dynamics.model(chain, kind, v0=0.05) for kind in (BOTH, MOTOR))
-    essential = base.kept[table_4(base)]
-    alone = plan.columns == len(essential) and plan.which != "B"  # the torques of B's goals take all columns
-    both = BothLoads(smooth, np.sort(essential) if alone else base.kept)
-    velocity = np.array([joint.velocity for joint in chain.joints])
-    tool = Points(chain, (0,), np.zeros((1, 3)))
-    torques = [
-        TorqueLimit(
-            motor.regressor, motor.regressor_gradient, values, arm.effort, torque_product=motor.torque_gradient,
-            name=f"torque, {load}",
-        )
-        for load, values in (("loaded", arm.values), ("empty", arm.without_payload))
-    ]  # fmt: skip
-    limits = (
-        *box_limits(chain.lower, chain.upper, velocity), *torques,
-        Workspace(tool, tool.product, radius=0.3, lowest=-0.2),
-    )  # fmt: skip
-    columns = table_4(base) if plan.columns == len(essential) and not alone else None
-    sigmas = np.tile(NOISE * np.tile(arm.effort, 2), LOADS) if plan.which == "D" else None
-    index = Excitation("logdet" if plan.which == "D" else "cond", "raw", sigmas=sigmas, columns=columns)
-    spot = ExcitationProblem(
-        fourier_family(plan.harmonics, PERIOD, chain.n, rate=RATE), both, both.product, ((index, 1.0),), limits,
-        samples=80 + 8 * plan.harmonics,
-    )  # fmt: skip
-    if plan.which != "B":
-        return spot
-    values = base.transform @ arm.values
-    rows = {j: tuple(7 + j + load * smooth.rows for load in range(LOADS)) for j in (5, 6)}  # motor torques, both loads
-    slacks = [TorqueSlack(rows[j], values, np.tile(arm.effort, 2 * LOADS)) for j in rows]
-    goals = (AttainmentGoal(index, 35.0), *(AttainmentGoal(slack, 0.9) for slack in slacks))
-    return replace(spot, goals=goals)
-
-
 def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
     """Return one period of a designed trajectory, verified between its samples."""
-    spot = problem(plan, arm)
-    found, proof = ensured(spot, design(spot, starts=starts, evaluations=evaluations, seed=plan.seed))
-    assert proof.feasible
-    motion = dense_motion(spot.family, found.x, np.arange(0.0, PERIOD, 1.0 / RATE))
-    return Reference(motion.times, motion.q, motion.v, motion.a)
+    model, base = arm.observed
+    excited = excited_model(model, RUNS, arm.values, friction=True, base=base)
+    columns = table_4(base) if plan.columns == len(TABLE_4) else np.arange(base.b)
+    sigmas = np.tile(NOISE * np.tile(arm.effort, 2), len(RUNS)) if plan.which == "D" else None
+    given = ExcitationInputs(
+        arm.chain, read_motion_limits(LIMITS, arm.chain), excited, {},
+        IdentifiableColumns(columns, sigmas, tuple(base.names[k] for k in columns)), None,
+    )  # fmt: skip
+    settings = ExcitationSettings(
+        goals=GOALS[plan.which], period=PERIOD, harmonics=plan.harmonics, rate=RATE, samples=80 + 8 * plan.harmonics,
+        starts=starts, evaluations=evaluations, seed=plan.seed, outlook=False,
+    )  # fmt: skip
+    return Reference(*ExcitationDesign(**vars(search_motion(given, settings))).sampled())
 
 
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
@@ -218,8 +172,9 @@ def exact(motion: Reference) -> dict[str, Any]:
     arm, part = truth(), slice(None, None, 50)
     own, base = arm.observed
     state = (motion.q[part], motion.v[part], motion.a[part])
-    Y = BothLoads(own, base.kept)(*state)
-    tau = np.abs(Y @ (base.transform @ arm.values)).reshape(-1, 2 * LOADS, 7)[:, 1::2] / arm.effort
+    runs = LoadCases(own, base, RUNS)
+    Y = runs.regressor(*state)
+    tau = np.abs(Y @ (base.transform @ arm.values))[:, runs.limited] / arm.effort
     return {
         "cond": {str(len(base.kept)): condition_numbers(Y), "44": condition_numbers(Y, columns=table_4(base))},
         "torque_share": tau.mean(axis=(0, 1)).tolist(),

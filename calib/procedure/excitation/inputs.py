@@ -10,7 +10,7 @@ import numpy as np
 from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import columns_at_rest, information, standard_name
+from calib.dynamics.base import Base, columns_at_rest, information, standard_name
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
@@ -182,7 +182,7 @@ def read_model(
         notes += said
         if not known:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
-    return _dynamics(model, cases, values, bool(known), notes)
+    return excited_model(model, cases, values, bool(known), notes)
 
 
 def _refuse_rows(model: IdentificationModel, where: str) -> None:
@@ -249,21 +249,34 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     if not np.isfinite(own).all():
         name = model.names[int(np.argmin(np.isfinite(own)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
-    made = _dynamics(model, loads, own, any(one.shape == "sign" for one in model.columns), notes)
+    made = excited_model(model, loads, own, any(one.shape == "sign" for one in model.columns), notes)
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
 
 
-def _dynamics(
-    model: IdentificationModel, loads: Loads, values: np.ndarray | None, friction: bool, notes: Sequence[str] = ()
+def excited_model(
+    model: IdentificationModel,
+    loads: Loads,
+    values: np.ndarray | None,
+    friction: bool,
+    notes: Sequence[str] = (),
+    base: Base | None = None,
 ) -> ExcitedModel:
+    """Return the model to excite, for the search with a smooth Coulomb sign, from an identification model.
+
+    Args:
+        loads: payload labels of each run.
+        values: (p,) of the model's parameters; None: unknown.
+        friction: whether friction is among the values.
+        base: base columns; default those of the model under these loads.
+    """
     smoothed = (
         replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one for one in model.terms
     )
     smooth = replace(model, terms=tuple(smoothed))
-    found = base_parameters.find(model, loads=loads)
+    found = base_parameters.find(model, loads=loads) if base is None else base
     chosen = None if values is None else found.transform @ values
     return ExcitedModel(
         LoadCases(smooth, found, loads), LoadCases(model, found, loads), chosen, None, friction, tuple(notes)
