@@ -118,6 +118,7 @@ def design_excitation(
     model: DynamicsModel | MechanismResult | str | Path | None = None,
     limits: Tables | None = None,
     options: IdentifySettings | str | Path | None = None,
+    after: DynamicsModel | str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -133,6 +134,8 @@ def design_excitation(
         limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``), or its tables.
         options: of the identification that will follow, as `calib.identify_dynamics` takes them: its torque rows, drive
             terms, couplings and payloads are what the motion is designed for.
+        after: identified dynamics that the motion shall add to, in place of `model`: designed is what lowers their σ
+            most, and predicted how far.
         workers: local processes, or the address of a Dask scheduler.
         progress: called with a few words now and then.
 
@@ -146,12 +149,14 @@ def design_excitation(
     lost, stage = [], stage_of(robot, "excite", base, tip)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
+        before = None if after is None else stack.enter_context(saved(after))
         crew = stack.enter_context(opened(workers))
         if stage is not None:
             return stage.run(settings, model=place, limits=optional(limits), map=crew.map, progress=progress)
         designed = design.excite(
             cast(Any, robot), settings, model=place, limits=optional(limits), base=base, tip=tip,
-            options=None if options is None else _read(options).settings, map=crew.map_without(lost), progress=progress,
+            options=None if options is None else _read(options).settings, after=before,
+            map=crew.map_without(lost), progress=progress,
         )  # fmt: skip
     return ExcitationDesign(**vars(replace(designed, notes=(*designed.notes, *map(str, lost)))))
 

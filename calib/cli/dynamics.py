@@ -73,6 +73,7 @@ def excite(
     model: Path | None = None,
     limits: Path | None = None,
     options: Path | None = None,
+    after: Path | None = None,
     workers: str = "1",
     base: str | None = None,
     tip: str | None = None,
@@ -85,15 +86,16 @@ def excite(
         model: folder of an identification: predicts the torques
         limits: TOML: speeds, torques, workspace, collision, friction
         options: TOML: options of the identification that will follow (rows, drives, couplings, payloads)
+        after: folder of an identification, which the motion adds to: for its model, information and torque errors
     """
     from calib.api.motions import design_excitation
     from calib.workers import finishing
 
-    check_destination("excite", robot, out, [robot, model, limits, options, *settings.existing])
+    check_destination("excite", robot, out, [robot, model, limits, options, after, *settings.existing])
     with progress() as say:
         designed = design_excitation(
-            robot, settings, model=model, limits=limits, options=options, base=base, tip=tip, workers=workers,
-            progress=say,
+            robot, settings, model=model, limits=limits, options=options, after=after, base=base, tip=tip,
+            workers=workers, progress=say,
         )  # fmt: skip
         say("writing")
         with finishing():

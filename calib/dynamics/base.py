@@ -281,16 +281,19 @@ def _require_same(base: Base, model: RegressorModel) -> None:
 BLOCK = 4000  # samples at a time
 
 
-def information(model: BaseModel, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+def information(
+    model: BaseModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, sigmas: np.ndarray | None = None
+) -> np.ndarray:
     """Return the information Σ ωᵀω (b, b) of a motion with regressors ω.
 
     Args:
         model: with b columns; q, v, a: (N, n) [rad or m, and per s, per s²].
+        sigmas: (rows,) by which the rows of ω are divided; None: 1.
     """
     total = np.zeros((len(model.names),) * 2)
     for start in range(0, len(q), BLOCK):
         part = (np.ascontiguousarray(x[start : start + BLOCK]) for x in (q, v, a))
-        W = model.regressor(*part)
+        W = model.regressor(*part) / (1.0 if sigmas is None else sigmas[:, None])
         rows = W.reshape(-1, W.shape[-1])
         total += rows.T @ rows
     return total

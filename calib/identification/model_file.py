@@ -30,7 +30,8 @@ its median half width, and how the motion leaves the training range. Then ``para
 essential), ``condition_number`` (raw, and with columns of unit norm), ``friction`` and its ``ladder``, ``elimination``,
 ``loop``, ``tracking`` by file (or ``tracking_failure``), ``filters`` by file, ``geometry``, ``warnings`` and the
 findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdict``, its ``reason``, and ``code`` and
-``advice`` of the finding that decided it, ``seed``, ``schema`` (3; files without one are of earlier versions and are
+``advice`` of the finding that decided it, ``error_density`` of each row (variance of its errors over the independent
+rows per second), ``seed``, ``schema`` (3; files without one are of earlier versions and are
 read, too). No number: null.
 
 Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual);

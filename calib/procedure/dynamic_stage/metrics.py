@@ -6,7 +6,7 @@ file had no number, and some keys another place: `with_current_keys` moves them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -137,6 +137,7 @@ class ModelMetrics(JudgedMetrics):
     geometry: geometry_tables.GeometryMetrics | None = None
     repeated: Mapping[str, float] = field(default_factory=dict)
     findings: ModelFindings | None = None
+    error_density: Array | None = None
     seed: int = 0
     schema: int = SCHEMA
 
@@ -179,8 +180,18 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
         repeated=outcome.repeated,
         findings=outcome.findings,
+        error_density=_error_density(found, inputs.cases),
         seed=outcome.seed,
     )
+
+
+def _error_density(found: Identification, cases: Sequence[Case]) -> np.ndarray:
+    """Return the errors' density (rows,) [N² m² s or N² s]: ∫ ωᵀω / density dt is what a motion tells.
+
+    It is their variance over the independent rows per second.
+    """
+    per_second = sum(len(rows.target) for rows in found.rows) / sum(case.duration for case in cases)
+    return found.fitted.std**2 * found.fitted.inflation / per_second
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,22 +56,25 @@ class NamedGoal:
     goal: AttainmentGoal
 
 
-def objectives_of(settings: ExcitationSettings, condition: Excitation) -> tuple[tuple[Objective, float], ...]:
+def objectives_of(
+    settings: ExcitationSettings, condition: Excitation, errors_known: bool = False
+) -> tuple[tuple[Objective, float], ...]:
     """Return the objectives and their weights: the aim of the settings, or both condition numbers with equal weights.
 
     Args:
         condition: see `read_goals`.
+        errors_known: of the torques, by an identification: without goals the determinant is the aim.
 
     Raises:
         UsageError: for two aims, or one together with the condition numbers that it replaces.
     """
     aims: list[Index] = [one for one in AIMS if one in settings.goals]
-    if not aims:
+    if not aims and not (errors_known and not settings.goals):
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
     others = [text for text in (*settings.goals, *settings.hard) if text.partition("=")[0] in (*SCALINGS, *AIMS)]
     if len(others) > 1:
         raise UsageError(f"goals {', '.join(others)}: '{aims[0]}' replaces the others; leave them out")
-    return ((replace(condition, index=aims[0]), 1.0),)
+    return ((replace(condition, index=(*aims, AIMS[0])[0]), 1.0),)
 
 
 def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[NamedGoal]:
@@ -243,6 +246,7 @@ def excite(
     base: str | None = None,
     tip: str | None = None,
     options: IdentificationSettings | None = None,
+    after: Path | None = None,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Designed:
@@ -259,12 +263,13 @@ def excite(
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
         options: of the identification that will follow: torque rows, drive terms, payloads.
+        after: folder of an identification that the motion shall add to; replaces `model`.
         map: where the starts of the search run (`calib.workers`).
         progress: called with words.
 
     Ctrl-C ends the search; the best motion found so far is verified and returned.
     """
-    given = read_inputs(robot, settings, model, limits, base, tip, options)
+    given = read_inputs(robot, settings, model, limits, base, tip, options, after)
     try:
         return search_motion(given, settings, map, progress)
     except NothingFeasible as error:
@@ -320,7 +325,7 @@ def _excitation_problem(
     """Return the optimisation problem (condition numbers, limits), the constraints to verify, and notes."""
     search, checked, notes = _constraints(given.model, given.limits)
     condition, smooth = _condition_objective(given, settings), given.model.smooth
-    objectives = objectives_of(settings, condition)
+    objectives = objectives_of(settings, condition, given.prior is not None and given.prior.sigmas is not None)
     family, coarse = _family(given, settings)
     problem = ExcitationProblem(
         family, smooth.regressor, smooth.regressor_gradient, objectives, search, samples=settings.samples,

@@ -164,10 +164,12 @@ def design_lines(designed: Designed) -> list[str]:
     """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
     found, cond = designed.found, designed.condition
     columns, prior = len(designed.inputs.columns.names), designed.inputs.prior
+    earlier = ["what is identified"] if prior is not None and prior.sigmas is not None else []
+    earlier += [f"{', '.join(prior.names)} ({prior.seconds:.1f} s)"] if prior is not None and prior.names else []
     together = [] if prior is None else [
-        f"together with {', '.join(prior.names)} ({prior.seconds:.1f} s), which alone has "
-        f"{cond.raw_before:.4g} raw, {cond.normalised_before:.4g} normalised; this motion alone has "
-        f"{cond.raw_alone:.4g} and {cond.normalised_alone:.4g}"
+        f"together with {' and '.join(earlier)}, which alone has {cond.raw_before:.4g} raw, "
+        f"{cond.normalised_before:.4g} normalised; this motion alone has {cond.raw_alone:.4g} and "
+        f"{cond.normalised_alone:.4g}"
     ]  # fmt: skip
     result = [
         *(["interrupted: this is the best motion so far"] if found.interrupted else []),
@@ -187,7 +189,7 @@ def design_lines(designed: Designed) -> list[str]:
     parts = ["the approach"] if played.approach is not None else []
     parts.append(counted(played.repeat, "period"))
     result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
-    result += [] if designed.outlook is None else prediction.lines(designed.outlook)
+    result += [] if designed.outlook is None else prediction.lines(designed.outlook, designed.predicted)
     return [*result, *designed.inputs.limits.bounds.lines(), *(f"note: {note}" for note in designed.notes)]
 
 

@@ -79,12 +79,14 @@ class PriorMotions:
     Attributes:
         names: of the files or folders.
         seconds: of motion.
-        information: (b, b) ∫ ωᵀω dt, of the design's columns.
+        information: (b, b) ∫ ωᵀω dt, of the design's columns, rows in units of `sigmas`.
+        sigmas: (rows,) root of the torque errors' density, where an identification states it; None: 1.
     """
 
     names: tuple[str, ...]
     seconds: float
     information: np.ndarray
+    sigmas: np.ndarray | None = None
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
         """Return the information per sample, if `count` samples represent `duration` seconds of new motion."""
@@ -118,6 +120,7 @@ def read_inputs(
     base: str | None = None,
     tip: str | None = None,
     options: IdentificationSettings | None = None,
+    after: Path | None = None,
 ) -> ExcitationInputs:
     """Read robot, limits, model and earlier motions of an excitation.
 
@@ -126,15 +129,18 @@ def read_inputs(
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
         options: of the identification that will follow: torque rows, drive terms, payloads.
+        after: folder of an identification that the motion shall add to: its model, information and torque errors.
 
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
     """
+    require(after is None or model is None, "after: this folder is the model, too; leave the model out", UsageError)
+    model = model or after
     chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
     dynamics = read_model(chain, model, settings.drives, known, options, settings.loads)
     locked = _read_locked(settings.lock, chain, known.positions)
-    prior = read_prior(settings.existing, dynamics, chain)
+    prior = read_prior(settings.existing, dynamics, chain, after)
     columns = identifiable(dynamics, chain, locked, prior)
     return ExcitationInputs(chain, known, dynamics, locked, _selected(columns, dynamics, settings, model), prior)
 
@@ -324,13 +330,14 @@ def identifiable(
     model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None
 ) -> IdentifiableColumns:
     """Return the columns that a motion with locked joints, together with earlier motions, can identify."""
-    names = model.exact.names
+    names, known, sigmas = model.exact.names, None, None
+    if prior is not None:
+        known, sigmas = prior.information, prior.sigmas
     if not locked:
-        return IdentifiableColumns(None, None, names)
-    known = None if prior is None else prior.information
+        return IdentifiableColumns(None, sigmas, names)
     still = np.isin(model.exact.joint_of_row, list(locked))
     kept = columns_at_rest(model.exact, locked, *chain.sampling_limits(), known, np.flatnonzero(still))
-    sigmas = np.where(still, np.inf, 1.0)
+    sigmas = np.where(still, np.inf, 1.0 if sigmas is None else sigmas)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
         f"locked: {', '.join(chain.joint_names[j] for j in locked)}; torques of locked joints are not used "
@@ -349,7 +356,7 @@ def _selected(
     Raises:
         UsageError: for an unknown parameter, or ``essential`` without a folder.
     """
-    wanted = list(settings.columns)
+    wanted = [name.strip() for text in settings.columns for name in text.split(",")]
     if not wanted:
         return found
     if "essential" in wanted:
@@ -367,23 +374,41 @@ def _selected(
     return replace(found, columns=kept, names=tuple(model.exact.names[k] for k in kept))
 
 
-def read_prior(paths: Sequence[str], model: ExcitedModel, chain: Chain) -> PriorMotions | None:
+def read_prior(
+    paths: Sequence[str], model: ExcitedModel, chain: Chain, after: Path | None = None
+) -> PriorMotions | None:
     """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
 
-    Recordings are filtered and differentiated as `calib identify` does it.
+    Recordings are filtered and differentiated as `calib identify` does it. What an identification `after` knows, its
+    prior included, is the inverse of its covariance.
 
     Raises:
         UsageError, MeasurementError: for a path that is neither, or belongs to another robot.
     """
-    if not paths:
+    if not paths and after is None:
         return None
-    total, seconds = np.zeros((len(model.exact.names),) * 2), 0.0
+    total, seconds, sigmas = np.zeros((len(model.exact.names),) * 2), 0.0, None
+    if after is not None:
+        total, sigmas = _known(after, model)
     for text in paths:
         designed = (Path(text) / coefficients.NAME).exists()
         q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
-        total += information(model.exact, q, v, a) / rate
+        total += information(model.exact, q, v, a, sigmas) / rate
         seconds += len(q) / rate
-    return PriorMotions(tuple(str(path) for path in paths), seconds, total)
+    return PriorMotions(tuple(map(str, paths)), seconds, total, sigmas)
+
+
+def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return the information (b, b) of an identification, and the root of its torque errors' density (rows,)."""
+    density, covariance = IdentificationFolder(folder).metrics().error_density, model.covariance
+    if covariance is None or density is None or len(density) != model.exact.model.rows:
+        raise UsageError(f"{folder}: states no covariance of the design's columns, or no torque errors; identify again")
+    spread = np.sqrt(np.diag(covariance))
+    # what a constraint holds has no spread and gains nothing: as if known to a millionth (our choice)
+    spread = np.where(spread > 0.0, spread, np.maximum(1e-6 * np.abs(cast(np.ndarray, model.values)), 1e-12))
+    unit = covariance / np.outer(spread, spread)
+    np.fill_diagonal(unit, 1.0 + 1e-9)
+    return np.linalg.inv(unit) / np.outer(spread, spread), np.tile(np.sqrt(density), len(model.exact.loads))
 
 
 def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -59,13 +59,17 @@ class MotionPrediction:
 
 
 class PredictedSigma(NamedTuple):
-    """A row of ``prediction.csv``: a parameter, its value if known, and the sigma predicted for the motion as run."""
+    """A row of ``prediction.csv``: a parameter, its value if known, and the sigma predicted for the motion as run.
+
+    `sigma_before` is that of an identification that the motion adds to.
+    """
 
     name: str
     unit: str
     value: float | None
     sigma: float
     rsd: float | None
+    sigma_before: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +80,14 @@ class MotionOutlook:
         noise: (n,) taken as the torques' error [N m or N]; noise_share: of the torque limits.
         own: of the motion as it is to be run; by_period: of other lengths. Longer ones run the same motion again,
             shorter ones are designed quickly.
+        before: torque_sigma_share of an identification that the motion adds to; None without one.
     """
 
     noise_share: float
     noise: Array
     own: MotionPrediction
     by_period: tuple[MotionPrediction, ...]
+    before: float | None = None
 
 
 def foretell(
@@ -102,7 +108,7 @@ def foretell(
         return None, ()
     sigmas = share * limits
     task = _task(given, settings.seed)
-    predict = partial(_prediction, given, sigmas[given.model.exact.joint_of_row], task)
+    predict = partial(_prediction, given, sigmas, task)
     own, spread = predict(problem.family, found.x, found.factor, settings.repeat)
     others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
     own_period = problem.family.period * found.factor
@@ -115,13 +121,43 @@ def foretell(
     model, columns = given.model, given.columns.columns
     kept = slice(None) if columns is None else columns
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
+    before, earlier = None, [None] * len(spread)
+    if _errors_known(given):
+        root = _root(_known(given))
+        before, earlier = _torque_sigma(given, task, root)[1], np.linalg.norm(root, axis=1).tolist()
     parts = given.columns.names, np.array(model.exact.units)[kept].tolist(), values[kept].tolist(), spread.tolist()
     rows = []
-    for name, unit, value, sigma in zip(*parts):
+    for name, unit, value, sigma, sigma_before in zip(*parts, earlier):
         known = np.isfinite(value) and value != 0.0
         known_rsd = 100.0 * sigma / abs(value) if known else None
-        rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd))
-    return MotionOutlook(share, sigmas, own, tuple(others)), rows
+        rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd, sigma_before))
+    return MotionOutlook(share, sigmas, own, tuple(others), before), rows
+
+
+def _errors_known(given: ExcitationInputs) -> bool:
+    return given.prior is not None and given.prior.sigmas is not None
+
+
+def _known(given: ExcitationInputs) -> np.ndarray:
+    """Return a triangle (c, c) of what earlier motions tell of the columns."""
+    assert given.prior is not None
+    columns = slice(None) if given.columns.columns is None else given.columns.columns
+    values, V = np.linalg.eigh(given.prior.information[columns][:, columns])
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * V.T
+
+
+def _root(W: np.ndarray) -> np.ndarray:
+    """Return a root C^(1/2) (c, c) of the covariance (Wᵀ W)⁻¹."""
+    scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
+    _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
+    return (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None]
+
+
+def _torque_sigma(given: ExcitationInputs, task: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the σ of predicted torques (n,) of the load for which each is largest, and their share of the limits."""
+    squares = np.mean(np.sum((task @ root) ** 2, axis=2), axis=0)
+    torque = np.sqrt(squares[given.model.exact.limited].max(axis=0))
+    return torque, float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
 
 
 def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
@@ -147,17 +183,15 @@ def _prediction(
     """Return the prediction for `repeat` periods of a motion, and the sigmas (c,) of the parameters."""
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
-    counted = np.ones(len(noise)) if given.columns.sigmas is None else given.columns.sigmas
-    Y = _columns(given, given.model.exact.regressor(motion.q, motion.v, motion.a)) / (noise * counted)[:, None]
-    W = Y.reshape(-1, Y.shape[2])
-    rows = 2.0 * _band(motion, period) * period * repeat
-    scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
-    _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
-    root = (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None] * np.sqrt(PERIOD_SAMPLES / rows)
-    squares = np.mean(np.sum((task @ root) ** 2, axis=2), axis=0)
-    torque = np.sqrt(squares[given.model.exact.limited].max(axis=0))  # of the load for which it is largest
-    share = float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
-    return MotionPrediction(period * repeat, rows, torque, share), np.linalg.norm(root, axis=1)
+    rows, sigmas = 2.0 * _band(motion, period) * period * repeat, given.columns.sigmas
+    if sigmas is None or not _errors_known(given):
+        sigmas = noise[given.model.exact.joint_of_row] * (1.0 if sigmas is None else sigmas)
+        weight, earlier = rows / PERIOD_SAMPLES, np.zeros((0, task.shape[2]))
+    else:
+        weight, earlier = period * repeat / PERIOD_SAMPLES, _known(given)
+    Y = _columns(given, given.model.exact.regressor(motion.q, motion.v, motion.a)) / sigmas[:, None]
+    root = _root(np.concatenate([np.sqrt(weight) * Y.reshape(-1, Y.shape[2]), earlier]))
+    return MotionPrediction(period * repeat, rows, *_torque_sigma(given, task, root)), np.linalg.norm(root, axis=1)
 
 
 def _band(motion: SampledMotion, period: float) -> float:
@@ -192,14 +226,24 @@ def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     return files.write_table(folder / NAME, PredictedSigma._fields, rows)
 
 
-def lines(one: MotionOutlook) -> list[str]:
-    """Return the predicted σ of torques as text, for this motion and for motions of other lengths."""
+def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:
+    """Return the predicted σ of torques as text, for this motion and for motions of other lengths.
+
+    After an identification, the three parameters whose σ the motion lowers most follow.
+    """
     others = ", ".join(f"{100 * each.torque_sigma_share:.2g} % from {each.seconds:g} s" for each in one.by_period)
+    head = "predicted σ of torques, typical task: "
+    own = f"{100 * one.own.torque_sigma_share:.2g} % of the limits from {one.own.seconds:g} s"
+    others = f" ({others})" if others else ""
+    if one.before is None:
+        return [f"{head}{own}{others}, if the torque residual is {100 * one.noise_share:.2g} %"]
+    gains = sorted((row for row in predicted if row.sigma_before), key=lambda row: row.sigma / row.sigma_before)[:3]
     return [
-        f"predicted σ of torques, typical task: {100 * one.own.torque_sigma_share:.2g} % of the limits from "
-        f"{one.own.seconds:g} s{' (' if others else ''}{others}{')' if others else ''}, if the torque residual is "
-        f"{100 * one.noise_share:.2g} %"
-    ]
+        f"{head}{100 * one.before:.2g} % so far, with this motion {own}{others}",
+        "most improved: " + "; ".join(
+            f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in gains
+        ),
+    ]  # fmt: skip
 
 
 def check_folder(folder: Path) -> None:

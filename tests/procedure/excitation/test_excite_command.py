@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError
+from calib.identification.identify_options import parse_options
 from calib.procedure.excitation import coefficients, design
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.inputs import identifiable, read_model, read_prior
@@ -396,3 +398,36 @@ def test_collision_distances_are_kept_with_a_slope(tmp_path):
 
     motion = SampledMotion(np.zeros(1), q, 0 * q, 0 * q, 0 * q)
     check(total, clearance.slopes(motion, weights)[0, 0], q[0], tolerance=1e-4)
+
+
+PAYLOAD = {"rows": "both", "payload": {"load": {"mass": 3.28, "com": [0.0, 0.0, 0.05]}}}
+
+
+def test_the_design_is_for_the_model_that_will_be_identified():
+    """Both torque rows, runs without and with the payload: 102 columns, and both loads keep the torque limits."""
+    options = parse_options(PAYLOAD).settings
+    goals = ("raw=300", "joint6=0.02")
+    found = design.excite("lwr4plus", replace(SHORT, goals=goals), options=options)
+    exact, tau = found.inputs.model.exact, found.playback.run.tau
+    assert len(exact.names) == 102 and exact.loads == ((), ("load",)) and found.condition.raw < 300
+    assert [name for name, *_ in found.goals] == ["cond raw", "torque slack of joints 6"]
+    margin = found.proof.worst["torque"]
+    assert margin.margin > 0 and (np.abs(tau) < found.inputs.limits.torque).all()
+    few = design.excite("lwr4plus", replace(SHORT, columns=("ZZ1R", "Fvm1,Ia1")), options=options)
+    assert few.inputs.columns.names == ("ZZ1R", "Ia1", "Fvm1")
+
+
+@pytest.mark.parametrize(
+    ("options", "settings", "words"),
+    [
+        ({"rows": "drive"}, {}, "rows = 'drive'"),
+        ({"rows": "power"}, {}, "rows = 'power'"),
+        ({"payload": {"load": {}}}, {}, "payload 'load': state its mass"),
+        (PAYLOAD, {"loads": ("lode",)}, "did you mean 'load'"),
+        (PAYLOAD, {"columns": ("ZZ9",)}, "'ZZ9' is not one of"),
+        (PAYLOAD, {"columns": ("essential",)}, "needs --model"),
+    ],
+)
+def test_models_that_no_motion_can_be_designed_for(options, settings, words):
+    with pytest.raises(UsageError, match=re.escape(words)):
+        design.excite("lwr4plus", replace(SHORT, **settings), options=parse_options(options).settings)
