@@ -68,7 +68,9 @@ class LoadCases(BaseModel):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives of Σ weights · regressor by q, v, a, each (N, n); weights (N, all rows, b)."""
         parts = np.split(weights, len(self.loads), axis=1)
-        return super().regressor_gradient(q, v, a, np.sum([part * mask for part, mask in zip(parts, self._masks)], axis=0))
+        return super().regressor_gradient(
+            q, v, a, np.sum([part * mask for part, mask in zip(parts, self._masks)], axis=0)
+        )
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray

@@ -49,6 +49,7 @@ from calib.estimation.linear import settled_std, wls
 from calib.estimation.triangles import combine
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
+from calib.geometry.weighing import calibrated_chain
 from calib.procedure.excitation.design import search_motion
 from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns, excited_model
 from calib.procedure.excitation.limits import read_motion_limits
@@ -113,7 +114,7 @@ def estimate(seed: int) -> Arm:
     """
     nominal = lwr4plus.nominal_chain()
     measured = measure(lwr4plus_cell(), random_joints(nominal, 60, [seed, 1]), [seed, 2])
-    chain = fit(install(nominal, [measured]), [measured]).calibrated.chain
+    chain = calibrated_chain(fit(install(nominal, [measured]), [measured])).chain
     bodies = np.arange(17 * (nominal.n + 1)) < 10 * (nominal.n + 1)
     slow = moves(
         nominal, Arm(nominal, dynamics.true_parameters(nominal) * bodies).torque, SPEEDS[0], seed, RATE, SECONDS

@@ -306,12 +306,25 @@ def search_motion(
     pairs = zip(problem.goals, found.values)
     reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
     cut = ("interrupted before any motion met the goals",) if named_goals and not problem.goals else ()
+    cut += _missed(problem, found, given)
     return Designed(
         given, settings, problem, found, proof, condition_found,
         reached, front, played,
         (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook,
         predicted,
     )  # fmt: skip
+
+
+def _missed(problem: ExcitationProblem, found: SearchResult, given: ExcitationInputs) -> tuple[str, ...]:
+    """Return a note on each goal that the motion misses by more than a hundredth."""
+    words = [
+        f"goal {goal.objective.name} is missed: {value:.4g} for {goal.goal:.4g}"
+        for goal, value in zip(problem.goals, found.values)
+        if value > goal.goal + 0.01 * abs(goal.goal)
+    ]
+    idle = "without friction light joints have hardly any torque: state [friction] in the limits file, or a model"
+    known = given.model.friction or not any(isinstance(goal.objective, TorqueSlack) for goal in problem.goals)
+    return tuple(words if known or not words else [*words, idle])
 
 
 def _problem_of_period(given: ExcitationInputs, settings: ExcitationSettings, period: float) -> ExcitationProblem:

@@ -16,7 +16,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
 from calib.dynamics.regressor_model import Loads
 from calib.dynamics.shapes import V0
-from calib.dynamics.torque_rows import MOTOR
+from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of, require
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.identify_options import FileSettings
@@ -162,22 +162,25 @@ def read_model(
         loads: see `ExcitationSettings`.
 
     Raises:
-        UsageError: for torque rows without bodies, an unknown payload, or one without mass where torques are limited.
+        UsageError: for an unknown payload.
     """
     if folder is not None:
         if options is not None:
             raise UsageError(f"model {folder}: states rows, drives and payloads itself; leave the options out")
         return _identified(chain, folder, loads)
+    notes = []
+    if options is not None and not _designable(options.torque_rows):
+        notes = [f"designed for motor torques: a motion cannot be designed for rows = '{options.torque_rows.name}'"]
+        options = replace(options, torque_rows=MOTOR, sets=())
     if options is None:
         linear = [joint.kind == "prismatic" for joint in chain.joints]
         model = IdentificationModel(bodies_of(chain), drives.standard([sets] * chain.n, V0, linear))
     else:
         model = make_model(chain, options)
-    _refuse_rows(model, "options")
     model, left = _differentiable(model)
     cases = _loads(loads, model, with_payloads=True)
     known = {} if limits.friction is None else dict(zip(("velocity", "sign"), limits.friction))
-    values, notes = None, list(left)
+    values, notes = None, notes + left
     if chain.inertias is not None:
         check_bodies(chain, limits.torque)
         side = "motor" if model.torque_rows.with_motors else "link"  # where all friction counts, as the limits do
@@ -191,10 +194,9 @@ def read_model(
     return excited_model(model, cases, values, bool(known), notes)
 
 
-def _refuse_rows(model: IdentificationModel, where: str) -> None:
-    rows = model.torque_rows
-    if not rows.has_bodies or rows.projection is not None:
-        raise UsageError(f"{where}: a motion cannot be designed for rows = '{rows.name}'; use motor, link or both")
+def _designable(rows: TorqueRows) -> bool:
+    """Return whether rows contain the bodies and have derivatives."""
+    return rows.has_bodies and rows.projection is None
 
 
 def _stated(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
@@ -202,10 +204,10 @@ def _stated(options: IdentificationSettings | None) -> tuple[list[tuple[float, .
     result, notes = [], []
     for label, load in ({} if options is None else options.payloads).items():
         if load.mass is None:
-            raise UsageError(f"payload '{label}': state its mass, so that the motion keeps the torque limits with it")
-        if load.com is None:
+            notes.append(f"NOT checked: torques with payload '{label}', whose mass is not stated")
+        elif load.com is None:
             notes.append(f"payload '{label}': no com is stated; torques are predicted with its mass at the tip")
-        result.append(replace(load, com=load.com or (0.0, 0.0, 0.0)).parameters)
+        result.append(replace(load, com=load.com or (0.0, 0.0, 0.0)).parameters or (0.0,) * 10)
     return result, notes
 
 
@@ -249,7 +251,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     bodies = bodies_of(chain).with_gravity(np.asarray(found.model.bodies.gravity))
     for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1) if label in run else bodies
-    rows = MOTOR if found.model.torque_rows.projection is not None else found.model.torque_rows
+    rows = found.model.torque_rows if _designable(found.model.torque_rows) else MOTOR
     model, notes = _differentiable(IdentificationModel(bodies, found.model.columns, rows))
     own = np.array([values[name] for name in model.names])
     if not np.isfinite(own).all():

@@ -237,7 +237,9 @@ def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[
     others = f" ({others})" if others else ""
     if one.before is None:
         return [f"{head}{own}{others}, if the torque residual is {100 * one.noise_share:.2g} %"]
-    gains = sorted((row for row in predicted if row.sigma_before), key=lambda row: row.sigma / (row.sigma_before or np.inf))[:3]
+    gains = sorted(
+        (row for row in predicted if row.sigma_before), key=lambda row: row.sigma / (row.sigma_before or np.inf)
+    )[:3]
     return [
         f"{head}{100 * one.before:.2g} % so far, with this motion {own}{others}",
         "most improved: " + "; ".join(

@@ -33,7 +33,17 @@ from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.excitation.settings import DEFAULT_DESIGN, HARMONICS, Evaluations, Harmonics, Period, Rate, Starts
+from calib.procedure.excitation.settings import (  # fmt: skip
+    DEFAULT_DESIGN,
+    HARMONICS,
+    Evaluations,
+    Goal,
+    HardGoal,
+    Harmonics,
+    Period,
+    Rate,
+    Starts,
+)
 from calib.procedure.kinematic_stage.settings import (  # fmt: skip
     DEFAULT_SELECTION,
     Deliverable,
@@ -160,6 +170,7 @@ class DynamicsSection:
         period: of the designed motion [s]; the validation motion's is 0.8 of it
         harmonics: frequencies per joint
         rate: of the controller [Hz]
+        goals, hard, front: of the training motion, see calib excite --help
         repeats: number of repetitions of each motion
         starts: random starts of the search for a motion
         evaluations: largest number per start
@@ -180,6 +191,9 @@ class DynamicsSection:
     period: Period = DEFAULT_DESIGN.period
     harmonics: Harmonics = HARMONICS
     rate: Rate = DEFAULT_DESIGN.rate
+    goals: tuple[Goal, ...] = ()
+    hard: tuple[HardGoal, ...] = ()
+    front: Annotated[int, Whole(0, 1000)] = 0
     repeats: Annotated[int, Whole(1)] = 3
     starts: Starts = DEFAULT_DESIGN.starts
     evaluations: Evaluations = DEFAULT_DESIGN.evaluations

@@ -24,7 +24,7 @@ from calib.errors import UsageError
 from calib.identification.identify_options import parse_options
 from calib.procedure.excitation import coefficients, design
 from calib.procedure.excitation import folder as motion_folder
-from calib.procedure.excitation.inputs import identifiable, read_model, read_prior
+from calib.procedure.excitation.inputs import identifiable, read_inputs, read_model, read_prior
 from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.kinematics import forward
@@ -415,14 +415,20 @@ def test_the_design_is_for_the_model_that_will_be_identified():
     assert margin.margin > 0 and (np.abs(tau) < found.inputs.limits.torque).all()
     few = design.excite("lwr4plus", replace(SHORT, columns=("ZZ1R", "Fvm1,Ia1")), options=options)
     assert few.inputs.columns.names == ("ZZ1R", "Ia1", "Fvm1")
+    other = parse_options({"rows": "power", "payload": {"load": {}}}).settings
+    notes = " ".join(read_inputs("lwr4plus", SHORT, options=other).model.notes)
+    assert "rows = 'power'" in notes and "NOT checked: torques with payload 'load'" in notes
+
+
+def test_a_goal_out_of_reach_is_named():
+    found = design.excite("lwr4plus", replace(SHORT, goals=("raw=300", "joint7=0.5")))
+    said = " ".join(found.notes)
+    assert "torque slack of joints 7 is missed" in said and "state [friction]" in said
 
 
 @pytest.mark.parametrize(
     ("options", "settings", "words"),
     [
-        ({"rows": "drive"}, {}, "rows = 'drive'"),
-        ({"rows": "power"}, {}, "rows = 'power'"),
-        ({"payload": {"load": {}}}, {}, "payload 'load': state its mass"),
         (PAYLOAD, {"loads": ("lode",)}, "did you mean 'load'"),
         (PAYLOAD, {"columns": ("ZZ9",)}, "'ZZ9' is not one of"),
         (PAYLOAD, {"columns": ("essential",)}, "needs --model"),
