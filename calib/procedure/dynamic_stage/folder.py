@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,11 @@ OURS = (
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
+
+
+class _Essential(NamedTuple):
+    name: str
+    essential: float | None
 
 
 @dataclass(frozen=True)
@@ -103,7 +108,7 @@ class IdentificationFolder:
 
     def essential(self) -> tuple[str, ...]:
         """Read the names of the essential parameters."""
-        return tuple(row["name"] for row in read_estimate(self.path).rows if row.get("essential"))
+        return tuple(row.name for row in read_estimate(self.path, _Essential) if row.essential is not None)
 
     def errors(self) -> TorqueErrorModel | None:
         """Read the model's expected torque errors; None if they are unknown."""

@@ -361,14 +361,15 @@ def _selected(
     wanted = [name.strip() for text in settings.columns for name in text.split(",")]
     if not wanted:
         return found
+    standard = model.exact.model.names
+    short = {standard_name(name, standard): name for name in found.names}
     if "essential" in wanted:
         require(
             folder is not None, "columns 'essential': needs --model with the folder of an identification", UsageError
         )
         wanted.remove("essential")
-        wanted += IdentificationFolder(cast(Path, folder)).essential()
-    standard = model.exact.model.names
-    short = {standard_name(name, standard): name for name in found.names}
+        essential = IdentificationFolder(cast(Path, folder)).essential()
+        wanted += [name for name in essential if standard_name(name, standard) in short]  # friction has derivatives
     for name in wanted:
         one_of(standard_name(name, standard), short, "columns: parameter", UsageError)
     chosen = {short[standard_name(name, standard)] for name in wanted}
