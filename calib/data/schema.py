@@ -130,7 +130,7 @@ class Column:
     positive: str = ""
 
     def check(self, values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-        """Return the given values (m, k) [SI] (NaN: empty cell); refuse values beyond the column's bounds."""
+        """Return the values (m, k) [SI] of a column (NaN: empty cell); refuse values beyond its bounds."""
         unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
 
         def other_unit(row: int, k: int) -> str:

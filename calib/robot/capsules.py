@@ -162,7 +162,7 @@ def inseparable(
 
 
 MIN_RADIUS, RADIUS_SHARE = 0.05, 0.05
-"""Default radius of capsules: at least [m], and this share of the stretched arm's length. Our choice."""
+"""Default radius of capsules: a least radius [m], and a share of the stretched arm's length (our choice)."""
 TARGET_RADIUS = 0.02
 """Radius of a target and its stem [m]; a 1.5 inch reflector has 0.019. Our choice."""
 
@@ -174,7 +174,7 @@ def usual_radius(chain: Chain) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """Centre lines of the capsules in m poses.
+    """Centre lines of the capsules in m postures.
 
     Attributes:
         start, end: (m, C, 3) [m].
@@ -275,7 +275,7 @@ class Capsules:
 
     @cached_property
     def _beside(self) -> Capsules | None:
-        """The same arm compared with the obstacles only; None without obstacles."""
+        """The same model with the pairs of arm and obstacles only; None without obstacles."""
         world = self.world[self.world[:, 1] >= len(self.walls)]
         return replace(self, own=self.own[:0], world=world) if len(world) else None
 

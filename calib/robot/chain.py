@@ -23,7 +23,7 @@ MIN_LIMIT = 1e-6  # of a speed or effort that a description states [SI]; less is
 
 
 def check_gravity(gravity: np.ndarray, place: str = "") -> None:
-    """Refuse a gravity vector (3,) [m/s²] that is not plausible; `place` begins the message.
+    """Refuse an implausible gravity vector (3,) [m/s²]; the message begins with `place`.
 
     Raises:
         RobotError: for one beyond `max_gravity`, or not finite.

@@ -278,7 +278,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
 
 
 def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
-    """Return the path of a mesh name; ``package://`` is tried with and without the package's folder."""
+    """Return the path of a mesh by its name in a URDF; None if no folder contains it."""
     if name.startswith("file://"):
         name = name.removeprefix("file://")
     variants = [name]
@@ -290,7 +290,7 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
 
 
 def meshes_beside(path: Path) -> dict[str, Path | str]:
-    """Return the meshes of a URDF's collision shapes by their paths next to a copy of it (folder ``1-robot``).
+    """Return the mesh files of a URDF's collision shapes, by their paths next to its copy in ``1-robot``.
 
     Names from the root, or that lead out of their folder, are left out: a copy of the URDF finds them, or nothing does.
     """

@@ -72,7 +72,7 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
-    """Return descriptions of physically impossible bodies, by joint; () without masses.
+    """Return a sentence per group of physically impossible bodies, with their joints; () without masses.
 
     A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
     others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass
@@ -145,12 +145,12 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
 
 
 def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict[str, Any]]:
-    """Return the robot and the extra tables of a file, as `read` and `read_extra`."""
+    """Return the robot of a file and its extra tables, as `read` and `read_extra` do."""
     table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
-            f"{path} is a parallel robot (legs and a platform), only serial arms are supported here; calib "
-            "fit, excite, identify and plan support it"
+            f"{path} is a parallel robot (legs and a platform), only serial arms are supported here; use "
+            "calib fit, excite, identify or plan"
         )
     robot = {key: value for key, value in table.items() if key not in EXTRA}
     if "element" not in robot:
@@ -198,7 +198,7 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
         inertias.append(tables.vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
         links.append(tables.word(entry, "link", place) if "link" in entry else None)
     if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
-        refuse_robot(where, "some joints have an inertia, others have none")
+        refuse_robot(where, "some joints have an inertia and others have none: state all of them, or none")
     elements = enumerate(_tables(table, "element", where), 1)
     return Chain(
         joints=tuple(joints),

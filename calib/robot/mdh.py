@@ -138,7 +138,7 @@ def rows(chain: Chain) -> tuple[Row, ...]:
         expected += _elements(row, row.beta, owner)
         owner += row.kind != "fixed"
     if tuple(expected) != chain.elements:
-        raise RobotError(f"robot '{chain.name}' is not an MDH table: its elements are not complete rows in order")
+        raise RobotError(f"robot '{chain.name}' is not an MDH table: its elements do not form complete rows in order")
     return result
 
 
@@ -200,7 +200,7 @@ def _row(entry: Any, index: int, where: str) -> Row:
     if kind == "prismatic":
         quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
     if kind == "fixed" and (extra := [key for key in (*tables.LIMITS, "inertia") if key in entry]):
-        refuse_robot(where, f"a fixed row cannot have '{extra[0]}'")
+        refuse_robot(where, f"a fixed row cannot have '{extra[0]}': remove the key")
     numbers = {key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
     inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
     return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)

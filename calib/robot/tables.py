@@ -62,7 +62,7 @@ def placement(table: Any, where: str) -> np.ndarray:
     result[: len(rows)] = [vector(row, 4, f"{where}, matrix") for row in rows]
     error = np.abs(result[:3, :3].T @ result[:3, :3] - np.eye(3)).max()
     if not error < 1e-6 or np.linalg.det(result[:3, :3]) < 0:
-        refuse_robot(where, f"the rotation in matrix is not a rotation (R'R - 1 = {error:.2g})")
+        refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g})")
     return result
 
 
@@ -81,7 +81,7 @@ def spelled(angle: float) -> float | str:
 
 
 def chain_head(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the fields of a `Chain` in a robot's table besides joints: name, ends, tail, gravity, floor."""
+    """Return the fields of a `Chain` in a robot's table except its joints: name, ends, tail, gravity, floor."""
     head: dict[str, Any] = {"name": word(table, "name", where)}
     head |= {key: word(table, key, where) for key in ("base", "tip") if key in table}
     if "tail" in table:
@@ -92,7 +92,7 @@ def chain_head(table: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def chain_table(chain: Chain, **rows: Any) -> dict[str, Any]:
-    """Return the table that `chain_head` reads back exactly, with `rows` before its tail."""
+    """Return the table of a chain that `chain_head` reads back exactly; `rows` stand before its tail."""
     table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
     table |= {"gravity": chain.gravity.tolist(), **({"floor": chain.floor} if chain.floor else {}), **rows}
     return table if np.array_equal(chain.tail, np.eye(4)) else {**table, "tail": placement_table(chain.tail)}

@@ -101,7 +101,7 @@ def _plain(name: str) -> str:
 
 
 def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple[Table, tuple[str, ...]]:
-    """Return the table with a column ``tool`` if the rows have different TCPs, and a note."""
+    """Return the table, with a column ``tool`` and a note if its rows have different TCPs."""
     if not tcp:
         return table, ()
     triples = [tuple(row) for row in np.round(np.stack([table.numbers(name) for name in tcp], axis=1), 3)]

@@ -62,7 +62,7 @@ SCALES = {
 
 
 def _ours(names: Any) -> Any:
-    """Return `names`; refuse a name unknown to this toolkit."""
+    """Return `names` unchanged; refuse names of series that this toolkit does not know."""
     for name in names if isinstance(names, Mapping) else ():
         words = f"'{name}' is not a known name{suggestion(name, SYNONYMS)}; known are {', '.join(SYNONYMS)}"
         require(name in SYNONYMS, words, ValueError)
@@ -70,7 +70,7 @@ def _ours(names: Any) -> Any:
 
 
 def _known(units: Any) -> Any:
-    """Return `units`; refuse a unit that does not suit its series."""
+    """Return `units` unchanged; refuse a unit that does not suit its series."""
     for name, unit in _ours(units).items() if isinstance(units, Mapping) else ():
         if unit and (not isinstance(unit, str) or unit.lower() not in SCALES[name]):
             raise ValueError(f"unit {shown(unit)} of {name} is unknown; expected one of {', '.join(SCALES[name])}")
@@ -130,7 +130,7 @@ def check_units(name: str, units: Sequence[str], joints: Joints | None, path: st
 
 
 def stem_of(name: str) -> tuple[str, int | None]:
-    """Return a column's quantity in lower case, words joined by ``_``, and its last number: (q, 1) for ``J1 q``."""
+    """Return the quantity that a column's name states, in lower case, and its last number: (q, 1) for ``J1 q``."""
     number = _NUMBER.search(name)
     rest = f"{name[: number.start()]} {name[number.end() :]}" if number else name
     words = [word for word in re.split(r"[\W_]+", rest.lower()) if word not in ("", "joint", "j")]

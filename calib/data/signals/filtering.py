@@ -170,7 +170,7 @@ def _chebyshev(factor: int, ripple: float = 0.05) -> np.ndarray:
 
 
 def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
-    """Return the error for a motion shorter than the filter's window."""
+    """Return the error about a motion that is shorter than the filter's window."""
     need = len(decimator.taps) / decimator.rate
     message = (
         f"decimation by {decimator.factor} needs {need:.3g} s without a gap, found {motion_length / decimator.rate:.3g}"

@@ -223,7 +223,7 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
             read = read_archived_positions if file.read(2) == b"PK" else read_positions
     t, q = read(path, joints, options)
     if q.shape[1:] != (motion.n,):
-        refuse_data(path, f"has {q.shape[1]} joints, the recording {motion.n}")
+        refuse_data(path, f"has {q.shape[1]} joints, the recording has {motion.n}")
     if len(t) < 10 or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
         refuse_data(path, "a reference needs ten samples or more, finite numbers and increasing stamps")
     slack = 1.5 * float(np.median(np.diff(t)))
@@ -326,10 +326,10 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
 
 
 def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
-    """Return a description of the origin of the cut-offs."""
+    """Return sentences on where the cut-offs come from."""
     stated = {name: value for name in ("cutoff", "band") if (value := getattr(options, name)) is not None}
     lines = [
-        f"{name} = {' '.join(f'{one:.4g}' for one in np.atleast_1d(value))} Hz, as stated or as in the training motion"
+        f"{name} = {' '.join(f'{one:.4g}' for one in np.atleast_1d(value))} Hz, stated, or that of the training motion"
         for name, value in stated.items()
     ]
     return (*lines, *cutoffs.reasons) if len(stated) < 2 else tuple(lines)

@@ -78,7 +78,7 @@ def _placed(frame: np.ndarray) -> dict[str, str]:
 
 
 def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return Pinocchio's tip poses (m, 4, 4) in the base, for a chain read from the URDF text `source`.
+    """Return the tip's poses (m, 4, 4) in the base frame that Pinocchio computes from a URDF text.
 
     Args:
         source: URDF text.
@@ -128,7 +128,7 @@ def configurations(model: Any, chain: Chain, q: np.ndarray, from_zero: bool = Fa
 def motion_torques(
     source: str, chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray, mjcf: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return Pinocchio's torques, body frames, damping and friction of a robot with masses and drives.
+    """Return torques, body frames, damping and friction that Pinocchio computes from a robot's URDF or MJCF text.
 
     Args:
         source: URDF or MJCF text.
@@ -164,7 +164,7 @@ def motion_torques(
 
 
 def _from_mjcf(pin: Any, source: str) -> Any:
-    """Return Pinocchio's model of an MJCF text, by way of a temporary file."""
+    """Return Pinocchio's model of an MJCF text, which it reads from a temporary file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.xml"
         path.write_text(source, encoding="utf-8")
@@ -172,7 +172,7 @@ def _from_mjcf(pin: Any, source: str) -> Any:
 
 
 def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[str], q: np.ndarray) -> np.ndarray:
-    """Return yourdfpy's poses (links, m, 4, 4) in the link `base` of the links of a URDF text.
+    """Return the poses (links, m, 4, 4) of links in the link `base` that yourdfpy computes from a URDF text.
 
     Args:
         source: URDF text; meshes are not looked for.

@@ -176,7 +176,7 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
             side = "comes after it" if leader in actuated else f"is not between '{base}' and '{tip}'"
             refuse_robot(place, f"the joint it mimics, '{leader}', {side}; choose another base or tip")
         if ratio == 0.0 or tree.joints[leader].kind == "fixed":
-            refuse_robot(place, f"it mimics '{leader}' but cannot move; make it fixed")
+            refuse_robot(place, f"it mimics '{leader}' but cannot move; change its type to fixed")
     if joint_names and (extra := [name for name in actuated if name not in joint_names]):
         refuse_robot(
             tree.where,
@@ -217,7 +217,7 @@ def _longest(tree: UrdfTree, base: str) -> str:
 
 
 def _gripper_joints(tree: UrdfTree) -> set[str]:
-    """Return mimic joints with a leader in another branch, and those leaders if no actuated joint follows them."""
+    """Return mimic joints whose leader is in another branch, and leaders that no actuated joint follows."""
     found: set[str] = set()
     for joint in tree.joints.values():
         leader = tree.joints.get(joint.mimic.leader) if joint.mimic else None

@@ -299,9 +299,10 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
             found.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
     if len(found) > 1:
         refuse_robot(
-            where, f"{listing(found, 3)}: beyond a full turn: degrees? A URDF's angles are radians; convert them"
+            where,
+            f"{listing(found, 3)}: beyond a full turn: are these degrees? A URDF's angles are radians; convert them",
         )
-    return tuple(f"{one} is beyond a full turn: degrees? A URDF's angles are radians" for one in found)
+    return tuple(f"{one} is beyond a full turn: are these degrees? A URDF's angles are radians" for one in found)
 
 
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -379,12 +380,12 @@ def _mimic(node: Node, place: str) -> Mimic | None:
     if found is None:
         return None
     if not (leader := found.attributes.get("joint")):
-        refuse_robot(place, "<mimic> without a joint to follow")
+        refuse_robot(place, "<mimic> has no attribute joint: name the joint to follow")
     return Mimic(leader, _number(found, "multiplier", 1.0, place), _number(found, "offset", 0.0, place))
 
 
 def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float, tuple[str, ...]]:
-    """Return the limits lower, upper, velocity, effort, and the last two as text if below `MIN_LIMIT`.
+    """Return a joint's limits (lower, upper, velocity, effort), and as text those below `MIN_LIMIT`.
 
     Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF demands velocity and effort, so 0
     is what people write who do not know them, and 1e9 is what we write.
@@ -441,7 +442,7 @@ def _number(node: Node, key: str, default: float, place: str) -> float:
 
 
 def _check_loops(tree: UrdfTree) -> None:
-    """Refuse a tree with loops of links."""
+    """Refuse a tree whose links form a loop, or that has no link."""
     reached: set[str] = set()
     todo = tree.roots
     while todo:

@@ -161,12 +161,12 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
     max_difference = 1e-9
     if error > max_difference:
-        refuse_robot(where, f"the edited text does not read back as the calibrated robot (difference {error:.2g})")
+        refuse_robot(where, f"the edited URDF differs from the calibrated robot by {error:.2g}; report this as a bug")
     return result
 
 
 def write_new(chain: Chain) -> str:
-    """Return the URDF text of any chain, with a link frame after each moving element.
+    """Return a new URDF text of a chain, with a link frame after each moving element.
 
     Constant elements are folded into the joint origins. Limits are kept; where velocity or effort is not known 1e9
     stands, since URDF demands a number. A body of unknown inertia has none. Pinocchio reads the same kinematics.
@@ -235,7 +235,7 @@ def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
 
 
 def _check_pair(nominal: Chain, calibrated: Chain) -> None:
-    """Refuse a calibrated chain that differs from the nominal one in more than values."""
+    """Refuse a calibrated chain that differs from the nominal one in more than its elements' values."""
     one, two = (
         [(element.axis, element.joint, element.ratio) for element in chain.elements if element.joint is not None]
         for chain in (nominal, calibrated)
@@ -248,7 +248,7 @@ def _check_pair(nominal: Chain, calibrated: Chain) -> None:
 
 
 def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
-    """Return the URDF's joints from the first moving one to the tip; refuse joints unlike the chain's.
+    """Return the URDF's joints from the first moving one to the tip; refuse joints that differ from the chain's.
 
     Joints are matched by name, or, where the URDF has none of the names, in the order of its longest chain.
     """
