@@ -138,10 +138,11 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
         loop=_loop(condition, controller), start=base.transform @ _guess(setup.plant, condition.guess, seed),
         constraints=ConstraintSettings(bodies=True),
     )  # fmt: skip
-    matrix, torque = _validation(setup, model, base, truth if condition.mismatch == "payload" else true)
-    return Experiment(
-        problem, model, base.transform @ truth.parameters, matrix, torque
-    )  # fmt: skip
+    part = slice(None, None, THIN)
+    thin = Reference(*(series[part] for series in (setup.other.t, setup.other.q, setup.other.v, setup.other.a)))
+    matrix = model.regressor(thin.q, thin.v, thin.a)[:, :, base.kept]
+    torque = feed_forward(truth if condition.mismatch == "payload" else true, thin)
+    return Experiment(problem, model, base.transform @ truth.parameters, matrix, torque)
 
 
 def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, IdentificationModel, Base, Plant]:
@@ -205,12 +206,6 @@ def _loop(condition: Condition, controller: Controller) -> LoopSettings:
         "pd", kp=tuple(kp * controller.kp), kd=tuple(kd * controller.kd), limit=tuple(controller.limit),
         rate=float(known["control"]["rate"]), inertia=tuple(known["drives"]["Ia"]),
     )  # fmt: skip
-
-
-def _validation(setup: Setup, model: IdentificationModel, base: Base, true: Plant) -> tuple[np.ndarray, np.ndarray]:
-    other, part = setup.other, slice(None, None, THIN)
-    thin = Reference(other.t[part], other.q[part], other.v[part], other.a[part])
-    return model.regressor(thin.q, thin.v, thin.a)[:, :, base.kept], feed_forward(true, thin)
 
 
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:

@@ -108,7 +108,7 @@ COLUMNS = (
     Column("trials", "{0.trials}"),
     Column("failed", lambda one: ", ".join(f"{count} {status}" for status, count in one.failures.items()) or "0"),
     _median("torque [%]", "torque_error"),
-    Column("quartiles", lambda one: "–".join(map(_short, one.figures["torque_error"][1:3]))),
+    Column("quartiles", lambda one: "–".join(map(_short, one.figures["torque_error"][1:]))),
     _median("worst joint [%]", "torque_worst"),
     _median("β [%]", "beta_error"),
     _median("in σ", "beta_sigma"),
@@ -213,7 +213,7 @@ def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], li
         for method in one.methods:
             flags = ["yes" if flag else "no" for flag in (method.as_good, method.chosen)]
             head = [one.condition.name, method.method, method.trials, sum(method.failures.values()), method.rank]
-            spreads = [value for name in FIGURES for value in method.figures[name][:3]]
+            spreads = [value for name in FIGURES for value in method.figures[name]]
             lines.append([*head, *flags, method.p, *spreads])
     return header, lines
 

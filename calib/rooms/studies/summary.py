@@ -35,7 +35,6 @@ class Quartiles(NamedTuple):
     median: float
     lower: float
     upper: float
-    count: int
 
 
 @dataclass(frozen=True)
@@ -167,10 +166,10 @@ def spread(values: Sequence[float]) -> Quartiles:
     """Return median and quartiles of the values without NaN; NaN if none remain."""
     found = np.sort([value for value in values if value == value])
     if not len(found):
-        return Quartiles(float("nan"), float("nan"), float("nan"), 0)
+        return Quartiles(float("nan"), float("nan"), float("nan"))
     with np.errstate(invalid="ignore"):
         lower, upper = (float(x) for x in np.quantile(found, [0.25, 0.75], method="nearest"))
-    return Quartiles(float(np.median(found)), lower, upper, len(found))
+    return Quartiles(float(np.median(found)), lower, upper)
 
 
 def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
