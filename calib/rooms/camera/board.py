@@ -1,4 +1,4 @@
-"""A printed board as a rigid table of corners, and its file ``board.toml``.
+"""Printed boards: the positions of their corners, and the file ``board.toml``.
 
 The board's frame lies in its upper left corner as printed: x to the right, y down, z into the paper, so that a board
 held upright before a camera has the camera's own axes. Corners are numbered as OpenCV numbers them: row by row the
@@ -38,7 +38,7 @@ MIN_CORNERS = 8  # corners that make an image useful
 @strict
 @dataclass(frozen=True)
 class Board:
-    """Type, size and markers of a printed board; see the module."""
+    """Type, size and markers of a printed board."""
 
     kind: Annotated[str, OneOf(KINDS)] = "charuco"
     columns: Annotated[int, Whole(2)] = 9
@@ -86,7 +86,7 @@ class Board:
 
 
 def corners(board: Board) -> np.ndarray:
-    """Return the corner table (K, 3) [m]; see the module for their order."""
+    """Return the positions (K, 3) [m] of a board's corners in the board's frame."""
     if board.kind == "apriltag":
         pitch, side = board.square + board.marker, board.square
         first = [(column * pitch, row * pitch) for row in range(board.rows) for column in range(board.columns)]
@@ -97,7 +97,7 @@ def corners(board: Board) -> np.ndarray:
 
 
 def read_board(path: str | Path) -> Board:
-    """Return the board of a ``board.toml`` file, or of the one in a folder.
+    """Return the board described by a ``board.toml`` file, or by the one in a folder.
 
     Raises:
         UsageError: for a key or a value that cannot be.

@@ -27,7 +27,7 @@ MIN_SEEN = 6
 
 @dataclass(frozen=True, eq=False)
 class BoardPoses:
-    """Board poses and reprojection errors of m images, from PnP.
+    """Board poses (PnP) in m images, with their reprojection errors.
 
     Attributes:
         poses: (m, 4, 4) of the board in the camera's frame.
@@ -41,7 +41,7 @@ class BoardPoses:
 
 
 def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
-    """Return the board's pose in the camera's frame for each image.
+    """Return the pose of the board in the camera's frame for each image, from its corners [px].
 
     Args:
         lens: of the camera.
@@ -78,7 +78,7 @@ def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:
 
 
 def _tilted_back(poses: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Return poses (m, 4, 4) with the boards' normals mirrored about the line of sight to their centre."""
+    """Return the second candidate poses (m, 4, 4): board normals mirrored about the line of sight."""
     middle = poses[:, :3, :3] @ table.mean(axis=0) + poses[:, :3, 3]
     sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     normal = poses[:, :3, 2]
@@ -90,7 +90,7 @@ def _tilted_back(poses: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 
 def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray) -> BoardPoses:
-    """Return poses refined by damped Gauss–Newton on the reprojection error of each image; see `board_poses`."""
+    """Return the poses that minimise each image's reprojection error, by damped Gauss–Newton from given poses."""
     seen = ~np.isnan(pixel[:, :, 0])
     damping = np.full(len(poses), 1e-6)
     cost, gradient, information = _normal(lens, table, pixel, seen, poses)
@@ -119,7 +119,7 @@ def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray)
 def _normal(
     lens: Lens, table: np.ndarray, pixel: np.ndarray, seen: np.ndarray, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ‖r‖² (m,), Jᵀr (m, 6) and JᵀJ (m, 6, 6) of [v; ω] about the board's origin."""
+    """Return ‖r‖² (m,), Jᵀr (m, 6) and JᵀJ (m, 6, 6) of each image; J with respect to the board's twist [v; ω]."""
     turned = np.einsum("mij,kj->mki", poses[:, :3, :3], table)
     point = turned + poses[:, None, :3, 3]
     aside = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
@@ -191,7 +191,7 @@ def estimate_lens(
 
 
 def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) -> tuple[Lens, float, np.ndarray]:
-    """Return the best lens, its reprojection error [px], and ∂residual/∂values with the poses projected out."""
+    """Return the fitted lens, its reprojection error [px], and the lens Jacobian with the poses projected out."""
     middle, zero = 0.5 * (np.array(size) - 1.0), np.zeros({"pinhole": 5, "fisheye": 4}[model])
     starts = [Lens(model, np.array([f * max(size), f * max(size), *middle, *zero]), size) for f in STARTS]
     max_tried = 8  # images that they are tried on (our choice)
@@ -222,12 +222,12 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
 
 
 def _squares(rows: np.ndarray) -> float:
-    """Return the sum of squares of the residuals (last column); infinite for a lens without valid projection."""
+    """Return the sum of squared residuals (last column of `rows`); infinite if the projection is not valid."""
     return float(np.nan_to_num(rows[:, FITTED] @ rows[:, FITTED], nan=np.inf))
 
 
 def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
-    """Return [∂residual/∂values, residual] of all images with each image's pose projected out."""
+    """Return the lens Jacobian and the residuals of all images side by side, with the poses projected out."""
     table, rows = corners(board), []
     for where, own in zip(board_poses(lens, board, pixel).poses, pixel):
         seen = ~np.isnan(own[:, 0])
@@ -239,7 +239,7 @@ def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
 
 
 def _focal_sigma(lens: Lens, matrix: np.ndarray, rms: float) -> float:
-    """Return the larger relative sigma of both focal lengths with unknown poses; infinite if not identifiable."""
+    """Return the relative σ of the less certain focal length; infinite if it is not identifiable."""
     size = np.linalg.norm(matrix, axis=0) + 1e-300
     _, values, axes = np.linalg.svd(matrix / size, full_matrices=False)
     if values[-1] < 1e-9 * values[0]:

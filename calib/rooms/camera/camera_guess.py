@@ -31,7 +31,7 @@ LOST = 0.2  # median misfit over the distance to the board beyond which nothing 
 
 @dataclass(frozen=True, eq=False)
 class CameraPlacement:
-    """Placement of camera and board, estimated from one block of images.
+    """Estimated placement of camera and board for one block of images.
 
     Attributes:
         rows: (k,) the rows that were looked at.
@@ -47,7 +47,7 @@ class CameraPlacement:
 
 
 def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasurements] = ()) -> Pixels:
-    """Return a block of images with lens and mounting; refuse images that contradict the arm's motion.
+    """Return a block of images with its lens and mounting; refuse images that contradict the arm's motion.
 
     Args:
         chain: the nominal arm.
@@ -80,14 +80,14 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
 
 
 def _lens_of(block: Pixels) -> Lens:
-    """Return the lens of a block of images, if it has one: their own, or what `complete_camera` has found."""
+    """Return the lens of a block of images; raise if it is unknown."""
     if block.lens is None:
         raise MeasurementError("the lens of these images is unknown", block.file)
     return block.lens
 
 
 def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.ndarray:
-    """Return the board's poses (k, 4, 4) in the camera's frame at some rows, each from its image alone.
+    """Return the board's pose (k, 4, 4) in the camera's frame for each of the given rows.
 
     `max_at_once`: images whose corners are looked at together.
     """
@@ -96,7 +96,7 @@ def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.nd
 
 
 def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: float = 1.1774) -> Pixels:
-    """Return the block without outlier corners; its notes name the removed ones.
+    """Return the block without outlier corners; the removed corners are named in its notes.
 
     A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
 
@@ -126,7 +126,7 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: floa
 
 
 def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return the rows of images that contradict the others, and a sentence that names these images.
+    """Return the rows of images that contradict the other images, and a sentence that names them.
 
     Raises:
         MeasurementError: where they are many.
@@ -143,11 +143,11 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
         return strange, ""
     turned = far(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= most
     cause = (
-        "would match if turned by 180°: did a program rotate them?"
+        "they match if turned by 180°; did a program rotate them?"
         if turned.mean() > 0.5
         else "wrong joint values, or was camera or board moved?"
     )
-    words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from where all others do: {cause}"
+    words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from its place in all other images: {cause}"
     words += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
     max_strange = 0.3  # share of images that may contradict the others, and are left out; more are refused
     if len(strange) > max_strange * len(block):
@@ -156,12 +156,12 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
-    """Return poses (m, 4, 4) of the moving body (camera or board) in the fixed one, from board poses in the camera."""
+    """Return the moving body's poses (m, 4, 4) in the fixed one's frame (camera and board), from board poses."""
     return invert(poses) if mounting == IN_HAND else poses
 
 
 def pnp_poses(block: Pixels) -> Poses:
-    """Return the images as measured poses for a fit of poses, each pose from its image's corners (PnP)."""
+    """Return the images as measured poses: one pose per image, computed from its corners (PnP)."""
     seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
     return Poses(
         block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), station=block.station,
@@ -170,7 +170,7 @@ def pnp_poses(block: Pixels) -> Poses:
 
 
 def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
-    """Return the placement of camera and board for a block of images, in the mounting with the smaller error.
+    """Return the placement of camera and board for a block of images; the mounting with the smaller error is taken.
 
     Args:
         block: with its lens.
@@ -211,7 +211,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
 def _check_pairing(
     block: Pixels, arm: np.ndarray, poses: np.ndarray, mountings: Sequence[str], placed: Placement, lever: float
 ) -> None:
-    """Refuse images whose joint values are those of other images or unrelated."""
+    """Raise if the joint values are shifted against the images by some rows, or do not match them at all."""
     if placed.error <= 0.01 * lever or len(arm) < 6:
         return
     max_left = 0.25  # of the misfit is left with the rows shifted: they were
@@ -238,7 +238,7 @@ def _check_pairing(
 
 
 def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_scale_error: float = 0.04) -> None:
-    """Refuse a board whose square size contradicts the arm's motion, which gives it to a few per cent.
+    """Raise if the stated square size contradicts the size computed from the arm's motion.
 
     Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
 
@@ -270,7 +270,7 @@ def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_sc
 
 
 def optics_of(measured: Sequence[Pixels]) -> Optics:
-    """Return the cameras and boards of all images; of several blocks by one camera, the first provides the lens.
+    """Return the lenses and boards of all image blocks; a camera's lens is that of its first block.
 
     Raises:
         MeasurementError: for images whose camera is not known, or one camera with images of two sizes.
@@ -296,7 +296,7 @@ def optics_of(measured: Sequence[Pixels]) -> Optics:
 def _guess_frames(
     block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return station and tool (4, 4) for a block of images from the arm's poses (m, 4, 4); one of both may be given."""
+    """Return station and tool (4, 4) of a block of images, from the arm's poses (m, 4, 4); one may be given."""
     found = place_camera(block, arm)
     if station is None and tool is None:
         return found.placed.station, found.placed.tool

@@ -39,7 +39,7 @@ TRIES = 60
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The constraint that the camera sees the whole board: q (m, n) -> (m, 19), met where <= 0.
+    """Constraint "the camera sees the whole board": q (m, n) -> (m, 19), satisfied where <= 0.
 
     Attributes:
         cell: the arm with camera and board where they roughly are.
@@ -96,11 +96,11 @@ class CameraView:
 
     @property
     def assumed(self) -> str:
-        """Sentence on the assumptions of a predicted accuracy."""
+        """The noise assumed when σ is predicted, as a sentence."""
         return ASSUMED
 
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
-        """Return the observation Jacobian of images in columns identifiable with the board in view."""
+        """Return the observation Jacobian of images for the parameters that views of the board can identify."""
         columns = layout(self.cell).rigid_index
         q = self.draw(100, lambda each: np.all(self(each) <= 1e-8, axis=1), lower, upper, seed)
         if len(q) < 20:
@@ -112,7 +112,7 @@ class CameraView:
         return ImageObservation(self.cell, True, columns[split.kept], view=self)
 
     def block(self, q: np.ndarray) -> list[Block]:
-        """Return a block of images at joint values (m, n) for a fit, without measured corners."""
+        """Return a block of images at joint values q (m, n), ready for a fit, with all corners set to zero."""
         pixel = np.zeros((len(q), len(corners(self.board)), 2))
         block = Pixels(
             q, self.cell.chain.joint_names, pixel, self.board, self.lens, mounting=self.mounting,
@@ -154,7 +154,7 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class ImageObservation(Observation):
-    """Whitened observation Jacobian of images, in base columns: q (m, n) -> (m, rows, p).
+    """Whitened observation Jacobian of images for the p identifiable parameters: q (m, n) -> (m, rows, p).
 
     An image's corners are reduced to what they say of the board's pose and the lens; noise of corners and of the arm's
     repeatability are our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
@@ -168,7 +168,7 @@ class ImageObservation(Observation):
     product = None  # type: ignore[assignment]
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (m, 3) [m] of camera or board on the arm, and Jacobian (m, 3, p), not whitened."""
+        """Return the position (m, 3) [m] of the carried camera or board, and its Jacobian (m, 3, p), not whitened."""
         seen = see(self.cell, q, -1)
         columns = target_jacobian(self.cell, seen, self.free, -1, np.zeros(len(q), dtype=int))
         return seen.point.T, columns[:, :3].transpose(2, 1, 0)

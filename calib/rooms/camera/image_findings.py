@@ -20,7 +20,7 @@ MAX_NOISE = 4.0  # corner noise over its stated sigma from which on it is remark
 
 
 def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
-    """Return the image coverage by corners of a fit's images; empty without images."""
+    """Return how the corners of a fit cover each set of images; empty without images."""
     result = []
     for piece in found.pieces:
         block, part = found.blocks[piece.block].measured, piece.part
@@ -56,7 +56,7 @@ def image_words(block: Pixels) -> str:
 
 
 def image_notes(found: GeometricFit) -> list[Finding]:
-    """Return findings on a fit's images; empty without images."""
+    """Return the findings on the images of a fit; empty without images."""
     result: list[Finding] = []
     others = [Path(block.measured.file).name for block in found.blocks if not isinstance(block.measured, Pixels)]
     for piece in found.pieces:
@@ -77,7 +77,7 @@ def image_notes(found: GeometricFit) -> list[Finding]:
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
-    """Return the number (or weight) of corners (N, 2) [px] in each cell of an image, (rows, columns) of `GRID`."""
+    """Return the number (or total weight) of corners in each cell of the image grid (`GRID`), as (rows, columns)."""
     bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
     return np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)[0].T
 
@@ -85,5 +85,5 @@ def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | No
 def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
     """Return a sentence on the share of the image covered by corners, with advice if it is small."""
     share = float(np.mean(coverage(pixels, size) > 0))
-    few = ": the lens is not identifiable elsewhere; bring the board closer and into the image's corners"
+    few = "; the lens is not identifiable in the rest: bring the board closer and into the image's corners"
     return f"corners lie in {share:.0%} of the image{few if share < 0.6 else ''}"

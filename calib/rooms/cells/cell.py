@@ -128,7 +128,7 @@ def measure(
 
 
 def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
-    """Return positions measured by an instrument that drifts by `drift` [m] from `begin` (0 to 1) to the series' end.
+    """Return measured positions with an instrument drift added: `drift` [m] from `begin` (0 to 1) to the end.
 
     The direction is the seed's, so that several series can share it.
     """
@@ -146,7 +146,7 @@ def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Ge
 
 
 def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stated sigmas of position [m] and orientation [rad], each (m, 3).
+    """Return the σ of position [m] and orientation [rad] that the instrument's maker states, each (m, 3).
 
     Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
     """

@@ -137,11 +137,11 @@ def _results(session: Session) -> tuple[tuple[str, str], ...]:
 
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Return the tool's errors [mm] against the cell's truth; print and write all errors."""
+    """Return the tool errors [mm] of nominal and calibrated arm against the truth; print and write all errors."""
     found = installation.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
-        f"hidden truth, over {TRUTH} poses of the whole joint range: tool error {before:.3f} mm rms with the "
+        f"true errors over {TRUTH} poses in the whole joint range: tool error {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
     ]
     truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
@@ -193,7 +193,7 @@ def simulate_next(folder: Path, say: Say) -> None:
 
 
 def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
-    """Return the virtual cell of a session, and the same with its camera if the instrument is a camera."""
+    """Return the virtual cell of a session, and the same cell with its camera (None for other instruments)."""
     cell = virtual_cell(session.settings.robot.given, session.settings.seed)
     if session.settings.instrument.measures != IMAGES:
         return cell, None
@@ -216,11 +216,11 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda wor
         simulate_recordings(session, arm_of(session, cell), seed)
         say("    (the simulated arm plays both motions)")
     else:
-        raise SessionError(f"the demonstration cannot simulate the files of {step} needs")
+        raise SessionError(f"the demonstration cannot simulate the files that step {step} needs")
 
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:
-    """Return the moving arm of a session's simulated cell."""
+    """Return the simulated arm of a session, with its dynamics."""
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 

@@ -43,7 +43,7 @@ def random_fourier(
     lower: np.ndarray, upper: np.ndarray, velocity: np.ndarray, duration: float, rate: float,
     harmonics: int = 5, acceleration: float = np.inf, seed: int | np.random.Generator = 0,
 ) -> Reference:  # fmt: skip
-    """Return a random Fourier motion of one period inside the limits, at rest at both ends.
+    """Return one period of a random Fourier motion inside the limits, at rest at both ends.
 
     Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is
     scaled until its first limit is met, then centred. A stand-in for designed excitation, not a replacement.
@@ -124,7 +124,7 @@ def truth(name: str) -> dict[str, Any]:
 
 
 def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) -> Plant:
-    """Return the simulated TX40 or RV-2SQ with Ia, Fv, Fc of every joint.
+    """Return the simulated TX40 or RV-2SQ with motor inertia Ia, friction Fv and Fc of each joint.
 
     Args:
         coupled: with the TX40's wrist coupling: Ia6 on both rows, Fvm6, Fcm6.

@@ -41,7 +41,7 @@ def nominal_chain() -> Chain:
 
 
 def arm(table: np.ndarray) -> Chain:
-    """Return the library's arm with frames 2 to 7 of a table (frame 1 belongs to the base placement)."""
+    """Return the library's arm with the values of frames 2 to 7 of a table (9, 4)."""
     values = {f"{column}{row}": table[row, position] for row in range(2, 8) for position, column in enumerate(COLUMNS)}
     return nominal_chain().with_values(values)
 
@@ -52,7 +52,7 @@ def station(table: np.ndarray) -> np.ndarray:
 
 
 def tool(table: np.ndarray) -> np.ndarray:
-    """Return the pose of the LED fixture in the library arm's flange (4, 4): frame 8, the flange taken off."""
+    """Return the pose (4, 4) of the LED fixture in the frame of the library arm's flange, from frame 8."""
     return invert(nominal_chain().tail) @ transform(*table[8])
 
 

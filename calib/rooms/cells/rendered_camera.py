@@ -78,7 +78,7 @@ def render(
 
 
 def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, shape: BoardShape) -> np.ndarray:
-    """Return reflectances (height, width) of one pose, box-filtered over each pixel."""
+    """Return the reflectance image (height, width) of one board pose, averaged over each pixel."""
     result = np.full(lens.size[::-1], background, dtype=np.float32)
     outline = _outline(board)
     seen = shaped_points(board, shape, outline) @ pose[:3, :3].T + pose[:3, 3]
@@ -116,7 +116,7 @@ def _outline(board: Board) -> np.ndarray:
 def _on_sheet(
     board: Board, lens: Lens, pose: np.ndarray, shape: BoardShape, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Return the intersections of a window's sub-pixel rays with the board, (h·SUB, w·SUB, 2) [m]."""
+    """Return the board points (h·SUB, w·SUB, 2) [m] seen by the sub-pixels of an image window."""
     knots = [np.arange(a - NODES, b + 2 * NODES, NODES, dtype=float) for a, b in zip(low, high)]
     grid = np.stack(np.meshgrid(*knots), axis=-1)
     ray = np.concatenate([rays(lens, grid.reshape(-1, 2)), np.ones((grid[..., 0].size, 1))], axis=1)
@@ -132,7 +132,7 @@ def _on_sheet(
 
 
 def _cubic(count: int, columns: int) -> np.ndarray:
-    """Return the matrix that interpolates nodes to the sub-pixels of `count` pixels (Catmull & Rom 1974)."""
+    """Return the matrix that interpolates from nodes to the sub-pixels of `count` pixels (Catmull & Rom 1974)."""
     at = (np.arange(count * SUB) + 0.5) / SUB - 0.5 + NODES  # pixels after the first node
     first, t = np.divmod(at / NODES, 1.0)
     result = np.zeros((len(at), columns), dtype=np.float32)

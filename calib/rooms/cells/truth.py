@@ -27,7 +27,7 @@ SECONDS, RATE = 20.0, 250.0  # of the motion nobody has seen [s], [Hz]
 
 
 def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[float, float, float]:
-    """Return rms position errors against the noise-free truth over `TRUTH` poses [mm]: nominal, calibrated, URDF.
+    """Return the rms position error [mm] of nominal arm, calibrated arm and URDF over `TRUTH` noise-free poses.
 
     The nominal arm and the URDF get their best station and tool for these very poses, so that arms are compared.
 
@@ -55,7 +55,7 @@ def _rms(arm: Installation, block: Poses) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TorqueComparison:
-    """Errors of predicted torques against the noise-free truth on unseen motion.
+    """Errors of predicted torques against noise-free torques on a validation motion.
 
     Attributes:
         identified: 100 ‖τ̂ - τ‖ / ‖τ‖ by the identified model, over all rows [%].
@@ -71,7 +71,7 @@ class TorqueComparison:
 def torque_errors(
     cell: Cell, arm: MovingArm, model: IdentificationModel, values: np.ndarray, chain: Chain, seed: int = 4321
 ) -> TorqueComparison:
-    """Return the errors of a model's torques against the noise-free truth along a random motion of `SECONDS`.
+    """Return the errors of a model's torques against noise-free torques along a random validation motion.
 
     Args:
         cell, arm: the virtual cell, and its arm as it moves.
@@ -98,7 +98,7 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> tuple[float, int]:
-    """Return the share of estimated parameters within two sigmas of the truth, and their number.
+    """Return the share of estimated parameters within two σ of the truth, and the number of parameters compared.
 
     Args:
         true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.
@@ -112,7 +112,7 @@ def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> 
 def true_base(
     model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int, running: float = np.inf
 ) -> dict[str, float]:
-    """Return the true base parameters of a model by name: columns of the nominal arm, regrouped on the true one.
+    """Return the true base parameters of a model by name, regrouped on the true geometry.
 
     Friction is that of an arm in steady sliding that has moved for the time `running` [s], infinite for a warm one:
     friction with memory, all of it slipping, is Coulomb friction.

@@ -33,7 +33,7 @@ CABLE = 0.5  # [rad]
 
 
 def _named(parts: Sequence[tuple[float, str]]) -> str:
-    """Return a clause that lists the effects (size, words) with a size above 0; empty without any."""
+    """Return the names of all effects with a size above 0, as the end of a sentence; empty without any."""
     named = ", ".join(words for size, words in parts if size)
     return f"; unmodelled: {named}" if named else ""
 
@@ -60,7 +60,7 @@ class PositionErrors:
     def note(self) -> str:
         """What they are, as the end of a sentence; empty where there are none."""
         parts = [
-            (self.gear, f"gear errors of {self.gear * 1e3:.2g} mrad with the next joint and with load"),
+            (self.gear, f"gear errors of {self.gear * 1e3:.2g} mrad that depend on load and on the next joint"),
             (self.backlash, f"backlash of ±{self.backlash * 1e3:.2g} mrad"),
             (self.growth, f"lengths growing by {self.growth * 1e6:.0f} ppm"),
             (self.droop, f"a tool drooping by up to {self.droop * 1e3:.2g} mm"),
@@ -71,7 +71,7 @@ class PositionErrors:
 def displacements(
     errors: PositionErrors, chain: Chain, q: np.ndarray, torque: np.ndarray, warm: float = 0.0
 ) -> np.ndarray:
-    """Return the added displacement (K, m) [rad or m] of every element of a chain.
+    """Return the error (K, m) [rad or m] that the effects add to each element of a chain.
 
     Args:
         errors: their sizes.
@@ -96,7 +96,7 @@ def displacements(
 
 
 def _largest_load(chain: Chain) -> np.ndarray:
-    """Return the largest gravity torque of each joint (n,) [N m or N]; 1 for joints without gravity load."""
+    """Return the largest gravity torque (n,) [N m or N] of each joint; 1 for joints without gravity load."""
     if chain.inertias is None:
         return np.ones(chain.n)
     largest = np.abs(gravity_torques(chain, random_joints(chain, 200, 0))).max(axis=0)
@@ -104,7 +104,7 @@ def _largest_load(chain: Chain) -> np.ndarray:
 
 
 def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return tool poses (m, 4, 4) shifted by the tool's droop, with a different stiffness along each axis.
+    """Return tool poses (m, 4, 4) shifted by the droop of the tool under gravity.
 
     Args:
         errors, chain: as for `displacements`.
@@ -120,7 +120,7 @@ def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.n
 
 @dataclass(frozen=True)
 class TorqueErrors:
-    """Sizes of the simulated torque errors, zero by default.
+    """Sizes of the simulated torque errors; zero by default.
 
     Attributes:
         memory: Σ_k f_k, of the Coulomb friction.
@@ -172,7 +172,7 @@ def gear_torques(
 
 
 def memory(q: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the torque (N, n) of elasto-plastic friction elements along joint values q (N, n) [rad or m] from rest.
+    """Return the torque (N, n) of elasto-plastic friction elements along a motion q (N, n) [rad or m] from rest.
 
     Args:
         q: finely sampled, since each step moves an element by the whole step.

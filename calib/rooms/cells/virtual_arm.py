@@ -59,7 +59,7 @@ class MovingArm:
     unmodelled: TorqueErrors
 
     def true_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) of a warm arm's motors without noise [N m or N], along a finely sampled motion."""
+        """Return the noise-free motor torques (N, n) [N m or N] of a warm arm along a finely sampled motion."""
         return _modelled(self, q, v, a) + _unmodelled(self, q, v, a, np.full(len(q), np.inf))
 
     def link_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ class MovingArm:
 
 
 def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors = UNMODELLED) -> MovingArm:
-    """Return the moving true arm of a cell.
+    """Return the simulated real arm of a cell, with its dynamics, controller and sensors.
 
     Args:
         cell: whose true geometry it has.
@@ -110,7 +110,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
 
 
 def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: int) -> Reference:
-    """Return a periodic motion, repeated, with rest before and after.
+    """Return the reference of a periodic motion that is repeated, with rest before and after.
 
     Args:
         t: (N,), even steps [s].
@@ -152,7 +152,7 @@ def record(
 
 
 def _held(torque: np.ndarray) -> np.ndarray:
-    """Return the mean of torques (N, n) over the two control periods around each instant.
+    """Return torques (N, n) averaged over the two control periods around each sample.
 
     The controller's torque is held for a period, so what is commanded at an instant acts half a period later; drives
     and sensors that integrate over their sampling see this mean, without that lead.
@@ -163,7 +163,7 @@ def _held(torque: np.ndarray) -> np.ndarray:
 
 
 def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the motors' torques (N, n) of the simulated robot's rigid model with friction [N m or N]."""
+    """Return the motor torques (N, n) [N m or N] of the simulated robot: rigid model with friction."""
     model = IdentificationModel(arm.plant.bodies, arm.plant.terms)
     return np.einsum("kij,j->ki", model.regressor(q, v, a), arm.plant.parameters)
 
@@ -182,7 +182,7 @@ def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: 
 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return the true drive parameters (n, 7) in the order of `robots.SIDED`, and a note on their source."""
+    """Return the true drive parameters (n, 7) in the order of `SIDED`, and a note on their source."""
     source = "drives as published for the type"
     if library.path(f"{robot}_truth").exists():
         rows = known_robots.truth(robot)["drives"]
@@ -198,7 +198,7 @@ def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, s
 
 
 def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return ten standard parameters of a body with random errors of size, position and mass.
+    """Return the ten standard parameters of a body after random changes of shape, centre and mass.
 
     T P Tᵀ of the pseudo-inertia P (`calib.dynamics.pseudo_inertia`) is positive definite where P is.
     """

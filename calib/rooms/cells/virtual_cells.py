@@ -1,4 +1,4 @@
-"""Simulated cells to practise on: the LWR4+ of the paper, and library robots with random geometric errors."""
+"""Simulated cells: the LWR4+ of the paper, and robots of the library with random geometric errors."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ CMM, NO_ERRORS = SimulatedInstrument(), PositionErrors()
 
 
 def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed: int) -> Deflection:
-    """Return compliance and harmonics of every joint of a chain.
+    """Return the joint deflections of a chain: compliance and harmonics of each joint.
 
     Args:
         chain: the true arm.
@@ -96,7 +96,7 @@ def perturbed_cell(
     hidden: float = 0.2,
     unmodelled: PositionErrors = NO_ERRORS,
 ) -> Cell:
-    """Return a cell whose true arm deviates normally from nominal in every element.
+    """Return a cell whose true arm differs from the nominal arm by normal random errors.
 
     Args:
         nominal: the arm as it is described.
@@ -125,7 +125,7 @@ def perturbed_cell(
 
 
 def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
-    """Return a chain whose elements deviate by normal errors: `LENGTH`, `ANGLE`, and `OFFSET` for joint offsets."""
+    """Return the chain with normal random errors (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets) in all elements."""
     rng = np.random.default_rng(seed)
     spread = [
         LENGTH if element.unit == "m" else OFFSET if element.joint is not None else ANGLE for element in chain.elements
