@@ -65,7 +65,7 @@ class Lens:
         return replace(self, values=values)
 
     def in_sight(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Return whether points (N, 3) [m] project into the image, `margin` [px] inside its edge: (N,) bool.
+        """Return whether points (N, 3) [m] project into the image, at least `margin` [px] from its edge: (N,) bool.
 
         A point beyond the angle at which the distortion's polynomial turns back is out of sight, wherever it falls.
         """
@@ -97,7 +97,7 @@ class Lens:
 
 
 def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distorted coordinates (N, 2) and their derivatives by undistorted ones (N, 2, 2) and k (N, 2, len(k))."""
+    """Return distorted coordinates (N, 2) and their Jacobians with respect to `plane` (N, 2, 2) and k (N, 2, K)."""
     a, b = plane[:, 0], plane[:, 1]
     square = a * a + b * b
     k1, k2, p1, p2, k3 = k[:5]
@@ -125,7 +125,7 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _fisheye(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distorted coordinates and derivatives of a fisheye lens, as `_brown_conrady`."""
+    """Return distorted coordinates and Jacobians of a fisheye lens, in the form of `_brown_conrady`."""
     r = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
     angle = np.arctan(r)
     powers = angle[:, None] ** np.array([2, 4, 6, 8])
@@ -142,7 +142,7 @@ BEND = {"pinhole": _brown_conrady, "fisheye": _fisheye}
 
 
 def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """Return X/Z and Y/Z (N, 2) of pixels (N, 2), by Newton's method; NaN for pixels that no ray reaches."""
+    """Return the ray direction (X/Z, Y/Z) (N, 2) of each pixel (N, 2), by Newton's method; NaN without a solution."""
     wanted = (pixels - lens.values[2:4]) / lens.values[:2]
     if lens.model == "fisheye":
         long = np.linalg.norm(wanted, axis=1)

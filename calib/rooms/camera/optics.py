@@ -1,4 +1,4 @@
-"""Parameters that images add to an installation: lenses and shapes of printed boards, with derivatives.
+"""Calibration parameters of images: lenses and shapes of printed boards, with derivatives.
 
 A corner (x, y, 0) of the table stands on the board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y counted
 from the board's middle: s is the scale of the print, b how the board bends [1/m]. In ``robot.toml`` of a fit::
@@ -34,7 +34,7 @@ UNITS = ("", "1/m", "1/m", "1/m")
 
 @dataclass(frozen=True)
 class BoardShape:
-    """Deviation of a printed board from its corner table: scale, and bending [1/m]."""
+    """Deviation of a printed board from its nominal shape: scale, and bending [1/m]."""
 
     scale: float = 1.0
     bend_xx: float = 0.0
@@ -95,7 +95,7 @@ class Optics:
         return sum(len(lens.values) for lens in self.lenses) + len(SHAPE) * len(self.boards)
 
     def with_values(self, values: np.ndarray) -> Optics:
-        """Return the optics with other parameter values; a focal length changes by half at most per step."""
+        """Return the optics with other parameter values; a focal length changes by at most half of its value."""
         lenses, start = [], 0
         for lens in self.lenses:
             own = np.array(values[start : start + len(lens.values)])
@@ -106,7 +106,7 @@ class Optics:
         return replace(self, lenses=tuple(lenses), boards=tuple(BoardShape(*map(float, row)) for row in shapes))
 
     def like(self, other: Optics) -> Optics:
-        """Return these optics with the values of others of the same kind, all of them fixed."""
+        """Return these optics with the values of other optics (same lens model, same board), not to be fitted."""
         known = {(lens.model, lens.size): lens for lens in reversed(other.lenses)}
         lenses = tuple(known.get((lens.model, lens.size), lens) for lens in self.lenses)
         shapes = {name: shape for name, shape in zip(other.board_names, other.boards)}
@@ -115,7 +115,7 @@ class Optics:
         return replace(self, lenses=lenses, boards=boards, free=frozenset())
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
-        """Return lens, board shape and free parameters for the prediction of a block of images."""
+        """Return lens, board shape and free parameters of a block of images; None for other measurements."""
         if not isinstance(measured, Pixels):
             return None
         if measured.camera not in self.lens_names or measured.target not in self.board_names:
@@ -177,7 +177,7 @@ def read_optics(cameras: Sequence[Mapping[str, Any]], boards: Sequence[Mapping[s
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Lens and board shape of one block of images, for its residuals.
+    """Lens and board shape that predict one block of images.
 
     Attributes:
         lens, shape: of the camera and the board.
@@ -192,12 +192,12 @@ class View:
 
 
 def shaped_points(board: Board, shape: BoardShape, points: np.ndarray) -> np.ndarray:
-    """Return the positions of a corner table's points (N, 3) [m] on the printed board."""
+    """Return the positions (N, 3) [m] of nominal board points on the printed board."""
     return shape_slopes(board, shape, points)[0]
 
 
 def shape_slopes(board: Board, shape: BoardShape, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3) [m] on the printed board, and their derivatives by the four values (N, 3, 4)."""
+    """Return positions (N, 3) [m] on the printed board, and their Jacobian (N, 3, 4) with respect to its shape."""
     x, y = (points[:, :2] - 0.5 * np.array(board.extent)).T
     slope = np.zeros((len(points), 3, 4))
     slope[:, :2, 0] = points[:, :2]

@@ -1,4 +1,4 @@
-"""Residuals of images of a rigid board: its corners, with the pose that all corners of an image share.
+"""Residuals of images of a rigid board: corner by corner, with one pose per image.
 
     r = y - π(P c + p),   ∂π/∂x = ∂π/∂point · (ω × R c + v) + ∂π/∂lens + ∂π/∂point · R ∂c/∂shape
 
@@ -39,7 +39,7 @@ MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
 
 @dataclass(frozen=True, eq=False)
 class ImageNoise(Frozen):
-    """Noise of one block of images.
+    """Noise estimates of one block of images.
 
     Attributes:
         factor: of the corners' stated sigmas.
@@ -62,11 +62,11 @@ class ImageNoise(Frozen):
         return np.repeat([self.displacement, self.turn], 3)
 
     def unweighted(self, images: int) -> ImageNoise:
-        """Return this noise for `images` images of weight 1, without the stored `shared`."""
+        """Return this noise for another number of images, with all weights equal to 1."""
         return replace(self, weight=np.ones(images), shared=None)
 
     def near(self, other: ImageNoise) -> bool:
-        """Return whether two estimates are so close that the fit need not be repeated."""
+        """Return whether two noise estimates agree, so that the fit is not repeated."""
         pairs = ((self.factor, other.factor), (self.displacement, other.displacement), (self.turn, other.turn))
         alike = all(abs(a - b) <= MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE for a, b in pairs)
         return alike and np.abs(self.weight - other.weight).max(initial=0.0) < 0.05
@@ -74,7 +74,7 @@ class ImageNoise(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class OwnPoses:
-    """Estimates of k images, each with a free pose.
+    """Results of fitting a free pose to each of k images.
 
     Attributes:
         residual: (k, 6) of what the arm carries: best pose minus predicted [v; ω].
@@ -90,7 +90,7 @@ class OwnPoses:
 
 
 def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
-    """Return the noise estimated from the residuals at an optimum.
+    """Return the noise of the images, estimated from the residuals of a fit.
 
     Args:
         found: see there.
@@ -120,7 +120,7 @@ def estimate_noise(found: OwnPoses, unknowns: int, loss: str = "none", scale: fl
 
 
 def _component(square: np.ndarray, known: np.ndarray, max_steps: int = 20) -> float:
-    """Return s with E[t²] = s² + known, by the maximum-likelihood score Σ (t² - s² - c) / (s² + c)² = 0."""
+    """Return the standard deviation s with E[t²] = s² + known, by maximum likelihood: Σ (t² - s² - c)/(s² + c)² = 0."""
     value = max(float(np.mean(square - known)), 1e-3 * float(np.median(square)))
     for _ in range(max_steps):
         weight = 1.0 / (value + known) ** 2
@@ -136,7 +136,7 @@ STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axi
 
 @dataclass(frozen=True, eq=False)
 class PixelPart(Part):
-    """Residuals of corners, ordered by image; ``jacobian`` is that of the pose shared by an image's corners.
+    """Residuals of corners, ordered by image; ``jacobian`` is the Jacobian of each image's board pose.
 
     Attributes:
         value, sigma: (2, N) [px].
@@ -209,7 +209,7 @@ class PixelPart(Part):
         return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
-        """Return estimates with a free pose per image, at sigmas `scale` (2, N)."""
+        """Return the fit of a free pose to each image, with corner σ `scale` (2, N) [px]."""
         images, first = np.unique(self.index, return_index=True)
         counts = np.diff(np.append(first, len(self.index)))
         table = np.concatenate([self.local[:, :, :6], self.value.T[:, :, None]], axis=2) / scale.T[:, :, None]
@@ -229,7 +229,7 @@ class PixelPart(Part):
         return replace(noise, weight=weight, shared=self._shared_errors(noise))
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
-        """Return the corners' residuals (2, N) [px] after a fit of a free pose per image."""
+        """Return the residuals (2, N) [px] of all corners after a free pose is fitted to each image."""
         images, place = np.unique(self.index, return_inverse=True)
         found = self.own_poses(sigma)
         moved = np.einsum("kij,kj->ki", self.carried[images], found.residual)
@@ -237,7 +237,7 @@ class PixelPart(Part):
 
 
 def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarray:
-    """Return rows (N, 2, w), `counts` corners per image, as (images, height, w) with zeros below."""
+    """Return corner rows (N, 2, w) as one block per image (images, height, w), filled up with zeros."""
     width = table.shape[2]
     most = height // 2 or max(int(counts.max(initial=0)), (width + 1) // 2)
     padded = np.zeros((len(counts), most, 2, width))
@@ -258,7 +258,7 @@ def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
 
 @parts.register
 def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """Return the corner residuals r = y - π(point); see the module."""
+    """Return the corner residuals r = y - π(point) of a block of images, with their Jacobians."""
     if seen.view is None:
         refuse_data(measured.file, "the camera of these images is unknown")
     view, in_hand = seen.view, measured.mounting == IN_HAND
@@ -294,7 +294,7 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
 
 
 def _twist_of_board(jacobian: np.ndarray, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return [v; ω] of the board in the camera's axes (f, 6, m) from that of the camera in the board's axes.
+    """Return the board's twist [v; ω] in the camera's axes (f, 6, m), from the camera's twist in the board's axes.
 
     With the board at (R, o) in the camera's frame, ω' = -R ω and o' = -R v + ω' × o.
 

@@ -23,7 +23,7 @@ from calib.rooms.camera.lens import Lens
 
 @dataclass(frozen=True, eq=False)
 class Pixels(PoseMeasurements):
-    """Pixel positions of a rigid board's corners in m images.
+    """Measured pixel positions of a board's corners in m images.
 
     The camera in the hand: the arm carries the camera (``tool``), ``station`` is the board's place. The camera to the
     hand: the arm carries the board (``tool``), ``station`` is the camera's place.
@@ -113,7 +113,7 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Detections of a folder by image name, and the images' width and height (0, 0 where unknown)."""
+    """Detected corners by image name, and the images' width and height (0, 0 if unknown)."""
 
     images: dict[str, Detection]
     size: tuple[int, int] = (0, 0)

@@ -1,4 +1,4 @@
-"""Placement of camera and board from poses: the best of three closed forms of B_i = S A_i X.
+"""Placement of camera and board from poses: the best of three closed-form solutions of B_i = S A_i X.
 
 * Shah (2013): rotations by the Kronecker product's first singular pair, then translations;
 * Li, Wang & Wu (2010): rotations and translations at once, S⁻¹ B_i = A_i X as one homogeneous linear system;
@@ -19,7 +19,7 @@ from calib.transforms import invert, orthonormal, pose
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Placement of m poses by a closed form.
+    """Placement of camera and board from m poses, by one closed-form method.
 
     Attributes:
         method: its name.
@@ -39,7 +39,7 @@ class Placement:
 
 
 def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement:
-    """Return the best placement by any of the three methods.
+    """Return the placement of the closed-form method with the smallest median misfit.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.

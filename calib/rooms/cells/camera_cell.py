@@ -70,7 +70,7 @@ class CameraCell:
 
 @dataclass(frozen=True)
 class Views:
-    """Ranges of the random views of the board: distance [m], maximum tilt [rad], and whether it is fully in view."""
+    """Ranges of random views: distance [m] and largest tilt [rad] of the board, and whether it is fully in view."""
 
     distance: tuple[float, float] = RANGE
     tilt: float = TILT
@@ -134,7 +134,7 @@ def board_poses(found: CameraCell, q: np.ndarray) -> np.ndarray:
 def views(
     found: CameraCell, count: int, seed: int | np.random.Generator = 0, sought: Views | None = None
 ) -> np.ndarray:
-    """Return joint values (count, n) at random within the limits, with the board in the camera's view.
+    """Return random joint values (count, n) at which the camera sees the board.
 
     Args:
         found: the cell.
@@ -158,7 +158,7 @@ def views(
 
 
 def visible(found: CameraCell, q: np.ndarray) -> np.ndarray:
-    """Return whether corners (m, K) fall into the image and face the camera at joint values q (m, n)."""
+    """Return whether each corner is visible to the camera at joint values q (m, n): (m, K) bool."""
     poses = board_poses(found, q)
     flat = _points(found, poses).reshape(-1, 3)
     facing = np.einsum("mi,mi->m", poses[:, :3, 2], poses[:, :3, 3]) > 0.0
@@ -173,7 +173,7 @@ def _points(found: CameraCell, poses: np.ndarray) -> np.ndarray:
 def photograph(
     found: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
 ) -> Pixels:
-    """Return the corners seen at q (m, n) with white noise [px], as a block of images with unknown lens.
+    """Return simulated images at q (m, n): projected corners with white noise [px]; the lens is left unknown.
 
     The recorded joints carry the encoders' noise.
     """

@@ -45,7 +45,7 @@ def study(
         say(*(map(str, METHODS.values()) if list_methods else ()), *(report.study_lines() if list_studies else ()))
         return
     if not studies:
-        raise UsageError("no study named: give a file, or a name out of calib study --list")
+        raise UsageError("no study given: name a file, or a study of calib study --list")
     if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
         raise UsageError("several studies need one folder: give --out DIR")
     folder = out or Path(f"{Path(studies[0]).stem}-study")

@@ -72,7 +72,7 @@ Count = Annotated[int, Whole(0, 1_000_000)]
 @strict
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the encoders [rad] and of the logged torques [N m]; its name is part of the conditions' names."""
+    """Noise of encoders [rad] and logged torques [N m], with a name."""
 
     name: Name
     sigma_q: Annotated[float, Real(least=0, most=0.1, unit="rad", quantity="angle")]
@@ -82,7 +82,7 @@ class Noise:
 @strict
 @dataclass(frozen=True)
 class StudyFile:
-    """The content of a study file; see the module for the keys."""
+    """Content of a study file; one field per key."""
 
     name: Name
     noise: Annotated[tuple[Noise, ...], MinLen(1)]
@@ -138,7 +138,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Study:
-    """Conditions, and the number of runs of each method on them.
+    """Conditions of a study, and the number of runs of each method on each condition.
 
     Attributes:
         name, about: of the study.
@@ -186,7 +186,7 @@ def read_study(
     names = [condition.name for condition in conditions]
     if twice := next((name for name in names if names.count(name) > 1), ""):
         raise UsageError(
-            f"two conditions are named '{twice}': list each value once, and give noises (and studies of "
+            f"two conditions are named '{twice}': state each value once, and give noises (and studies of "
             "several files) different names"
         )
     _check_cutoffs(conditions)
@@ -218,12 +218,12 @@ def _paths(files: Sequence[str | Path]) -> list[Path]:
     for one in map(str, files):
         found = [path for name, path in own.items() if fnmatchcase(name.lower(), one.lower())]
         if not Path(one).exists() and not one.endswith(".toml"):
-            words = f"no study '{one}'{suggestion(one, own)}: neither a file nor one of calib study --list"
+            words = f"no study '{one}'{suggestion(one, own)}: give a file, or a name of calib study --list"
             require(found, words, UsageError)
             result += found
         else:
             result.append(Path(one))
-    require(result, "no study named: give a file, or a name out of calib study --list", UsageError)
+    require(result, "no study given: name a file, or a study of calib study --list", UsageError)
     return list(dict.fromkeys(result))
 
 
@@ -242,7 +242,7 @@ def _parse(path: Path) -> StudyFile:
 
 
 def _expanded(study: StudyFile) -> list[Condition]:
-    """Return all combinations, named by the study and its varying keys."""
+    """Return the conditions of a study: all combinations of its values, each with a name."""
     axes: dict[str, tuple[Any, ...]] = {
         "robot": study.robot, "noise": study.noise, "decimation": study.decimation, "cutoff": study.cutoff,
         "mismatch": study.mismatch,
@@ -274,7 +274,7 @@ def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -
 
 
 def _stated(study: StudyFile, name: str) -> int:
-    """Return the number of runs in a file for a method: its own, else those of its kind."""
+    """Return the number of runs that a file states for a method, or for its kind."""
     method = METHODS[name]
     kind = study.runs_loop if method.needs_controller else study.runs_filter if method.needs_simulation else None
     return study.runs_of.get(name, study.runs if kind is None else kind)

@@ -1,4 +1,4 @@
-"""Simulated data set of a condition: a robot with known parameters in its loop, and the methods' input.
+"""Simulated data sets: a robot with known parameters in its control loop, and the input of the methods.
 
 The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40) or 140 Hz (RV-2SQ); the encoders'
 noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows decimated, as
@@ -121,7 +121,7 @@ def _nominal_base(robot: str) -> Base:
 
 @lru_cache(maxsize=2)
 def make_experiment(condition: Condition, seed: int) -> Experiment:
-    """Return the data set with a given number of a condition: the same at any place and time.
+    """Return the simulated data set of a condition and a seed; always the same.
 
     Raises:
         CalibError: where the true robot cannot be recorded.
@@ -176,7 +176,7 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, Ident
 
 
 def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Controller, seed: int) -> Case:
-    """Return the case of one noisy run of the true robot."""
+    """Return the recording of one noisy run of the true robot, as a case."""
     sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
 
     def run(every: float) -> SimulatedRun:
@@ -209,7 +209,7 @@ def _loop(condition: Condition, controller: Controller) -> LoopSettings:
 
 
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
-    """Return the robot's parameters, each with a normal relative error, for consistent inertias and dissipative drives.
+    """Return the robot's parameters with normal relative errors; the inertias stay physically consistent.
 
     A body is drawn until it can be (the survey's way, but body by body); where that takes long, from a smaller spread.
     """

@@ -33,7 +33,7 @@ from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.report.page import Block, Column, Section, Text, table
 
 MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0  # our choices
-LOOP = "needs the closed loop: state it in the options file, [loop] (calib formats identify-options)"
+LOOP = "needs the closed loop: add [loop] to the options file (calib formats identify-options)"
 NO_MODEL = 100.0  # error [%] of predicting no torque at all
 
 
@@ -91,7 +91,7 @@ def compare_methods(
     inputs: IdentificationInputs, methods: Sequence[str] | None = None, friction: str = "standard",
     say: Callable[[str], None] = lambda words: None, each: Callable[[ComparedMethod], None] = lambda one: None,
 ) -> list[ComparedMethod]:  # fmt: skip
-    """Return the results of all methods on the recordings, best first; those that failed or need a [loop] last.
+    """Return the results of all methods on the recordings, best first; failed methods come last.
 
     Args:
         inputs: training recordings, and unseen ones.
@@ -146,7 +146,7 @@ def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> li
     notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
     notes += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
-        notes.append("none to take: give motion that is no repeat with --validate")
+        notes.append("none to take: all unseen recordings repeat the training motion; give another with --validate")
     elif repeated:
         notes.append(f"excluded from the ranking: {', '.join(repeated)}")
     judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
@@ -165,7 +165,7 @@ def _said(say: Callable[[str], None], name: str, words: str) -> None:
 
 
 def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
-    """Return the options' settings that apply to a method."""
+    """Return the identification settings for a method, without settings that it does not use."""
     settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
     if not method.takes_constraints:
         settings = replace(settings, constraints=None)
@@ -177,7 +177,7 @@ def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> Id
 def _held(
     one: ComparedMethod, inputs: IdentificationInputs, found: Identification, proven: bool, say: Callable[[str], None]
 ) -> ComparedMethod:
-    """Return the method selected by the rule with its model's verdict, recommended unless the verdict is fail.
+    """Return the selected method with the verdict on its model; with verdict fail it is not recommended.
 
     Args:
         proven: whether the recordings are motion that it has not seen.
@@ -195,7 +195,7 @@ def _held(
 def _errors(
     found: Identification, inputs: IdentificationInputs, same_unit: np.ndarray
 ) -> tuple[ComparedMethod, _Sums]:  # fmt: skip
-    """Return a method's errors, before the comparison with other methods."""
+    """Return the errors of a method's model, and their sums by block of time."""
     unseen, training = (_sums(found, cases) for cases in (inputs.unseen, inputs.cases))
     joints = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
     worst = int(np.argmax(np.where(same_unit, joints, -1.0)))
@@ -232,7 +232,7 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _leaving_out(sums: _Sums, same_unit: np.ndarray) -> np.ndarray:
-    """Return the error (k,) [%] with each block left out."""
+    """Return the error (k,) [%] with each of k blocks of time left out."""
     error, size = sums.error[:, same_unit].sum(axis=1), sums.size[:, same_unit].sum(axis=1)
     return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
 
@@ -242,7 +242,7 @@ def _jackknife(each: np.ndarray) -> float:
 
 
 def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
-    """Return the methods by rank; chosen is the first fast one among the good, regardless of its verdict."""
+    """Return the methods by rank; the first fast one of the good methods is marked as chosen."""
     if not done:
         return []
     order = sorted(done, key=lambda pair: pair[0].unseen)
@@ -295,13 +295,13 @@ COLUMNS = (
 
 
 def line(one: ComparedMethod) -> str:
-    """Return a line on a method's result before the ranking."""
+    """Return one line on a method's result: its error, or the reason of its failure."""
     words = one.failure or f"{one.unseen:.3g} % on unseen motion, {one.seconds:.2g} s"
     return f"{one.name}: {words}"
 
 
 def section(found: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
-    """Return a report section: the table, notes, and the verdict on the selected method's model."""
+    """Return a report section: table of methods, notes, and the verdict on the selected method's model."""
     own = next((one for one in found if one.verdict is not None), None)
     shown = (*_blocks(found), Text("", notes, "note"))
     if own is None or own.verdict is None:

@@ -51,7 +51,7 @@ def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):
     alone, beside = (gather(robot, [train], [tmp_path / "copy.npz", *more]) for more in ([], [other]))
     (found,) = compare_methods(alone, ["ols"])
     assert not found.chosen
-    assert "no repeat" in caveats(alone, [found])[-1]
+    assert "repeat the training motion" in caveats(alone, [found])[-1]
     (both,), (plain,) = compare_methods(beside, ["ols"]), compare_methods(gather(robot, [train], [other]), ["ols"])
     assert both.chosen and both.unseen == pytest.approx(plain.unseen)
     assert "copy.npz" in caveats(beside, [both])[-1]

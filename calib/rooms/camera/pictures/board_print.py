@@ -51,7 +51,7 @@ def _black(board: Board) -> np.ndarray:
 
 
 def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray:
-    """Return rectangles (N, 4) that cover the dark modules of a marker, one per horizontal run."""
+    """Return rectangles (N, 4) [m] that cover the black fields of a marker, one per horizontal run."""
     result = []
     for row, line in enumerate(dark):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
@@ -61,7 +61,7 @@ def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray
 
 
 def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
-    """Return a board with a white margin [m] around it as reflectances (H, W), 0 black to 1 white.
+    """Return the image (H, W) of a board with a white margin [m]: reflectances, 0 black to 1 white.
 
     Every pixel holds the share of its area that is white, so that edges lie where they belong.
     """
@@ -79,7 +79,7 @@ def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
 
 
 def page_size(board: Board, paper: str = "") -> tuple[float, float]:
-    """Return width and height of the page [m]: the paper's as the board lies on it better, or the smallest that does.
+    """Return width and height [m] of the page that the board fits on: the stated paper, or the smallest one.
 
     Raises:
         UsageError: where the board does not fit, with the largest square that would.
@@ -119,7 +119,7 @@ def svg(board: Board, size: tuple[float, float]) -> str:
 
 
 def pdf(board: Board, size: tuple[float, float]) -> bytes:
-    """Return a one-page PDF at true scale that requests printing without scaling."""
+    """Return the page as a PDF at true scale, with print scaling switched off."""
     boxes, words = _page(board, size)
     wide, high = (length / POINT for length in size)
     lines = [f"{x / POINT:.4f} {high - (y + h) / POINT:.4f} {w / POINT:.4f} {h / POINT:.4f} re" for x, y, w, h in boxes]
@@ -147,7 +147,7 @@ def pdf(board: Board, size: tuple[float, float]) -> bytes:
 
 
 def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tuple[float, float, str]]]:
-    """Return black boxes (N, 4) and words of a page [m]: the board in its middle, a ruler below."""
+    """Return the black rectangles (N, 4) [m] and the texts of a page: board in the middle, ruler below."""
     left, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
     boxes = _black(board) + np.array([left, top, 0.0, 0.0])
     length = 0.01 * int(100 * min(board.extent[0], 0.2) + 1e-9)
@@ -197,7 +197,7 @@ def make(
     there = out / BOARD
     if not overwrite and there.exists() and not _as_printed(out):
         raise UsageError(
-            f"{there} was changed after printing (measured squares?), or is another board's; nothing was written. "
+            f"{there} was changed after printing (measured squares?) or describes another board; nothing was written. "
             "Take another folder (--out), or give --overwrite"
         )
     files.write(out / "board.pdf", pdf(made, size))
@@ -213,7 +213,7 @@ def make(
 
 
 def _as_printed(out: Path) -> bool:
-    """Return whether a folder's ``board.toml`` still describes its ``board.svg``, as `make` wrote both."""
+    """Return whether a folder's ``board.toml`` is unchanged since `make` wrote it with ``board.svg``."""
     try:
         found, drawn = read_board(out), (out / "board.svg").read_bytes()
         sizes = []

@@ -1,4 +1,4 @@
-"""Sub-pixel corners of a board in an image, each with a standard deviation; or why the image is unusable.
+"""Sub-pixel corner detection: a board's corners in an image with their σ, or the reason why it is unusable.
 
 Markers are found in an image of some `max_pixels` pixels; corners are then refined in the full one by the orthogonality
 of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standard deviation is the Cramér–Rao bound of
@@ -100,7 +100,7 @@ def _upright(image: np.ndarray, found: np.ndarray, board: Board) -> np.ndarray:
 def _consistent(
     ids: np.ndarray, found: np.ndarray, table: np.ndarray, board: Board
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the corners consistent with the image of a plane, and the side of a square [px]."""
+    """Return the corners consistent with a plane, and the side of a square [px]."""
     plane = cv2.findHomography(table[ids, :2], found, cv2.RANSAC, 8.0)[0]
     if plane is None:
         return ids[:0], found[:0], 1.0
@@ -115,7 +115,7 @@ def _consistent(
 def _refined(
     image: np.ndarray, board: Board, ids: np.ndarray, found: np.ndarray, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners refined in the full image, without those at its edge and those that diverge."""
+    """Return the corners refined to sub-pixels; corners at the image's edge or without convergence are dropped."""
     free = {"charuco": 0.5 * (1.0 - board.marker / board.square), "chessboard": 0.3, "apriltag": 0.09}[board.kind]
     half = int(np.clip(free * spacing, 2, 12))
     inside = ((found > half + 2) & (found < np.array(image.shape[::-1]) - half - 3)).all(axis=1)
@@ -130,7 +130,7 @@ def _refined(
 
 
 def _quality(image: np.ndarray, found: np.ndarray, floor: float, spacing: float) -> tuple[np.ndarray, float, float]:
-    """Return each corner's sigma (n,) [px], the median width of edges [px], and its ratio across directions."""
+    """Return each corner's σ (n,) [px], the median edge width [px], and its ratio between the two directions."""
     max_half_width = 9  # half width of the patches that quality is measured in [px]
     half = int(np.clip(0.15 * spacing, 3, max_half_width))
     offsets = np.arange(-half, half + 1)
@@ -151,7 +151,7 @@ def _quality(image: np.ndarray, found: np.ndarray, floor: float, spacing: float)
 
 
 def _widths(across: np.ndarray, down: np.ndarray, contrast: float) -> tuple[float, float]:
-    """Return the widths [px] of both edges that cross in a patch: contrast over the steepest gradient of each."""
+    """Return the widths [px] of the two edges crossing in a patch: contrast divided by each steepest gradient."""
     size = np.hypot(across, down)
     best = np.unravel_index(int(np.argmax(size)), size.shape)
     normal = np.array([across[best], down[best]]) / max(float(size[best]), 1e-9)
@@ -164,7 +164,7 @@ def _widths(across: np.ndarray, down: np.ndarray, contrast: float) -> tuple[floa
 def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, thorough: bool) -> str:
     """Return the likely reason why no board was detected."""
     if count:
-        return f"only {count} corners of the board are seen ({MIN_CORNERS} are needed): move it into view"
+        return f"only {count} corners of the board are in view, {MIN_CORNERS} are needed: move it into view"
     if np.percentile(image[::5, ::5], 99) < 30:
         return "too dark: hardly anything is brighter than 30 of 255; expose longer"
     if np.mean(image[::5, ::5] > 252) > 0.25:

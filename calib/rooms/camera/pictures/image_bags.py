@@ -51,7 +51,7 @@ def read_image_bag(
     joint_topic: str = "",
     say: Callable[[int, str], None] | None = None,
 ) -> ImageBag:
-    """Return board detections and joint values of a bag's images.
+    """Return the detected corners and the joint values of a bag's images.
 
     Args:
         path: of the bag (a file, or the folder of a ROS 2 bag).
@@ -83,7 +83,7 @@ def _image_stamps(reader: Any, connections: list[Any]) -> np.ndarray:
 
 
 def _images(reader: Any, connections: list[Any], wanted: set[int]) -> Any:
-    """Yield the images with the given numbers as grey levels, in this order."""
+    """Yield the images with the given numbers as 8-bit grey levels, in the bag's order."""
     for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
         if number in wanted:
             yield _grey(reader.deserialize(raw, connection.msgtype))
@@ -112,7 +112,7 @@ def _grey(message: Any) -> np.ndarray:
 
 
 def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the numbers of images taken at rest, their joint values, and sentences on the other images."""
+    """Return the numbers of images taken at rest, their joint values, and notes on the other images."""
     notes = []
     after = np.clip(np.searchsorted(stamps, images), 1, len(stamps) - 1)
     before = after - 1
@@ -154,7 +154,7 @@ def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
 def from_bag(
     bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Callable[[str], None]
 ) -> list[str]:
-    """Write the corners and joint values of a bag's images as a folder; return sentences on the result."""
+    """Write a bag's corners and joint values into a folder; return a summary as sentences."""
     made = read_board(board)
     found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
     write_image_folder(found, made, out)

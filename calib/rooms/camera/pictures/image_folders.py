@@ -183,7 +183,7 @@ def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[
 
 
 def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
-    """Return the names of the fitted lens and board parameters by the options."""
+    """Return the names of the lens and board parameters that the options ask to fit."""
     camera, result = options.camera, list[str]()
     if camera.intrinsics == "fit" or (camera.intrinsics == "auto" and not known):
         own = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}[camera.model]
@@ -196,7 +196,7 @@ def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
 
 
 def look(folder: Path, show: Callable[[str], None]) -> list[str]:
-    """Return sentences on the board detection in the images of a folder."""
+    """Return a summary of the corner detection in a folder of images, as sentences."""
     board = read_own_board(folder)
     names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
     found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))

@@ -58,7 +58,7 @@ def decode(content: bytes) -> np.ndarray:
 
 
 def to_grey(image: np.ndarray) -> np.ndarray:
-    """Return 8-bit grey levels (height, width) of any image; more than 8 bits are scaled to the image's range."""
+    """Return any image as 8-bit grey levels (height, width); more than 8 bits are scaled to the image's range."""
     if image.ndim == 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
     if image.dtype == np.uint8:

@@ -1,4 +1,4 @@
-"""List of the survey's methods that serve for comparison only."""
+"""The survey's methods, for comparisons only."""
 
 from calib.rooms.studies.methods.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF, UKF
 from calib.rooms.studies.methods.maximum_likelihood import ML

@@ -35,7 +35,7 @@ NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider on
 
 @dataclass(frozen=True)
 class _KalmanFilter(Method):
-    """A Kalman filter whose states include the parameters; see the module.
+    """Identification by a Kalman filter whose states include the parameters.
 
     Attributes:
         kind: rule and form.
@@ -86,7 +86,7 @@ class _KalmanFilter(Method):
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Estimate and covariance of the parameters between recordings, with sizes of innovations and passes."""
+    """Parameters and their covariance between recordings, with the sizes of past innovations."""
 
     robot: BelievedRobot
     kind: Filter
@@ -116,7 +116,7 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
 
 
 def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield measured q (n,) of a segment, and mean torques (s, n) of s equal steps since the previous sample.
+    """Yield each sample q (n,) of a segment, and the mean torques (s, n) of s equal steps since the last sample.
 
     `max_step`: [s] of a step of the dynamics.
     """
@@ -168,7 +168,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
-    """Return the belief's spread with the parameters' part replaced by a covariance."""
+    """Return the spread of a belief after its parameter block is replaced by a covariance."""
     spread = np.array(belief.spread)
     spread[first:, first:] = np.linalg.cholesky(parameters) if belief.root else parameters
     return spread
@@ -186,7 +186,7 @@ class _Stepping:
     there: np.ndarray
 
     def step(self, before: Belief, tau: np.ndarray, period: float, torque: np.ndarray) -> Belief:
-        """Return the belief after torques tau (s, n), each for a period; `torque` (n,) is the noise of their mean.
+        """Return the predicted belief after torques tau (s, n), each held for one period.
 
         Raises:
             CannotSimulate: where not even points near the mean are robots.
@@ -217,7 +217,7 @@ class _Stepping:
             spread[:, :n], spread[:, n : 2 * n] = q, v
             noise = self._noise(gain, len(tau) * period, torque, spread.shape[1])
             return predicted(spread, noise, self.kind, narrower)
-        raise CannotSimulate(f"the filter's parameters are not a possible robot: {failure}", before.mean)
+        raise CannotSimulate(f"the filter's parameters give no robot that can be simulated: {failure}", before.mean)
 
     def _values(self, states: np.ndarray) -> np.ndarray:
         """Return the plant's parameters (K, p) of states (K, L)."""
@@ -226,7 +226,7 @@ class _Stepping:
         return result
 
     def _noise(self, gain: np.ndarray, period: float, torque: np.ndarray, size: int) -> np.ndarray:
-        """Return N (L, n): what noise of the torques does in one step."""
+        """Return the effect N (L, n) of torque noise on the state in one step."""
         result = np.zeros((size, self.n))
         result[: self.n] = 0.5 * period**2 * gain * torque
         result[self.n : 2 * self.n] = period * gain * torque

@@ -75,7 +75,7 @@ def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
 
 
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
-    """Return the points (2 L + 1, L) of a sigma-point rule, the mean first; `narrower` scales their distance."""
+    """Return the sigma points (2 L + 1, L) of a belief, the mean first; `narrower` scales their distance."""
     deviations, gamma = before.deviations, narrower * _gamma(kind, len(before.mean))
     return np.concatenate(
         [before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T]
@@ -83,7 +83,7 @@ def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
 
 
 def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: float = 1.0) -> Belief:
-    """Return the belief after a step, from the propagated `points` (2 L + 1, L) and noise N (L, k)."""
+    """Return the predicted belief from the propagated `points` (2 L + 1, L) and noise N (L, k)."""
     size = images.shape[1]
     gamma = narrower * _gamma(kind, size)
     middle, ahead, behind = images[0], images[1 : size + 1] - images[0], images[size + 1 :] - images[0]
@@ -98,14 +98,14 @@ def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: flo
 
 
 def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noise: np.ndarray, kind: Filter) -> Belief:
-    """Return the belief after a step to `mean` (L,) with slopes F (L, L)."""
+    """Return the predicted belief at `mean` (L,), from the Jacobian F (L, L) of the step and noise N (L, k)."""
     if kind.root:
         return _packed(mean, slopes @ before.spread, noise, kind, 0.0, mean)
     return Belief(mean, slopes @ before.spread @ slopes.T + noise @ noise.T, False)
 
 
 def corrected(before: Belief, seen: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
-    """Return the belief after measuring the first `rows` components with noise std (rows,), and the innovation's size.
+    """Return the belief corrected by a measurement of its first `rows` components, and the innovation's size.
 
     The size is eᵀ (H P Hᵀ + R)⁻¹ e, on average `rows` where the filter knows its noise.
     """
