@@ -143,9 +143,8 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
         part = next(part for part in observe(nominal, block, frames) if part.label == "position")
         seen = np.asarray(block.measured.position)[part.index]
         rows.append(part.value.ravel())
-        columns.append(
-            np.column_stack([part.jacobian.reshape(len(frames), -1).T, (seen - seen.mean(axis=0)).T.ravel()])
-        )
+        away = (seen - seen.mean(axis=0)).T.ravel()
+        columns.append(np.column_stack([part.jacobian.reshape(len(frames), -1).T, away]))
     if not rows:
         return None
     value, matrix = np.concatenate(rows), np.concatenate(columns)
@@ -159,9 +158,8 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
     slope = float(own @ left) / power
     squares = float(left @ left)
     rest = max(squares - slope**2 * power, 0.0)
-    return Scale(
-        1.0 / (1.0 - slope / size), float(np.sqrt(rest / count / power)) / size, 1.0 - rest / max(squares, 1e-300)
-    )
+    sigma = float(np.sqrt(rest / count / power)) / size
+    return Scale(1.0 / (1.0 - slope / size), sigma, 1.0 - rest / max(squares, 1e-300))
 
 
 def length_factor(fit: GeometricFit) -> Scale | None:

@@ -120,9 +120,7 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
     """
     max_station_poses = 150
     if name == "poses" and sum(len(block) for block in measured) > max_station_poses:
-        raise UsageError(
-            f"folds 'poses' hold out every pose once, for {max_station_poses} rows at most; choose 'random'"
-        )
+        raise UsageError(f"folds 'poses' hold out each pose once: at most {max_station_poses} rows; choose 'random'")
     ways = {
         "transfer": lambda: transfer_folds(measured, seed),
         "regions": lambda: region_folds(measured, seed=seed),

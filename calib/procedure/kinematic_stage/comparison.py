@@ -185,6 +185,5 @@ def iso9283_sentence(found: RepeatedPoses, min_poses: int = 5, min_cycles: int =
     )
     few = [f"{min_poses} poses"] * (found.poses < min_poses) + [f"{min_cycles} cycles"] * (least < min_cycles)
     words += f"; the norm asks for {' and '.join(few)}" if few else ""
-    return words + (
-        f"; too few poses to state an accuracy (makers take {usual_poses})" if found.poses < usual_poses else ""
-    )
+    too_few = f"; too few poses to state an accuracy (makers take {usual_poses})"
+    return words + (too_few if found.poses < usual_poses else "")

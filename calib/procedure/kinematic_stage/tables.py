@@ -129,10 +129,8 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
     named = {(each.file, each.row) for each in outcome.outliers}
     weights = _weights(outcome)
     rows: list[list[object]] = []
-    sets = [("fit", outcome.fit)]
-    sets += [
-        ("held out" if u.held_out else "validation", outcome.validation[n]) for n, u in outcome.inputs.unseen.items()
-    ]
+    sets, unseen = [("fit", outcome.fit)], outcome.inputs.unseen.items()
+    sets += [("held out" if one.held_out else "validation", outcome.validation[name]) for name, one in unseen]
     for label, comparison in sets:
         rows += _residual_rows(label, comparison, named, weights if label == "fit" else {})
     joints = outcome.inputs.chain.joints

@@ -128,10 +128,7 @@ def _with_camera(
     found = (view.constraint(), *(sight.targets[0] if sight is not None else ()))
     words = "the whole board in the camera's view, its range and its tilt"
     past = ("view past the arm",) if sight is not None else ()
-    return replace(
-        limits, views=found, camera=view, unchecked=unchecked,
-        checked=(*limits.checked, words, *past),
-    )  # fmt: skip
+    return replace(limits, views=found, camera=view, unchecked=unchecked, checked=(*limits.checked, words, *past))
 
 
 def limits_of(
@@ -211,9 +208,7 @@ def _joints(
         if far := turns and max(-low, high) > MAX_TURN:
             notes.append(f'{place}: {low:g} to {high:g} rad; if in degrees, write ["{low:g} deg", "{high:g} deg"]')
         if low <= own[0] and high >= own[1] and not far and (low, high) != own:
-            notes.append(
-                f"{place}: {low:g} to {high:g} has no effect: the joint's own range is {own[0]:g} to {own[1]:g}"
-            )
+            notes.append(f"{place}: {low:g} to {high:g} has no effect: the joint has {own[0]:g} to {own[1]:g}")
         lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
         require(lower[j] < upper[j], f"{place}: the range {lower[j]:g} to {upper[j]:g} is empty", UsageError)
     return lower, upper, tuple(notes)

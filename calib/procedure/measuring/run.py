@@ -33,10 +33,8 @@ from poses.information import log_det
 from trajectories.tour import move_times, tour
 from trajectories.ways import Room, way
 
-LEISURE = {
-    "revolute": 1.0,
-    "prismatic": 0.25,
-}  # [rad/s, m/s] full speed of a joint whose limit nobody knows; our choice
+# full speed of a joint whose limit nobody knows [rad/s, m/s]; our choice
+LEISURE = {"revolute": 1.0, "prismatic": 0.25}
 RISE = 2.0  # acceleration [1/s] times the speed: half a second to get there; our choice
 BLOCKED = 3.0  # times that a straight move which does not keep clear is taken to last; our choice
 PLACES = 8  # of a straight move that are looked at to guess whether it keeps clear
@@ -283,10 +281,8 @@ def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.
         MeasurementError: if a joint's column is missing.
     """
     table = read_table(path)
-    names = [
-        next((each for each in table.header if each.split(" [")[0] == joint), joint) for joint in chain.joint_names
-    ]
-    stops = np.column_stack([table.numbers(name, "joint") for name in names])
+    columns = {name.split(" [")[0]: name for name in reversed(table.header)}
+    stops = np.column_stack([table.numbers(columns.get(name, name), "joint") for name in chain.joint_names])
     times = table.numbers("t")
     t = np.linspace(times[0], times[-1], max(int((times[-1] - times[0]) * rate), 2))
     return t, np.column_stack([np.interp(t, times, column) for column in stops.T])
