@@ -1,4 +1,4 @@
-"""Errors of an installation's predictions against the measurements: the numbers printed on a certificate.
+"""Errors of predicted against measured positions, orientations and distances, as printed on a certificate.
 
     position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
                   plane for planes; for images the rms over its corners of what separates seen and predicted, across
@@ -29,7 +29,7 @@ NATURE = {
     "orientation": "orientation",
     "distance": "distance",
 }
-"""Which error each residual part (by its label) counts as."""
+"""Kind of error (position, orientation, distance) of each residual part, by its label."""
 
 _NONE = np.array([], dtype=int)
 
@@ -46,7 +46,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """Error statistics of one arm by kind; None for a kind that was not measured."""
+    """Error statistics of one arm, by kind of error; None for a kind that was not measured."""
 
     position_mm: ErrorStatistics | None = None
     orientation_deg: ErrorStatistics | None = None
@@ -84,7 +84,7 @@ class Errors:
         return float(np.sqrt(np.mean(self.main**2))) if len(self.main) else 0.0
 
     def summary(self) -> ArmErrors:
-        """Return the statistics of each kind of error in the printed units (mm, deg)."""
+        """Return the statistics of each kind of error in mm and deg."""
         sizes = (getattr(self, nature) for nature in ERRORS)
         return ArmErrors(*(statistics(size, factor) for size, (factor, _) in zip(sizes, ERRORS.values())))
 
@@ -131,7 +131,7 @@ def rms_sigma(sizes: np.ndarray) -> float:
 def pair_errors(
     cell: Installation, measured: Sequence[PoseMeasurements], limit: int = 20000, seed: int = 0
 ) -> np.ndarray:
-    """Return | |p_i - p_j| - |y_i - y_j| | of pairs of measured positions [m], independent of the station.
+    """Return the error of the distance between each pair of positions [m], | |p_i - p_j| - |y_i - y_j| |.
 
     Pairs are taken within a block; where there are more than `limit`, that many are drawn by seed.
     """
@@ -156,7 +156,7 @@ def _pairs(m: int, limit: int, generator: np.random.Generator) -> tuple[np.ndarr
 
 
 def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
-    """Return the deviations of each socket pair's distance from its mean over the fixture's positions [m].
+    """Return how much the distance of each socket pair deviates from its mean over all fixture positions [m].
 
     Of predicted points (3, m) [m]. A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets
     occurs in two positions.

@@ -39,13 +39,13 @@ def diagnose(found: GeometricFit) -> list[Finding]:
 
 
 def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
-    """Return the first residual part of each block, which is in metres for every kind of measurement."""
+    """Return each block with its first residual part, which is in metres for every kind of measurement."""
     first = {piece.block: piece.part.per_row() for piece in reversed(found.pieces)}
     return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 
 def _setup_change(block: Block, part: Part, max_chance: float = 1e-3, min_ratio: float = 1.6) -> list[Finding]:
-    """Return the finding of a changed set-up: residuals before and after every cut differ in size and ranks.
+    """Return a finding if the set-up changed: the residuals before and after one row differ in size and rank.
 
     `max_chance`: probability that the same rows in another order show such a change (our choice).
 
@@ -116,7 +116,7 @@ def neighbour_floor(q: np.ndarray, part: Part) -> float | None:
 
 @dataclass(frozen=True)
 class Scale:
-    """One factor on all measured lengths, fitted together with base and tool placement of the nominal arm.
+    """Scale factor of all measured lengths, fitted together with the nominal arm's base and tool placement.
 
     Attributes:
         factor: measured over the arm's.
@@ -130,7 +130,7 @@ class Scale:
 
 
 def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale | None:
-    """Return the scale factor of the instrument's lengths with its sigma; None without positions.
+    """Return the instrument's scale factor and its sigma from measured positions; None without positions.
 
     Args:
         nominal: the arm with base and tool placement fitted for it.
@@ -163,7 +163,7 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
 
 
 def length_factor(fit: GeometricFit) -> Scale | None:
-    """Return the common factor between fitted and nominal lengths of an arm; None for fewer than two fitted lengths.
+    """Return the common factor of fitted over nominal arm lengths; None for fewer than two fitted lengths.
 
     Its sigma follows from the measurements; the explained share of the lengths' change shows whether it is one factor.
     """
@@ -195,7 +195,7 @@ Blocks = Sequence[PoseMeasurements]
 
 
 def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False) -> Explanation | None:
-    """Return the change of columns with the smallest error of the nominal arm [m²]; None without a significant one.
+    """Return the change of columns that reduces the nominal arm's error most; None if no change helps much.
 
     Args:
         nominal: the arm as it was.
@@ -234,7 +234,7 @@ def _mirrored(blocks: Blocks) -> Blocks:
 
 
 def _least(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return a lower bound of the mean squared error over all base and tool placements [m²]; 0 without a closed form.
+    """Return the least mean squared error [m²] that any base and tool placement can reach; 0 if not known.
 
     Positions y = B (R p + t) + b, with R, t the tip's by the joints and B, b, p the placements, are linear in B ⊗ p, B
     and b: 13 numbers per axis of y, free of each other and of other axes here.

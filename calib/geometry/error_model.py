@@ -40,7 +40,7 @@ class Discrepancy:
     """Parameters of the error model, estimated on held-out rows.
 
     Attributes:
-        parameters: κ, by which the parameters' covariance counts.
+        parameters: κ, the factor of the variance due to the parameters.
         floor: v_0 [m²], error variance at the fitted poses for s = 1, with the instrument's noise.
         far: v_1 [m²/m²], per squared distance from the nearest of them.
         beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
@@ -71,7 +71,7 @@ class Discrepancy:
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """Prediction of the magnitude of the tool position error of a fitted installation.
+    """Model of the expected tool position error of a fitted arm.
 
     Attributes:
         cell: the installation.
@@ -87,7 +87,7 @@ class ErrorModel:
     discrepancy: Discrepancy
 
     def position_sigma(self, rows: PoseMeasurements, station: int = 0, tool: np.ndarray | int = 0) -> np.ndarray:
-        """Return the standard deviation of the tool position error (m,) [m], all axes together, at poses.
+        """Return the expected tool position error (m,) [m] at poses: its standard deviation, all axes together.
 
         Args:
             rows: joint values (m, n), and gravity torques for compliance terms.
@@ -98,7 +98,7 @@ class ErrorModel:
         return self._sigma(own, rows.q)
 
     def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
-        """Return `position_sigma` on measured rows (m,) [m].
+        """Return `position_sigma` at the poses of measured rows (m,) [m].
 
         Args:
             cell: the installation that predicts them: that of the fit, or one placed anew.
@@ -123,7 +123,7 @@ class ErrorModel:
         return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q, self.discrepancy.placed)
 
     def _sigma(self, own: np.ndarray, q: np.ndarray, radii: tuple[float, float] | None = None) -> np.ndarray:
-        """Return `position_sigma` (m,) [m] from the parameters' part trace J Σ Jᵀ (m,) [m²]."""
+        """Return `position_sigma` (m,) [m] from the variance due to the parameters, trace J Σ Jᵀ (m,) [m²]."""
         found, parts = self.discrepancy, _distances(q, self.learnt, np.array(self.discrepancy.levers))
         rest = unevenness(found.profile, q) * found.floor + found.far * parts[0] + found.beyond * parts[1]
         radius = np.interp(parts[0] + parts[1], found.reach, radii or found.radii)
@@ -142,12 +142,12 @@ class ErrorModel:
 
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
-    """Return which joint values of q (m, n) are outside the range of the fitted poses (k, n), as a mask (m, n)."""
+    """Return a mask (m, n) of the joint values q (m, n) outside the range of the fitted poses (k, n)."""
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
 def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
-    """Return R (p, p) with R Rᵀ the inverse of a precision matrix of unit diagonal, also of a nearly singular one."""
+    """Return a root R (p, p) of the covariance, R Rᵀ = P⁻¹, from a precision matrix P with unit diagonal."""
     try:
         factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
     except np.linalg.LinAlgError:  # by rounding; Cholesky is five times as fast
@@ -157,7 +157,7 @@ def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return squared distances (m,) [m²] of poses to the nearest fitted pose, and to the fitted values joint by joint.
+    """Return the squared distances (m,) [m²] of poses from the nearest fitted pose, and from each joint's range.
 
     The latter is, joint by joint, the way to where `near_share` of the learnt poses are within reach: a few of them far
     off the others do not say how a joint is there.
@@ -176,7 +176,7 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
 
 
 def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return each joint's lever at the tip (n,) [m/rad or 1], rms over poses, by central differences."""
+    """Return how far the tip moves per unit of each joint (n,) [m/rad or 1], rms over poses."""
     rows = q[np.unique(np.linspace(0, len(q) - 1, 50).astype(int))]
     result, step = np.zeros(chain.n), 1e-4
     for j in range(chain.n):
@@ -188,7 +188,7 @@ def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def learn_errors(selected: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0) -> ErrorModel | None:
-    """Return the error model estimated from errors on held-out rows; None for too few or no positions.
+    """Return the error model, estimated from the errors on held-out rows; None if too few positions were measured.
 
     For every fold the geometry and the ridges of all chosen effects are estimated anew: ridges from all rows would
     depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.
@@ -223,7 +223,7 @@ def learn_errors(selected: ModelSelection, measured: Sequence[PoseMeasurements],
 
 
 def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]]:
-    """Return pairs of a joint and the folds that hold out the two ends of its range."""
+    """Return, for each joint, its index and the two folds that hold out the ends of its range."""
     q = np.concatenate([block.q for block in measured])
     edges, result = np.cumsum([len(block) for block in measured])[:-1], []
     for j in range(q.shape[1]):
@@ -236,7 +236,7 @@ def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]
 
 
 class _Rows:
-    """Rows of a fit, linearised about its geometry without effects, for the evaluation of folds."""
+    """Residuals and Jacobians of a fit's rows at the rigid geometry, from which folds are evaluated."""
 
     def __init__(self, selected: ModelSelection, measured: Sequence[PoseMeasurements]):
         found, terms = selected.fit, selected.offered

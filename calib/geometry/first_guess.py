@@ -1,4 +1,4 @@
-"""First guess of instrument and target placements in closed form, so that the user need not state it.
+"""First guess of the instrument's and the target's placement, in closed form from the measurements.
 
 With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 
@@ -38,7 +38,7 @@ LEVER = 0.3  # what a turn counts as [m/rad] (our choice, as the next two)
 
 
 def misfit(arm: np.ndarray, seen: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
-    """Return the distances (m,) [m] between B_i and S A_i X at the target; rotations count with a lever [m]."""
+    """Return the distances (m,) [m] between measured poses B_i and predicted poses S A_i X of the target."""
     distance, turn = _apart(station @ arm @ tool, seen)
     return np.hypot(distance, lever * turn)
 
@@ -69,7 +69,7 @@ def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return S and X by Shah: accurate if the poses rotate about two axes by much more than their errors."""
+    """Return S and X by Shah's method: accurate if the poses rotate about two axes by much more than their errors."""
     a, b = arm[:, :3, :3], seen[:, :3, :3]
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", b, a).reshape(9, 9)
@@ -84,7 +84,7 @@ def by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.n
 def _by_ways(arm: np.ndarray, seen: np.ndarray, rounds: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X from rotations and displacements about the mean: accurate for a line with one orientation.
 
-    log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned alike, and
+    log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned in the same way, and
     y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, turns at a lever of `LEVER`, and t by its linear
     solution, in turns.
 
@@ -113,13 +113,13 @@ def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -
     away = turned - turned.mean(axis=0)
     u, size, vt = np.linalg.svd(away.reshape(-1, 3), full_matrices=False)
     min_turn = 0.01  # rms turn [rad] below which it tells no offset of the target
-    told = size > min_turn * np.sqrt(len(arm))
-    offset = vt[told].T @ ((u[:, told].T @ (target - target.mean(axis=0)).reshape(-1)) / size[told])
+    strong = size > min_turn * np.sqrt(len(arm))
+    offset = vt[strong].T @ ((u[:, strong].T @ (target - target.mean(axis=0)).reshape(-1)) / size[strong])
     return (target - turned @ offset).mean(axis=0), offset
 
 
 def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
-    """Refuse quaternions in the order w x y z under a header x y z w, and inverse orientations.
+    """Raise an error for quaternions in another order than the header's, and for inverted orientations.
 
     Args:
         chain: the nominal arm.
@@ -138,10 +138,10 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= min_angle:
         return
     readings = {
-        "read as w x y z they agree. Are the columns w first? Name them in their order: qw, qx, qy, qz": np.roll(
+        "read as w x y z they agree. If w comes first, name the columns in that order: qw, qx, qy, qz": np.roll(
             stated, -1, axis=1
         ),
-        "inverted they agree. State orientations of the target seen from the instrument": stated * [-1, -1, -1, 1],
+        "inverted they agree. Give the orientation of the target in the instrument's frame": stated * [-1, -1, -1, 1],
     }
     max_misfit = 0.1  # of the positions' spread: their median misfit then
     max_angle = 5.0  # and below which another reading of them is
@@ -156,7 +156,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
 
 
 def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:
-    """Return the misfit of measured poses to the arm's after the best placement of instrument and tool.
+    """Return the differences of measured and predicted poses after placing instrument and tool as well as possible.
 
     Args:
         arm: (m, 4, 4) poses of the tip in the base.
@@ -188,7 +188,7 @@ MAX_GUESS_ROWS = 300  # rows of a block that a guess is made from (our choice)
 
 
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
-    """Return the nominal arm with known deflections, its stations and tools placed from measurements.
+    """Return the nominal arm with its stations and tools placed by a first guess from the measurements.
 
     A tool seen in several blocks takes its guess from the block that constrains most (poses before positions before the
     rest, then the one whose poses turn most, then the most rows); a station likewise. Tools that no block can place
@@ -225,7 +225,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
 
 
 def check_scale(block: PoseMeasurements, chain: Chain) -> None:
-    """Refuse measurements with an implausible ratio of measured to predicted spread of positions.
+    """Raise an error if the measured positions spread far more or far less than the predicted ones.
 
     Args:
         block: measurements; those without positions pass.
@@ -261,13 +261,13 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
 
 
 def _spread(positions: np.ndarray) -> tuple[float, float]:
-    """Return the standard deviation of positions (m, 3) over all axes, and that across their principal line."""
+    """Return the standard deviation of positions (m, 3), over all axes and across their principal line [m]."""
     sizes = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     return float(np.linalg.norm(sizes)), float(sizes[1])
 
 
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
-    """Return a question with the units that would explain the spread (joint units first), and the header to write."""
+    """Return a question about the units that would explain the spread, and the column header to write."""
     guesses = [("", predicted, "'x [mm]'")]
     if np.abs(block.q).max() < MAX_TURN:
         turning = np.array([joint.kind != "prismatic" for joint in chain.joints])
@@ -282,7 +282,7 @@ def _likely_units(block: Positions, chain: Chain, measured: float, predicted: fl
 
 
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
-    """Return the rms rotation of a block's poses about the second principal axis in units of `TURN`, up to `TURNED`."""
+    """Return how much a block's poses rotate about their second principal axis, in steps of `TURN` [rad]."""
     rows = np.unique(np.linspace(0, len(block) - 1, MAX_GUESS_ROWS).astype(int))
     if len(rows) < 3:
         return 0.0
@@ -297,7 +297,7 @@ Guess = tuple[np.ndarray | None, np.ndarray]
 def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    """Return station and tool placement of one target; known ones stay. Plug-ins register their kinds of block."""
+    """Return the placements of station and tool for one target; known placements are kept."""
     arm = arm[rows]
     if isinstance(block, Positions) and len(arm) < (least := 3 if isinstance(block, Poses) else 4):
         refuse_data(

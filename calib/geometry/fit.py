@@ -29,10 +29,10 @@ def fit(
     candidates: np.ndarray | None = None,
     *,
     settings: Settings | None = None,
-    drawn: bool = False,
+    regularised: bool = False,
     prior: np.ndarray | None = None,
 ) -> GeometricFit:
-    """Fit the identifiable ones of the parameters `candidates`; the others keep their nominal values.
+    """Return the fit of the identifiable parameters among `candidates`; the others keep their nominal values.
 
     Minimises Σ ‖(y - f(x)) / σ‖². Three passes: columns that are linear combinations of others are set aside; the rest
     is fitted with a wide prior (`PLAUSIBLE`), which settles the sigmas; then every parameter that the data do not
@@ -44,7 +44,7 @@ def fit(
         measured: blocks of measurements.
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
-        drawn: keep all independent parameters, regularised towards nominal with the most probable strength
+        regularised: keep all independent parameters, pulled towards nominal with the most probable strength
             (`_shrunk_fit`), instead of fixing the unidentified ones at nominal.
         prior: prior standard deviations of the whole parameter vector about its present values; infinite without a
             prior. Parameters with a prior are always fitted.
@@ -60,12 +60,12 @@ def fit(
     free = candidates[split.kept]
     if split is not None and not len(free):
         raise Unidentifiable(
-            "these rows determine no parameter of the robot: a socket, a bar, a plane or a pair needs several "
+            "these rows determine no parameter of the robot: each socket, bar, plane or pair needs several "
             "rows at different joint values; measure more rows of each"
         )
     _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
-    if drawn:
+    if regularised:
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
         return replace(_shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found, max_retries = cell, None, 4
@@ -77,16 +77,16 @@ def fit(
         own = np.minimum(stated[free], plausible) if wide else stated[free]
         once = replace(settings, passes=1) if wide else settings
         found = fit_with_prior(start, blocks, free, own, settings=once, nominal=cell)
-        told = _identifiable_columns(found, plausible)
-        if not wide and len(told) == len(free):
+        clear = _identifiable_columns(found, plausible)
+        if not wide and len(clear) == len(free):
             break
-        start, free = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told]
+        start, free = _back_to_nominal(found.cell, cell, candidates, free[clear]), free[clear]
     assert found is not None
     return replace(found, start=cell, split=split, candidates=candidates)
 
 
 def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers: float = 1.5) -> None:
-    """Refuse measurements with less than `min_numbers` numbers per unknown: without redundancy no fit can be checked.
+    """Raise an error for fewer than `min_numbers` measured numbers per unknown: such a fit could not be checked.
 
     `min_numbers`: measured numbers per unknown at least (our choice).
     """
@@ -104,7 +104,7 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int, min_numbers:
 
 
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the index of the arm's longest length among the base columns, as an array of one or no element.
+    """Return the index of the arm's longest length among the base columns (an array of one element, or empty).
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
     come from the nominal: this length stays. What others merge with a column counts with it.
@@ -122,7 +122,7 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 def _shrunk_fit(
     cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings, stated: np.ndarray
 ) -> GeometricFit:
-    """Fit with a prior about the nominal values; its widths maximise the evidence (MacKay 1992).
+    """Return a fit regularised towards nominal values; the prior's widths maximise the evidence (MacKay 1992).
 
     One width for joint offsets, one for other angles, one for lengths. Where measurements come from a few places only
     (sockets, a plane), directions they hardly see would otherwise move the arm by centimetres to explain micrometres.
@@ -134,7 +134,7 @@ def _shrunk_fit(
     nominal = parameter_values(cell)[free]
     found = fit_with_prior(cell, blocks, free, prior, settings=settings)
     min_width = 1e-6  # [m, rad]
-    width_updates = 3  # updates of a drawn fit's widths
+    width_updates = 3  # updates of a regularised fit's widths
     for _ in range(width_updates):
         residual, matrix = _whitened(found)
         moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
@@ -163,7 +163,7 @@ def fit_with_prior(
     settings: Settings | None = None,
     nominal: Installation | None = None,
 ) -> GeometricFit:
-    """Fit exactly the parameters `free`, minimising Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
+    """Return the fit of exactly the parameters `free`: min Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
 
     Sigmas that no file states are estimated, one per file and nature (position, orientation …), and the fit repeated
     until they settle; so are the weights of a robust loss.
@@ -195,7 +195,7 @@ def fit_with_prior(
 
 
 def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
-    """Return the plausible deviation of each parameter from nominal (c,); infinite for frames and deflections."""
+    """Return how far each parameter may plausibly be from nominal (c,); infinite for frames and deflections."""
     table = layout(cell)
     return np.array([PLAUSIBLE[table.units[k]] if table.kinds[k] == "arm" else np.inf for k in columns])
 
@@ -210,13 +210,13 @@ def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndar
     factor = np.linalg.qr(matrix, mode="r")
     norms = np.linalg.norm(factor, axis=0)
     left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
-    told = np.ones(len(plausible), dtype=bool)
+    kept = np.ones(len(plausible), dtype=bool)
     while True:
-        ratio = np.where(told, np.sqrt(np.clip(np.diag(left), 0.0, None)) / plausible, 0.0)
+        ratio = np.where(kept, np.sqrt(np.clip(np.diag(left), 0.0, None)) / plausible, 0.0)
         worst = int(np.argmax(ratio))
         if ratio[worst] <= 0.5:
-            return np.flatnonzero(told)
-        told[worst] = False
+            return np.flatnonzero(kept)
+        kept[worst] = False
         left = left - np.outer(left[:, worst], left[worst]) / left[worst, worst]
 
 
@@ -230,7 +230,7 @@ def _whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
 def polish_frames(
     cell: Installation, measured: Sequence[PoseMeasurements], settings: Settings | None = None
 ) -> GeometricFit:
-    """Return the fit of station and tool placements only, the arm unchanged; it gives the 'nominal' errors."""
+    """Return the fit of station and tool placements only; the arm stays as it is."""
     return fit(cell, measured, layout(cell).frame_index, settings=settings)
 
 

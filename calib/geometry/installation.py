@@ -35,7 +35,7 @@ FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class NoOptics:
-    """Empty set of instrument parameters of an installation; cameras have a set of their own."""
+    """Instrument parameters of an installation without cameras: an empty set."""
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
@@ -46,11 +46,11 @@ class NoOptics:
         return 0
 
     def like(self, other: Any) -> NoOptics:
-        """Return the same instruments with the parameter values of `other`."""
+        """Return these instruments with the parameter values of `other`."""
         return self
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> Any:
-        """Return the additional prediction for a block's rows; `free` counts from the first of these parameters."""
+        """Return what these instruments add to a block's prediction; `free` counts from their first parameter."""
         return None
 
     def tables(self) -> Mapping[str, Any]:
@@ -152,7 +152,7 @@ def see(
 
 @dataclass(frozen=True)
 class _Frames:
-    """The tables of stations and tools, each entry with a name and a placement."""
+    """Tables of stations, tools, cameras and boards; each entry has a name and a placement."""
 
     station: tuple[Mapping[str, Any], ...] = ()
     tool: tuple[Mapping[str, Any], ...] = ()
@@ -180,7 +180,7 @@ def read(path: str | Path) -> Installation:
 
 
 def read_arms(path: str | Path) -> tuple[Installation, Installation]:
-    """Return the calibrated arm of a fit, as `read` does, and the nominal arm.
+    """Return the calibrated arm of a fit (see `read`), and its nominal arm.
 
     The nominal one has the frames that let it fit the same measurements best; of a fit that started from an earlier
     fit's folder they are not known: then it has no stations and no tools.

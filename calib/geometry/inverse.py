@@ -126,7 +126,7 @@ def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int, 
 
 
 def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray, lever: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
-    """Return error (m, dof) and Jacobian (m, dof, n), orientations as displacements at `lever` [m].
+    """Return error (m, dof) and Jacobian (m, dof, n); orientations are multiplied by `lever` [m].
 
     `lever`: an orientation counts as its displacement at this distance [m]; as all constants here, our choice.
     """
@@ -136,7 +136,7 @@ def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray, lever: float = 0.3
 
 
 def _inside(goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return damped steps (m, n); joints that would exceed a limit stop there, the others compensate."""
+    """Return damped joint steps (m, n); a joint that would exceed its limit stops there, and the others compensate."""
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
         held = ((q <= goal.lower) & (step < 0.0)) | ((q >= goal.upper) & (step > 0.0))
@@ -148,7 +148,7 @@ def _inside(goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, 
 
 
 def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return Jᵀ (J Jᵀ + λ I)⁻¹ e, λ in units of the mean squared singular value."""
+    """Return the damped step Jᵀ (J Jᵀ + λ I)⁻¹ e; λ is relative to the mean squared singular value."""
     across = np.swapaxes(jacobian, 1, 2)
     square = jacobian @ across
     rows = square.shape[1]
@@ -158,7 +158,7 @@ def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.
 
 
 def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray, passes: int = 8) -> np.ndarray:
-    """Return the joint values (m, n) nearest to `start` with the tool poses of `q`, by the arm's redundancy.
+    """Return the joint values (m, n) with the tool poses of `q` that are nearest to `start`, for a redundant arm.
 
     Minimises |q - q_start| (radians and metres alike) under e(q) = 0: each pass steps by d + J⁺ (e - J d), d = q_start
     - q. A target at which that loses what `q` has reached keeps `q`.

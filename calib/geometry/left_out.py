@@ -1,4 +1,4 @@
-"""Prediction of future errors from those on held-out rows: growth of their variance, and 95 % intervals.
+"""Expected errors at new poses, learnt from errors on held-out rows: variance model and 95 % intervals.
 
 A quantile is taken at the level (n + 1) / n · 95 % of n poses (conformal prediction; Vovk, Gammerman & Shafer 2005). As
 those rows have also chosen the variances, an interval is as much wider as it has to be to hold 95 % of a fold whose
@@ -40,7 +40,7 @@ Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]  # per joint: 
 
 
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
-    """Return the factor s (m,) of the expected error at poses q (m, n) [rad or m]; 1 for an empty profile."""
+    """Return the factor s (m,) of the error variance at poses q (m, n) [rad or m]; 1 for an empty profile."""
     return np.exp(sum((np.interp(q[:, j], *each) for j, each in enumerate(profile)), np.zeros(len(q))))
 
 
@@ -71,7 +71,7 @@ class Unevenness:
         self.data = gram(self.logs, self.columns)
 
     def profile(self, left_out: np.ndarray | None = None) -> Profile:
-        """Return log s by joint from all poses, or without those of a mask (m,)."""
+        """Return log s as one function per joint, from all poses or without those of a mask (m,)."""
         data = self.data if left_out is None else self.data - gram(self.logs[left_out], self.columns[left_out])
         values = dict(zip(self.moving.tolist(), self._values(data)))
         return tuple(
@@ -142,7 +142,7 @@ class LeftOut:
         return LeftOut(*(each[rows] for each in vars(self).values()))
 
     def scaled(self, q: np.ndarray) -> tuple[LeftOut, Profile]:
-        """Return the errors with shapes scaled by s, for each fold by that of the other poses; and the s of all poses.
+        """Return the errors with their variance terms scaled by s (for each fold from the other poses), and s itself.
 
         Args:
             q: (poses, n) [rad or m].
@@ -171,14 +171,14 @@ class LeftOut:
         return weights.tolist(), self.quantiles(sizes)
 
     def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
-        """Return the bounds of 95 % of future errors from magnitudes (m,), for near and far errors (conformal)."""
+        """Return the bounds that 95 % of future errors keep, near and far, from error magnitudes (m,) (conformal)."""
         poses = len(np.unique(self.pose))
         level = min(1.0, COVERED * (poses + 1) / poses)
         first, second = (float(np.quantile(sizes[of], level)) for of in (self.near, ~self.near))
         return first, second
 
     def surprise(self, weights: Sequence[float], reach: tuple[float, float]) -> tuple[float, float]:
-        """Return the factors (near, far) by which intervals without a fold's data must widen to contain 95 % of it."""
+        """Return the factors (near, far) by which intervals must widen to contain 95 % of a held-out fold's errors."""
         ratio = np.ones(len(self.squares))
         for fold in np.unique(self.fold):
             rows = self.fold == fold

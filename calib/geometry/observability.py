@@ -61,7 +61,7 @@ def _merged(found: GeometricFit, split: ColumnSplit, max_named: int = 4) -> list
 
 
 def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
-    """Return a finding on independent arm parameters that the data identify no better than the prior."""
+    """Return a finding on arm parameters that the data determine no better than the prior does."""
     table = layout(found.start)
     if found.prior is not None:
         sigma = found.estimate.sigma
@@ -74,7 +74,7 @@ def _at_nominal(found: GeometricFit, split: ColumnSplit) -> list[Finding]:
 
 
 def _loose(found: GeometricFit, max_placement_sigma: float = 2e-3) -> list[Finding]:
-    """Return findings on tools with a poorly determined placement, and the station correlated with each.
+    """Return findings on tools with a poorly determined placement, with the station correlated with it.
 
     `max_placement_sigma`: [m] a placement known no better than this is worth a word (our choice).
     """
@@ -108,7 +108,7 @@ def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str
 
 
 def _orientation_range(found: GeometricFit) -> float | None:
-    """Return the 95 % range of the flange's orientation over an instrument's poses [deg]; None without poses."""
+    """Return the range that holds 95 % of the flange's orientations [deg]; None without an instrument's poses."""
     q = [block.measured.q for block in found.blocks if block.measured.has_instrument]
     if not q:
         return None
@@ -117,7 +117,7 @@ def _orientation_range(found: GeometricFit) -> float | None:
 
 
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:
-    """Return W (rows, c) of all blocks, scaled by stated sigmas; else radians are scaled by the reach.
+    """Return the observation matrix W (rows, c) of all blocks, scaled by stated sigmas; else by the arm's reach.
 
     The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
     """
@@ -250,7 +250,7 @@ def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installat
 def observation(
     cell: Installation, kind: str = "pose", sigmas: tuple[float, float] | None = None, seed: int = 0
 ) -> Observation:
-    """Return the observation Jacobian of a nominal arm in the columns that random postures can identify.
+    """Return the observation Jacobian of a nominal arm, for the parameters that random postures can identify.
 
     Args:
         cell: see `targets_of`.
@@ -272,7 +272,7 @@ def observation(
 
 
 def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
-    """Return the noise-free measurements of one target."""
+    """Return noise-free measurements of one target at joint values q (m, n)."""
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
     return PoseMeasurements.of(
         q, poses[:, :3, 3], to_quaternion(poses) if full else None, joint_names=cell.chain.joint_names,

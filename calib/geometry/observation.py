@@ -42,7 +42,7 @@ class ParameterLayout:
     moving: tuple[int, ...] = ()
 
     def index(self, *kinds: str) -> np.ndarray:
-        """Return the indices of the parameters of some kinds."""
+        """Return the indices of all parameters of the given kinds (see `KINDS`)."""
         return np.flatnonzero(np.isin(self.kinds, kinds))
 
     @property
@@ -85,14 +85,14 @@ def layout(cell: Installation) -> ParameterLayout:
 
 
 def families(cell: Installation) -> np.ndarray:
-    """Return the kind of each parameter (p,); of the arm's, ``offset`` of a joint, or the unit of another element."""
+    """Return the family of each parameter (p,): ``offset`` or unit of an arm element, else its kind."""
     table, moving = layout(cell), {e.name for e in cell.chain.elements if e.joint is not None}
     arm = ["offset" if name in moving else unit for name, unit in zip(cell.chain.names, cell.chain.units)]
     return np.array([*arm, *table.kinds[len(arm) :]])
 
 
 def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:
-    """Return the installation changed by `change` (f,) in the parameters `free` (f,); frames move on the manifold."""
+    """Return the installation with `change` (f,) added to the parameters `free` (f,); frames move on the manifold."""
     where = layout_counts(cell)
     full = np.zeros(sum(where))
     full[free] = change
@@ -136,7 +136,7 @@ def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
 
 
 def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
-    """Return the prior standard deviations stated in the options, for the full vector; infinite where not stated."""
+    """Return the prior standard deviations of the options for the full vector; infinite without a prior."""
     if not options.prior:
         return None
     table = layout(start)
@@ -165,7 +165,7 @@ class Block:
 
 
 def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Block]:
-    """Return blocks of measurements matched to stations and tools by name, with evaluated deflection bases.
+    """Return the blocks with the indices of their stations and tools (by name) and their deflection bases.
 
     Raises:
         UsageError: for a station or tool the installation does not have.
@@ -236,7 +236,7 @@ def target_jacobian(
 
 
 def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
-    """Fill the column (6, m) of a unit displacement of a station along or about one of its own axes."""
+    """Fill the column (6, m) for a unit displacement of a station along or about one of its axes."""
     direction = placement[:3, axis % 3]
     if axis < 3:
         column[:3] = direction[:, None]
@@ -247,7 +247,7 @@ def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis:
 
 
 def stack(found: Sequence[Part], sigmas: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Whiten and stack parts into r (rows,) and a column-major W (rows, f).
+    """Return all parts whitened and stacked: residual r (rows,) and a column-major W (rows, f).
 
     Args:
         found: parts of all blocks.

@@ -254,17 +254,17 @@ def _variation(points: np.ndarray, directions: np.ndarray) -> float:
     left = np.flatnonzero(~np.isnan(directions[:, 0]))
     centres = []
     while len(left):
-        alike = directions[left] @ directions[left[0]] > np.cos(APART)
-        if alike.sum() > 1:
-            centres.append(points[left[alike]].mean(axis=0))
-        left = left[~alike]
+        parallel = directions[left] @ directions[left[0]] > np.cos(APART)
+        if parallel.sum() > 1:
+            centres.append(points[left[parallel]].mean(axis=0))
+        left = left[~parallel]
     if len(centres) < 2:
         return float("nan")
     return max(float(np.linalg.norm(a - b)) for k, a in enumerate(centres) for b in centres[:k])
 
 
 def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasurements]) -> tuple[set[str], list[str]]:
-    """Return the names of unseen files that mostly repeat rows of the fit, and notes on repeated rows.
+    """Return the names of validation files that mostly repeat rows of the fit, and notes on repeated rows.
 
     Args:
         fit: the fit's blocks.
@@ -281,9 +281,9 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
         before = _row_numbers(block, [mark in known for mark in marks])
         name = Path(block.file).name
         if within:
-            notes.append(f"{name}: {_rows(within)} identical to another row of the file: counted twice?")
+            notes.append(f"{name}: {_rows(within)} identical to another row of the file: each counts twice")
         if before:
-            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file: is the file given twice?")
+            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Is the file given twice?")
         known.update(marks)
     # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
     max_copied_share = 0.5
@@ -291,15 +291,15 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
         copied = np.array([mark in known for mark in _marks(aside)], dtype=bool)
         again = _measured_again(fit, aside) & ~copied
         for chosen, words in ((copied, "identical to fitted rows"), (again, "at joint values of fitted rows")):
-            if told := _row_numbers(aside, chosen):
-                notes.append(f"{name}: {_rows(told)} {words}: not unseen")
+            if repeats := _row_numbers(aside, chosen):
+                notes.append(f"{name}: {_rows(repeats)} {words}, so they do not count as validation")
         if len(_row_numbers(aside, again | copied)) > max_copied_share * len(aside):
             proofless.add(name)
     return proofless, notes
 
 
 def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) -> np.ndarray:
-    """Return which rows (m,) have the joint values of a row of the fit."""
+    """Return a mask (m,) of the rows with the joint values of a fitted row."""
     seen = [block.q for block in fit if type(block) is type(aside) and block.has_instrument]
     if not seen:
         return np.zeros(len(aside), dtype=bool)

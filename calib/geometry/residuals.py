@@ -61,7 +61,7 @@ class Part:
 
     @property
     def per_length(self) -> np.ndarray | float:
-        """Divisor that converts residuals into metres (pixels: per m); 1 for residuals in metres."""
+        """Divisor that converts residuals into metres (for pixels, in pixels per metre); 1 for residuals in metres."""
         return 1.0
 
     def sizes(self) -> np.ndarray:
@@ -77,7 +77,7 @@ class Part:
         return self
 
     def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> Any:
-        """Return the common errors of rows, estimated from residuals at a state; None if the kind has none.
+        """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 
         Args:
             sigma: (rows, m) standard deviations.

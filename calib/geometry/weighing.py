@@ -83,19 +83,19 @@ class GeometricFit:
         return sorted(result, key=lambda item: -item[3])
 
     def row_weights(self) -> list[np.ndarray]:
-        """Return for each block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
+        """Return, for each block, the smallest robust weight of each row (m,); 1 without a robust loss."""
         result = [np.ones(len(block.measured)) for block in self.blocks]
         for piece in self.pieces:
             np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
         return result
 
     def used_noises(self) -> list[Any]:
-        """Return the common noise of each block's rows; None for a block without."""
+        """Return the noise that each block's rows share; None for a block without shared noise."""
         noises = {piece.block: piece.part.noise for piece in self.pieces if piece.part.noise}
         return [noises.get(number) for number in range(len(self.blocks))]
 
     def used_sigmas(self) -> list[dict[str, float]]:
-        """Return for each block the rms standard deviation used per label [m or rad]."""
+        """Return, for each block, the rms of the standard deviations used for each label [m or rad]."""
         result: list[dict[str, float]] = [{} for _ in self.blocks]
         for piece in self.pieces:
             result[piece.block][piece.part.label] = float(np.sqrt(np.mean(piece.sigma**2)))
@@ -105,7 +105,7 @@ class GeometricFit:
 def calibrated_chain(
     found: GeometricFit, rigid: GeometricFit | None = None, nominal: Chain | None = None
 ) -> CalibratedChain:
-    """Return the calibrated robot from fits of one arm, with the covariance of its element values.
+    """Return the calibrated robot of one or two fits, with the covariance of its element values.
 
     Args:
         found: the fit that predicts best.
@@ -181,7 +181,7 @@ class Weigher:
         return [part for own in found for part in own]
 
     def noisy(self, found: list[Part]) -> list[Part]:
-        """Return parts with the common noise for whitening."""
+        """Return the parts with their shared noise, which whitening takes into account."""
         return [replace(part, noise=noise) if noise else part for part, noise in zip(found, self.noises)]
 
     def update(self, state: Installation, first: bool) -> None:
@@ -208,7 +208,7 @@ class Weigher:
         ]
 
     def settle(self, solution: Solution) -> Solution | None:
-        """Return the solution scaled to the sigmas of its residuals, or None if these would change the estimate.
+        """Return the solution scaled to the sigmas of its residuals; None if new sigmas would change the estimate.
 
         A common factor on all sigmas changes only the scale, unless the fit has a prior.
         """

@@ -1,4 +1,4 @@
-"""Errors on held-out rows from sufficient statistics, cheap for every fold and every subset of terms.
+"""Cross-validation errors from sufficient statistics, cheap for every fold and every subset of terms.
 
 The model is linear in its terms and, near its optimum, in the geometry: per fold the statistics WᵀW, Wᵀr of the
 training rows give the estimate, those of the held-out rows its error. Nothing is fitted to held-out rows but the
@@ -73,7 +73,7 @@ class UnseenErrors:
 
 @dataclass(frozen=True, eq=False)
 class FoldStatistics:
-    """Least-squares statistics of every fold for the columns [free geometry, terms], the terms condensed.
+    """Least-squares statistics of every fold, for the columns of free geometry and deflection terms.
 
     Attributes:
         rigid: number of geometry columns, which come first.
@@ -100,7 +100,7 @@ class FoldStatistics:
     _chosen: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def error(self, terms: np.ndarray) -> UnseenErrors:
-        """Return the errors on held-out rows of geometry and `terms` (whole groups)."""
+        """Return the errors on held-out rows of a model with the geometry and `terms` (whole groups)."""
         index, chosen = self._columns(terms), self._widths(terms)
         begin = np.where(chosen > 0.0, chosen, self.coordinates.sizes[index])  # where the search begins
         squares = []
@@ -111,7 +111,7 @@ class FoldStatistics:
         return UnseenErrors(np.array(squares), self.rows)
 
     def ridges(self, terms: np.ndarray) -> np.ndarray:
-        """Return each term's most probable prior standard deviation over all rows; 0 for a term switched off."""
+        """Return the most probable prior standard deviation of each term from all rows; 0 if the data drop the term."""
         width = np.ones(int(self.groups.max(initial=-1)) + 1)
         own = self.coordinates.groups[self._columns(terms)[self.rigid :]]
         width[own] = (self._widths(terms) / self.coordinates.sizes[self._columns(terms)])[self.rigid :]
@@ -121,7 +121,7 @@ class FoldStatistics:
         return np.flatnonzero(np.isin(self.coordinates.groups, [-1, *self.groups[terms]]))
 
     def _widths(self, terms: np.ndarray) -> np.ndarray:
-        """Return the most probable prior standard deviation of each coordinate of geometry and terms, over all rows."""
+        """Return the most probable prior standard deviation of each geometry and term coordinate, from all rows."""
         key = terms.tobytes()
         if key not in self._chosen:
             index = self._columns(terms)
@@ -216,7 +216,7 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Measured blocks and the weighing of their rows: rms sigma by label, robust weights, noise of images."""
+    """Measured blocks with the weights of their rows: rms sigma by label, robust weights, noise of images."""
 
     cell: Installation
     measured: Sequence[PoseMeasurements]
@@ -226,7 +226,7 @@ class _Rows:
     noises: Sequence[Any]
 
     def statistics(self, chosen: Sequence[np.ndarray], moved: Sequence[bool] | None = None) -> tuple[Gram, Gram, float]:
-        """Return statistics of chosen rows in metres (metric parts) and whitened, and the number of metric rows.
+        """Return the statistics of chosen rows in metres and whitened, and the number of rows in metres.
 
         Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
         """
@@ -259,7 +259,7 @@ class _Rows:
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return columns (f, ...) with those at `frames` projected out, as if these placements were fitted to the rows."""
+    """Return columns (f, ...) with those at `frames` projected out, as if these were fitted to the rows."""
     flat = columns.reshape(len(columns), -1)
     basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]

@@ -51,7 +51,7 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
 
 
 def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasurements]) -> Folds:
-    """Return folds that hold out the blocks of one name each; several names share a fold if there are too many."""
+    """Return folds that each hold out all blocks of one name; if there are too many names, some share a fold."""
     each = list(dict.fromkeys(names))
     count = min(len(each), 2 * FOLDS)
     members = [np.full(len(block), each.index(name) % count) for block, name in zip(measured, names)]
@@ -61,7 +61,7 @@ def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasuremen
 def divide(
     folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements], seed: int = 0, scattered: bool = False
 ) -> Folds:
-    """Return folds in which those marked in `blind` (count,) are divided into regions, one fold per region.
+    """Return the folds with those marked in `blind` (count,) split by region, one fold per region.
 
     What is left out as a whole has to be predicted by the rest. Where the rest does not determine the tool (it holds
     one orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
@@ -142,9 +142,9 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
     for number, block in enumerate(measured):
         _, unit = np.unique(block.together, return_inverse=True)
         count = int(unit.max(initial=-1)) + 1
-        wanted = count if folds is None else min(folds, count)
+        most = count if folds is None else min(folds, count)
         order = np.random.default_rng([seed, number]).permutation(count)
-        members.append((order % wanted)[unit])
+        members.append((order % most)[unit])
     highest = max(int(fold.max(initial=0)) for fold in members) + 1
     return Folds("poses" if folds is None else "random", highest, tuple(members))
 

@@ -37,7 +37,7 @@ def _stiffness(chain: Chain, known: bool) -> list[Term]:
 
 
 def _bending(chain: Chain, known: bool) -> list[Term]:
-    """Return the terms of tilt across each joint's axis under gravity, from compliant bearings and links."""
+    """Return the terms for tilt of each joint's axis under gravity, due to compliant bearings and links."""
     moving = set(chain.moving.tolist())
     places = [k for k, e in enumerate(chain.elements) if e.axis[0] == "r" and k not in moving and e.owner < chain.n]
     return [term for k in places for term in _sag(chain, k)]
@@ -49,14 +49,14 @@ def _sag(chain: Chain, place: int) -> list[Term]:
 
 
 def _coupling(chain: Chain, known: bool) -> list[Term]:
-    """Return the correction terms of a joint by its own and its neighbours' readings: gear ratio, coupled gears."""
+    """Return the terms that correct a joint by its reading and its neighbours': gear ratio, coupled gears."""
     names = chain.names
     near = [(j, i) for j in range(chain.n) for i in (j - 1, j, j + 1) if 0 <= i < chain.n]
     return [Term(names[chain.moving[j]], "joint", i) for j, i in near]
 
 
 def _harmonics(chain: Chain, known: bool, max_order: int = 60) -> list[Term]:
-    """Return the terms sin and cos of k q_j on each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
+    """Return the terms sin k q_j, cos k q_j of each revolute joint, k = 1 … `max_order`: encoder and gear errors."""
     return _turning(chain, [(chain.names[k], j) for j, k in enumerate(chain.moving)], max_order)
 
 
@@ -68,7 +68,7 @@ def _wobble(chain: Chain, known: bool, max_order: int = 2) -> list[Term]:
 
 
 def _turning(chain: Chain, places: list[tuple[str, int]], max_order: int) -> list[Term]:
-    """Return harmonics on elements, each in the angle of its revolute joint; none for prismatic joints."""
+    """Return the harmonic terms of given elements, in the angle of their revolute joint; none for prismatic joints."""
     revolute = [(name, j) for name, j in places if chain.joints[j].kind == "revolute"]
     orders = range(1, max_order + 1)
     return [Term(name, basis, j, order) for name, j in revolute for order in orders for basis in ("cos", "sin")]
@@ -110,7 +110,7 @@ class ModelStep:
 
     @property
     def cross_validated(self) -> float:
-        """The rms error on unseen rows [m]."""
+        """Cross-validation error: rms on held-out rows [m]."""
         return np.nan if self.cross_validated_mm is None else 1e-3 * self.cross_validated_mm
 
 
@@ -147,12 +147,12 @@ class ModelSelection:
         return ([rung.cross_validated for rung in self.rungs if rung.kept] or [np.inf])[-1]
 
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
-        """Return the best fit without corrections (for a URDF), those of the given robot removed, too."""
+        """Return the best fit without any joint corrections (for a URDF), not even those of the given robot."""
         if not self.rigid.cell.known.terms:
             return self.rigid
         bare = polish_frames(replace(self.nominal.cell, known=Deflection()), measured, settings).cell
-        drawn = not all(block.has_instrument for block in measured)
-        return fit(bare, measured, layout(bare).rigid_index, settings=settings, drawn=drawn)
+        regularised = not all(block.has_instrument for block in measured)
+        return fit(bare, measured, layout(bare).rigid_index, settings=settings, regularised=regularised)
 
 
 def select_model(
@@ -233,13 +233,13 @@ class _Climber:
             "offsets": np.concatenate([cell.chain.driven, table.frame_index]),
             "geometry": table.rigid_index,
         }
-        drawn = not all(block.has_instrument for block in self.measured)
+        regularised = not all(block.has_instrument for block in self.measured)
         error, last = np.inf, model if model in choices else "geometry"
         for name, candidates in choices.items():
             self._tick(name)
             found = self.nominal if name == "frames" else fit(
                 cell, self.measured, np.setdiff1d(candidates, self.fixed), settings=self.settings,
-                drawn=drawn, prior=self.prior,
+                regularised=regularised, prior=self.prior,
             )  # fmt: skip
             unseen = self._statistics(found, ()).error(NONE).rms
             better = unseen < error * (1.0 - MIN_GAIN)
@@ -256,7 +256,7 @@ class _Climber:
         self.stiff, self.error = self.best, error
 
     def effects(self, model: str) -> None:
-        """Try the effects one by one on the geometry; given an effect's name, use all up to it.
+        """Add effects to the geometry one by one; given an effect's name, use it and all before it.
 
         The geometry need not pay alone: gear errors may hide what it brings. Then both together have to. Effects whose
         fit does not come to an end, though nobody asked for them, are left out again.
@@ -295,7 +295,7 @@ class _Climber:
         self.rungs[last] = replace(self.rungs[last], parameters=len(found.free), corrections=corrections)
 
     def _greedy(self, statistics: FoldStatistics, place: dict[str, np.ndarray]) -> list[str]:
-        """Return the effects that reduce the error on unseen rows, best first (greedy selection).
+        """Return the effects that reduce the cross-validation error, best first (greedy selection).
 
         Args:
             place: indices of each effect's terms among those of the statistics.
@@ -321,7 +321,7 @@ class _Climber:
         return kept
 
     def _both(self, kept: list[str], climbed: int) -> list[str]:
-        """Return `kept` if geometry and effects together beat the chosen model on unseen rows; else an empty list.
+        """Return `kept` if geometry and effects together reduce the cross-validation error; else an empty list.
 
         Args:
             kept: effects that improve the geometry model.
@@ -336,7 +336,7 @@ class _Climber:
     def _final(
         self, rigid: GeometricFit, statistics: FoldStatistics, terms: tuple[Term, ...], where: np.ndarray
     ) -> GeometricFit:
-        """Fit geometry and effects to all rows, each term with its most probable ridge; drop terms without effect."""
+        """Return the fit of geometry and effects to all rows, each term with its most probable ridge."""
         ridge, reference = statistics.ridges(where), self.nominal.cell.chain
         picked = tuple(terms[k] for k in where[ridge > 0.0])
         cell = replace(rigid.cell, deflection=Deflection(picked, np.zeros(len(picked)), reference))
@@ -349,7 +349,7 @@ class _Climber:
         return replace(found, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
     def _terms(self, effect: str, poses_per_order: int = 8) -> list[Term]:
-        """Return an effect's terms, harmonics up to the order that the number of poses can identify.
+        """Return the terms of an effect; harmonics only up to the order that the number of poses can identify.
 
         `poses_per_order`: harmonics of order k are offered to sets of at least 8 k poses (our choice).
         """
@@ -375,6 +375,6 @@ class _Climber:
 
 
 def _rung(statistics: FoldStatistics, effect: str, where: np.ndarray, rms: float, note: str = "") -> ModelStep:
-    """Return the ladder step of an effect with error `rms` [m] on unseen rows; it is kept if `note` is empty."""
+    """Return the ladder step of an effect from its cross-validation error `rms` [m]; kept if `note` is empty."""
     shrunk = int(np.sum(statistics.ridges(where) > 0.0))  # terms that the data do not switch off
     return ModelStep(f"+ {effect}", statistics.rigid + shrunk, 1e3 * rms, not note, note, shrunk)

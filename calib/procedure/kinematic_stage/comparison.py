@@ -106,7 +106,7 @@ class Comparison:
         return self if self.alone is None else replace(self, errors=(self.errors[0], self.alone), intervals=None)
 
     def record(self, parameters: int = 0) -> ComparedRows:
-        """Return the comparison in the form of ``metrics.json``; `parameters` is the number fitted to its rows."""
+        """Return the entry of ``metrics.json``; `parameters` is the number of parameters fitted to these rows."""
         pairs = self.pairs if len(self.pairs[0]) else ()
         return ComparedRows(
             poses=self.poses,
@@ -126,7 +126,7 @@ class Comparison:
 def compare(
     cells: Sequence[Installation], blocks: Sequence[PoseMeasurements], frames: str, proves: bool = True, seed: int = 0
 ) -> Comparison:
-    """Return the errors on some rows of the nominal and the calibrated arm, and of a third one, the URDF alone."""
+    """Return the errors of the nominal arm, the calibrated arm and (if given) the URDF alone on the same rows."""
     (one, two, *alone), both = [errors(cell, blocks) for cell in cells], (cells[0], cells[1])
     first, second = (pair_errors(cell, blocks, seed=seed) for cell in both)
     corners: Any = tuple(room(cell, blocks) for room in offered("reprojection") for cell in both)
@@ -140,7 +140,7 @@ def compare(
 def compare_unseen(
     cells: Sequence[Installation], unseen: Unseen, settings: Settings, seed: int, expected: ErrorModel | None
 ) -> Comparison:
-    """Return the errors of the arms on unseen rows; base and tool placement are refitted if these rows need it."""
+    """Return the errors of the arms on validation rows; base and tool placement are refitted where needed."""
     block, settled, thin = unseen.block, True, None
     if unseen.own_frames:
         placed = [placed_on(cell, block, settings) for cell in cells]
@@ -175,7 +175,7 @@ def interval_cells(found: Comparison) -> np.ndarray:
 
 
 def iso9283_sentence(found: RepeatedPoses, min_poses: int = 5, min_cycles: int = 30, usual_poses: int = 100) -> str:
-    """Return RP and AP of repeated poses as a sentence; the norm asks for `min_poses` and `min_cycles`."""
+    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283)."""
     least, most = found.cycles
     cycles = f"{least}" if least == most else f"{least} to {most}"
     nominal, calibrated = (found.accuracy_mm[arm]["mean"] for arm in ARMS)

@@ -236,14 +236,14 @@ def compensate(
     """
     if not (np.isfinite(tolerance).all() and min(tolerance) > 0.0):
         given = f"{1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad"
-        raise UsageError(f"tolerance {given}: expected two sizes above 0")
+        raise UsageError(f"tolerance {given}: expected two numbers above 0")
     say = progress or (lambda words: None)
     one, two = placements(fitted, frame, tool)
     count, note = _dof(targets, one.chain, dof)
     lower, upper = one.chain.lower, one.chain.upper
     before, after = Goal(one, count, lower, upper), Goal(two, count, lower, upper, fitted.torques)
     if start is not None and not _inside(before, np.asarray(start)):
-        raise UsageError(f"start {list(start)}: beyond the joints' limits {lower.tolist()} to {upper.tolist()}")
+        raise UsageError(f"start {list(start)}: outside the joints' limits {lower.tolist()} to {upper.tolist()}")
     say("the nominal robot at the targets")
     poses, q0 = _reference(before, targets, start, seed)
     say("the calibrated robot")
@@ -271,7 +271,7 @@ def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
 
 
 def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return joint values (m, n) near `start` that reach the poses; near a singularity, as near as they may come."""
+    """Return joint values (m, n) near `start` that reach the poses; near a singularity they stay close to `start`."""
     q = inverse.nearest(goal, poses, np.clip(start, goal.lower, goal.upper), inverse.reach(goal, poses, start))
     far = np.flatnonzero(np.abs(q - start).max(axis=1, initial=0.0) > MAX_CORRECTION)
     q[far] = inverse.held_back(goal, poses[far], start[far], MAX_CORRECTION)
@@ -285,7 +285,7 @@ def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, Findin
     if asked not in (None, *inverse.DOF):
         raise UsageError(f"dof {asked}: expected 6, 5 (free to turn about the tool's z), or 3")
     if asked is not None and asked > given:
-        raise UsageError(f"{targets.file}: has positions without an orientation: dof {asked} needs qx qy qz qw")
+        raise UsageError(f"{targets.file}: the targets have no orientation; dof {asked} needs columns qx, qy, qz, qw")
     dof = asked or min(given, able)
     what = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
     joints = chain.n if asked is None and able < given else None
@@ -297,22 +297,22 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
-    wanted = pose(targets.rotation, targets.position)
+    poses = pose(targets.rotation, targets.position)
     if targets.q is not None:
-        found = inverse.reach(goal, wanted, targets.q)
-        return wanted, inverse.nearest(goal, wanted, np.clip(targets.q, goal.lower, goal.upper), found)
+        found = inverse.reach(goal, poses, targets.q)
+        return poses, inverse.nearest(goal, poses, np.clip(targets.q, goal.lower, goal.upper), found)
     lower, upper = goal.cell.chain.sampling_limits()
     middle = 0.5 * (lower + upper) if start is None else np.asarray(start, dtype=float)
     others = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
-    return wanted, _sought(goal, wanted, middle, others)
+    return poses, _sought(goal, poses, middle, others)
 
 
-def _sought(goal: Goal, wanted: np.ndarray, start: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the nominal robot's joint positions (m, n); of several solutions the one nearest to `start` (max norm)."""
-    best, cost = np.tile(start, (len(wanted), 1)), np.full(len(wanted), np.inf)
+    best, cost = np.tile(start, (len(poses), 1)), np.full(len(poses), np.inf)
     for first in (start, *others):
-        q = inverse.reach(goal, wanted, np.tile(first, (len(wanted), 1)))
-        met = _within(_sizes(inverse.differences(goal, q, wanted)), TOLERANCE)
+        q = inverse.reach(goal, poses, np.tile(first, (len(poses), 1)))
+        met = _within(_sizes(inverse.differences(goal, q, poses)), TOLERANCE)
         far = np.where(met, np.abs(q - start).max(axis=1), np.inf)
         better = far < cost
         best[better], cost[better] = q[better], far[better]
@@ -333,7 +333,7 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
 def _reason(
     chain: Chain, good: bool, beyond: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool
 ) -> str:
-    """Return why a target is not reached, from the remaining errors (2,) [m, rad]; else which joints extrapolate."""
+    """Return why a target is not reached, or which joints of its command are outside the measured range; "" if none."""
     if good:
         names = [name for name, out in zip(chain.joint_names, beyond) if out]
         return sentence(finding("command-extrapolates", joints=names)) if names else ""
@@ -414,7 +414,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     fitted, targets = commands.fitted, commands.targets
     lost, count = int(np.sum(~commands.reached)), len(commands.q)
     if lost and (not partial or lost == count):
-        advice = "" if lost == count else "\npartial (--partial) writes the others and leaves these rows empty"
+        advice = "" if lost == count else "\nwith partial (--partial) the others are written and these rows stay empty"
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         raise UsageError("\n  ".join([head, *_unreached(commands)]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names
@@ -432,7 +432,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
 
 
 def lines(commands: Commands) -> list[str]:
-    """Return the lines on the commands for the user."""
+    """Return the lines for the user: frames, targets that are not reached, errors before and after."""
     good, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []

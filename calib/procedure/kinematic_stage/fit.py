@@ -76,7 +76,7 @@ class Outcome:
 
     @property
     def validation(self) -> Mapping[str, Comparison]:
-        """Errors of both arms on unseen rows, by file name."""
+        """Errors of both arms on validation rows, by file name."""
         return self.assessment.validation
 
     @property
@@ -163,7 +163,7 @@ def run(
 
 
 def assessed(outcome: T, inputs: Inputs) -> T:
-    """Return an outcome with a new verdict on the unseen rows of `inputs`; nothing is fitted."""
+    """Return the outcome with a new verdict from the validation rows of `inputs`; nothing is fitted."""
     wanted, options, fits = outcome.settings, outcome.options, outcome.selection
     settings = Settings(wanted.loss or options.loss, options.loss_scale)
     arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
@@ -174,7 +174,7 @@ def assessed(outcome: T, inputs: Inputs) -> T:
 def _found_of(
     inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[Finding], accepted: Sequence[str]
 ) -> Findings:
-    """Return the findings of a fit that do not depend on unseen rows; `notes` are findings on its residuals."""
+    """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
     long = inputs.chain.stretched_length()
     left = found.cross_validated
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, left, long)
@@ -193,7 +193,7 @@ def _found_of(
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
-    """Return a finding if files share one station, but one station per file explains them far better."""
+    """Return a finding if one station per file explains the files far better than the station they share."""
     own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []

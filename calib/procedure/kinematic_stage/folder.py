@@ -77,7 +77,7 @@ class FitFolder:
         return read_record(Findings, _of_today(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
-        """Read both arms; the frames of the nominal arm are fitted again to the fitted rows."""
+        """Read the calibrated arm; return it with the nominal one, whose frames are fitted again to the fitted rows."""
         found, cell, expected = self.findings(), installation.read(self.path), None
         chosen = replace(settings, loss=found.loss or settings.loss)
         if found.discrepancy is not None:
@@ -143,14 +143,14 @@ def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that is not for a fit, or that contains one of its inputs."""
+    """Raise an error if a fit must not be written to `out`: other results are there, or one of the inputs."""
     folders.check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
 def write_folder(
     outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None, *, owned: bool = False
 ) -> Path:
-    """Write all files of a fit, or none (see `calib.folders`); an `owned` folder is ours, whatever it contains."""
+    """Write all files of a fit, or none on failure; an `owned` folder is not checked for foreign files."""
     if not owned:
         check_fit_target(out, [outcome.inputs.source])
 
@@ -200,7 +200,7 @@ def metrics(outcome: Outcome) -> FitMetrics:
 
 
 def _record(outcome: Outcome) -> dict[str, object]:
-    """Return the provenance entries on how the robot was calibrated, without its source."""
+    """Return the provenance entries of robot.toml: files, model, seed, verdict and nominal frames."""
     inputs = outcome.inputs
     again = inputs.earlier is not None and inputs.earlier.nominal is not None
     frames = {} if again else installation.frame_tables(outcome.selection.nominal.cell)
@@ -215,7 +215,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
 
 
 def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
-    """Write the table of joint corrections (a URDF cannot contain them), and how to apply it."""
+    """Write the table of joint corrections, which a URDF cannot contain, and a text on how to apply them."""
     chain, deflection = corrections.chain, corrections.deflection
     units = dict(zip(chain.names, chain.units))
     owners = {element.name: element.joint for element in chain.elements}

@@ -28,7 +28,7 @@ from calib.robot.library import load, resolve
 
 @dataclass(frozen=True)
 class Unseen:
-    """Rows withheld from the fit.
+    """Validation rows: measurements that are not fitted.
 
     Attributes:
         block: the measurements; station and tool names are those of the fit unless ``own_frames``.
@@ -45,7 +45,7 @@ class Unseen:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Robot and measurements, divided into fitted and unseen rows.
+    """Robot and measurements, divided into rows to fit and validation rows.
 
     Attributes:
         chain: the nominal arm.
@@ -117,14 +117,14 @@ def gather(
         return given
     name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
     return replace(
-        given, notes=(*given.notes, f"{name} brings {count} deflection terms of an earlier fit; they stay unchanged")
+        given, notes=(*given.notes, f"{name} has {count} deflection terms from an earlier fit; they stay unchanged")
     )
 
 
 def with_unseen(
     given: Inputs, validate: Sequence[Path | PoseMeasurements], options: FitOptions, settings: FitSettings
 ) -> Inputs:
-    """Return inputs with more unseen rows; copies of fitted rows are marked as seen.
+    """Return the inputs with further validation rows; copies of fitted rows are marked as seen.
 
     Args:
         given: robot, fitted rows, and unseen rows so far.
@@ -138,7 +138,7 @@ def with_unseen(
         for block in read_file(each, given.chain, options, fit):
             again = _path(each).resolve() in files
             if again:
-                notes.append(f"{block.file} is also a fit file: its errors are not those of unseen poses")
+                notes.append(f"{block.file} is also a fit file, so its errors do not count as validation")
             shared = block if settings.refit_frames else _shared(block, fit, notes)
             unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=settings.refit_frames, seen=again)
     copied, remarks = repeated(fit, {name: each.block for name, each in unseen.items()})
@@ -155,7 +155,7 @@ def load_robot(
     base: str | None = None,
     tip: str | None = None,
 ) -> tuple[Chain, Path]:
-    """Return the chain of `robot` (name or value) and its file; for a URDF, the chain of the measured joints."""
+    """Return a robot's chain and its file; of a URDF, the chain with the joints of the measured table."""
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
     source = resolve(robot)
@@ -168,8 +168,8 @@ def load_robot(
         known = read_tree(text(source)[0], str(source)).joints
         table = measured / JOINTS if measured.is_dir() else measured
         header = joint_columns(table)
-        wanted = [*header, *options.for_file(measured).columns]
-        names = [name for name in dict.fromkeys(wanted) if name in known and known[name].actuated]
+        columns = [*header, *options.for_file(measured).columns]
+        names = [name for name in dict.fromkeys(columns) if name in known and known[name].actuated]
         names = [] if f"q{len(names) + 1}" in header else names  # numbered columns hold more joints than are named
     return load(robot, base, tip, names or None), source
 
@@ -177,7 +177,7 @@ def load_robot(
 def load_rigid(
     robot: str | Path | CalibratedChain, measured: Path | None = None, base: str | None = None, tip: str | None = None
 ) -> tuple[Chain, Path]:
-    """Return the geometry that dynamics belong to and motions are planned on, and its file; see `load_robot`.
+    """Return the chain for dynamics and motion planning (without joint corrections), and its file.
 
     That is the best one without joint corrections: neither torques nor a robot's controller know of these, and the
     geometry they belong to is worse than this one where they are left out.
@@ -200,8 +200,8 @@ def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -
     missing = [one.name for one in whole.joints if one.name not in chain.joint_names and one.kind != "prismatic"]
     if missing and set(chain.joint_names) < set(whole.joint_names):
         raise UsageError(
-            f"{measured}: column '{missing[0]}' is missing: the arm of {source.name} has {whole.n} joints, {chain.n} "
-            f"given; if it ends at {chain.tip}, give --tip {chain.tip}"
+            f"{measured}: column '{missing[0]}' is missing: the arm of {source.name} has {whole.n} joints, but the "
+            f"table has {chain.n}; if the arm ends at {chain.tip}, give --tip {chain.tip}"
         )
 
 
@@ -244,7 +244,7 @@ def _path(each: Path | PoseMeasurements) -> Path:
 
 
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
-    """Return the rows of a block to fit, and the rows held out (None for a share of 0).
+    """Return the rows of a block to fit, and the held-out rows (None for a share of 0).
 
     Poses are permuted, not rows: the reflectors of one pose stay together, and so do the two rows of a distance and the
     cycles of a repeated pose.
@@ -281,7 +281,7 @@ def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
 def _named(
     read: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
-    """Return the fit files with stations and tools named by --stations and --tools; all names are distinct.
+    """Return the blocks to fit with station and tool names as --stations and --tools ask; all names are distinct.
 
     Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
     """
@@ -304,7 +304,7 @@ def _named(
 
 
 def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return the name of the tool of a file, numbered from the second tool of its kind."""
+    """Return the name of a file's tool; from the second tool of its kind on with a number."""
     number = [each for each in carried if each[0] == own[0]].index(own) + 1
     return f"{own[0]} {number}" if number > 1 else own[0]
 
@@ -316,18 +316,18 @@ def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
 
 
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
-    """Return a validation block with the fit's station and tools."""
+    """Return a validation block with the station and the tools of the fit."""
     fit = [other for other in fit if other.carried == block.carried] or fit
     first = fit[0]
     if block.has_instrument:
         stations = [other.station for other in fit if other.has_instrument]
         if not stations:
-            raise UsageError(f"{block.file}: no fit file places the instrument; refit its frames (--refit-frames)")
+            raise UsageError(f"{block.file}: no fit file has this instrument; refit its frames (--refit-frames)")
         if block.station not in stations:
             block = replace(block, station=stations[0])
             notes.append(
-                f"{block.file} is predicted from the station of the fit '{stations[0]}': if the instrument stood "
-                "elsewhere, refit frames there (--refit-frames)"
+                f"{block.file} is predicted with the fit's station '{stations[0]}'; if the instrument stood elsewhere, "
+                "refit its frames (--refit-frames)"
             )
     known = {name for other in fit for name in other.tool_names}
     if not set(block.tool_names) <= known:

@@ -84,7 +84,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of a fit that its verdict needs besides the errors on rows; stored in the fit's folder.
+    """Findings of a fit that its verdict needs in addition to the errors on rows; stored in the fit's folder.
 
     Attributes:
         model: the one chosen.
@@ -113,7 +113,7 @@ class Findings:
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationMetrics:
-    """Results of a fit on unseen rows: errors, verdict, warnings.
+    """Results of a fit on validation rows: errors, verdict, warnings.
 
     Attributes:
         deliverables: the verdict on each existing one of `calib.procedure.kinematic_stage.settings.DELIVERABLES`.
@@ -150,7 +150,7 @@ class FitMetrics(ValidationMetrics):
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:
-        """Errors on the sets of unseen rows, by name."""
+        """Errors on each set of validation rows, by name."""
         return {name: rows for name, rows in self.validation.items() if rows.unseen}
 
 

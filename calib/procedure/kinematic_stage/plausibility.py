@@ -57,7 +57,7 @@ def misfit(found: ModelSelection, reach: float) -> Finding | None:
 
 
 def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
-    """Return a finding if grossly wrong rows cause the error that `misfit` reports; else None.
+    """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; else None.
 
     Args:
         found: the selection of models with a loss that heeds every row.
@@ -75,7 +75,7 @@ def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> F
 
 
 def _left(found: GeometricFit) -> float:
-    """Return the rms position error of a fit on its own rows [m], corrected for degrees of freedom."""
+    """Return the rms position error of a fit on the fitted rows [m], corrected for degrees of freedom."""
     parts = [piece.part for piece in found.pieces]
     sizes = [part.sizes() for part in parts if NATURE[part.label] == "position"]
     rows, used = sum(part.height for part in parts), len(found.free) + sum(part.nuisances for part in parts)
@@ -91,7 +91,7 @@ MAX_IMAGES = 100  # that the scale is judged by
 def findings(
     nominal: Installation, fit: GeometricFit, blocks: Sequence[PoseMeasurements], left: float | None, reach: float
 ) -> list[Finding]:
-    """Return the findings on implausible rows of a fit, the one that explains most first.
+    """Return findings on measurements that contradict the arm, the most likely cause first.
 
     Args:
         nominal: the arm as it was, placed.
@@ -117,7 +117,7 @@ def findings(
 
 
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
-    """Return a block; of images, the poses they show, scaled by the board's square."""
+    """Return the block; images are replaced by board poses, scaled by the board's square."""
     if block.kind != IMAGES:
         return block
     rows = np.unique(np.linspace(0, len(block) - 1, MAX_IMAGES).astype(int))
@@ -125,7 +125,7 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 
 
 def _wrong_way(nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float) -> list[Finding]:
-    """Return the finding on the change of columns with which the nominal arm explains the rows."""
+    """Return a finding if the nominal arm explains the rows after a change of columns (sign, exchange, coupling)."""
     if not before > FLOOR * reach:
         return []
     changed = wrong_columns(nominal, blocks, mirrored=before > limit("unexplained", "share") * reach)
@@ -137,7 +137,7 @@ def _wrong_way(nominal: Installation, blocks: Sequence[PoseMeasurements], before
 
 
 def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
-    """Return the finding on the fitted changes of the arm's elements, largest first."""
+    """Return a finding if fitted elements differ implausibly much from nominal, largest change first."""
     changes = []
     for element, value, nominal in zip(fit.cell.chain.elements, fit.cell.chain.values, fit.start.chain.values):
         change = float(value - nominal)
@@ -151,7 +151,7 @@ def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
 
 
 def _scale(codes: tuple[str, str], one: Scale | None) -> list[Finding]:
-    """Return the first of two findings on a scale factor that reaches a level."""
+    """Return the first of two findings on a scale factor that is serious enough to report."""
     if one is None:
         return []
     off = abs(one.factor - 1.0)

@@ -124,7 +124,7 @@ def choose(
         map: where parallel work runs (`calib.workers`).
         progress: called with (done, total, what).
     """
-    require(m >= 1, f"-m {m}: give a number of at least one pose", UsageError)
+    require(m >= 1, f"-m {m}: give a number of poses, 1 or more", UsageError)
     chain, source = load_robot(robot, existing if isinstance(existing, Path) else None, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
     limits = read_limits(constraints, cell, source, settings.without)
@@ -137,12 +137,12 @@ def choose(
     if view is not None:
         if progress:
             progress(0, 1, "views of the board")
-        wanted = min(settings.candidates, VIEWS)
-        joints = view.draw(wanted, partial(is_feasible, space), limits.lower, limits.upper, settings.seed)
+        number = min(settings.candidates, VIEWS)
+        joints = view.draw(number, partial(is_feasible, space), limits.lower, limits.upper, settings.seed)
         if len(joints) < 2 * m:
             raise UsageError(
-                f"the camera sees the board at {len(joints)} postures that keep everything else, {m} are to be chosen: "
-                "look at [camera], carried and stands, tilt and range"
+                f"{len(joints)} feasible postures see the board, but {2 * m} are needed to choose {m}: "
+                "check carried, stands, tilt and range in [camera]"
             )
     index, method = cast(Any, settings.index), cast(Any, settings.method)  # checked by `select_poses`
     before = value = None
@@ -176,7 +176,7 @@ def choose(
 
 
 def _driven(found: Selection, driven: Drivable) -> Selection:
-    """Return a selection in driving order, its index and efficiency updated for replaced poses."""
+    """Return the selection in driving order, with index and efficiency updated for replaced poses."""
     indices, value = found.indices, driven.value[1] if driven.replaced else found.value
     if indices is not None:
         indices = indices.copy()
@@ -199,8 +199,8 @@ def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> n
         q = np.random.default_rng(settings.seed).uniform(limits.lower, limits.upper, (2000, len(limits.lower)))
         shares = [(one.name, (np.asarray(one.function(q)) <= 0.0).all(1).mean()) for one in space.constraints]
         named = ", ".join(f"{name} {100 * share:.2g} %" for name, share in sorted(shares, key=lambda each: each[1]))
-        hint = " (a target that faces the arm itself? see [target] facing)" if limits.sight is not None else ""
-        raise UsageError(f"{error}; of random postures keep: {named}{hint}") from error
+        hint = " (does the target face the arm? check facing in [target])" if limits.sight is not None else ""
+        raise UsageError(f"{error}; share of random postures that keep each constraint: {named}{hint}") from error
 
 
 def _outlook(
@@ -245,7 +245,7 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(found: Selection) -> str:
-    """Return the scope of the bound in an efficiency, and its uncertainty, as text."""
+    """Return, as text, which poses an efficiency's bound covers, and how exact it is."""
     climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
     if not climbs:
         return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
@@ -285,7 +285,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return table rows of the predicted accuracy, and of the loss by line-of-sight constraints if there are any."""
+    """Return the table rows of the predicted accuracy, with the accuracy lost to line-of-sight constraints."""
     rows = forecast.table(chosen.outlook.poses, chosen.outlook.others)
     if chosen.outlook.blind is None:
         return rows

@@ -72,7 +72,7 @@ def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
 
 
 def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.ndarray]:
-    """Read the covariance of the fit that `cell` came from, for steps (`calib.geometry.observation.step`).
+    """Read the covariance of a fit, for steps along its parameters (`calib.geometry.observation.step`).
 
     Returns:
         Positions (f,) in the parameter vector, and the covariance (f, f).
@@ -86,8 +86,8 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
     strange = [name for name in names if name not in place]
     if strange:
         raise UsageError(
-            f"{folder}/covariance.csv does not belong to the robot.toml next to it: '{strange[0]}' is no parameter "
-            "there; fit again"
+            f"{folder}/covariance.csv does not belong to the robot.toml next to it: '{strange[0]}' is not a "
+            "parameter there; fit again"
         )
     back = np.linalg.inv(_to_table(cell))[:, [place[name] for name in names]]
     free = np.flatnonzero(np.abs(back).max(axis=1, initial=0.0) > 0.0)
@@ -102,7 +102,7 @@ def _values(cell: Installation) -> np.ndarray:
 
 
 def _to_table(cell: Installation) -> np.ndarray:
-    """Return the derivative (p, p) of the tabulated values by steps along the parameters."""
+    """Return the Jacobian (p, p) of the tabulated values with respect to steps along the parameters."""
     result, start = np.eye(len(layout(cell).names)), len(cell.chain.elements)
     for k, frame in enumerate((*cell.stations, *cell.tools)):
         at, turn = start + 6 * k, rotation_vector(frame[:3, :3])[:, None]
@@ -199,7 +199,7 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
 
 
 def _places(found: Comparison, number: int) -> np.ndarray:
-    """Return measured position [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions."""
+    """Return measured positions [m] and error vectors of both arms [mm] of a block (m, 9); NaN without positions."""
     block = found.blocks[number]
     if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)

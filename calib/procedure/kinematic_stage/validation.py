@@ -1,4 +1,4 @@
-"""Errors of both arms on fitted and unseen rows, and the verdict from them.
+"""Errors of both arms on fitted rows and validation rows, and the verdict from them.
 
 `assess` returns the same result for a new fit and for one read from its folder.
 
@@ -53,7 +53,7 @@ def judge(
     cross_validated: float | None = None,
     arm: str = "",
 ) -> Verdict:
-    """Return the verdict on a calibration by its unseen rows; without unseen files, by cross-validation.
+    """Return the verdict on a calibration from its validation rows; without such rows, from cross-validation.
 
     Rules, the first group that says something; inside a group the worst finding decides:
 
@@ -150,7 +150,7 @@ def _worse(found: Sequence[_Proof], reach: float) -> list[Finding]:
 def _doubts(
     worst: _Proof, own: float, cross_validated: float | None, proofs: Mapping[str, Comparison], findings: Findings
 ) -> Iterator[Finding]:
-    """Yield the findings of the last group, worst first; those without a level count for nothing."""
+    """Yield the findings of the last group of rules, worst first."""
     times = worst.after / max(own, 1e-300)
     shared = any(rows.shares_frames for rows in proofs.values())
     remedy = catalogue()["placed-elsewhere"].advice if shared else ""
@@ -231,7 +231,7 @@ class Assessment:
 
 
 def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, wanted: FitSettings) -> Assessment:
-    """Return the errors of both arms on fitted and unseen rows, and the verdict.
+    """Return the errors of both arms on fitted and validation rows, and the verdict.
 
     Args:
         arms: what is compared.
@@ -280,7 +280,7 @@ def judge_deliverables(
 
 
 def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
-    """Return the largest rms error [m] of a deliverable on unseen rows; without such rows, by cross-validation."""
+    """Return the largest rms error [m] of a deliverable on validation rows; without such rows, by cross-validation."""
     alone = deliverable == "urdf"
     sizes = [(each.of_urdf if alone else each).errors[1].rms for each in validation.values() if each.proves]
     by_folds = findings.rigid_cross_validated if alone else findings.cross_validated
@@ -288,7 +288,7 @@ def _worst(validation: Mapping[str, Comparison], findings: Findings, deliverable
 
 
 def _copies(inputs: Inputs) -> list[str]:
-    """Return the names of files given as unseen that contain fitted rows."""
+    """Return a note for each validation file that contains fitted rows."""
     words = []
     for name, unseen in inputs.unseen.items():
         if unseen.seen:
@@ -300,7 +300,7 @@ def _copies(inputs: Inputs) -> list[str]:
 
 
 def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
-    """Yield the findings on one set of unseen rows.
+    """Yield the findings on one set of validation rows.
 
     Errors that look like another placement of the instrument than the `usual` nominal ones [m], rows that may be wrong
     measurements, a placement of base and tool that did not settle or took up most of the errors, and how many errors

@@ -202,7 +202,7 @@ class CameraTable:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Keys stated as unknown, which the check of the camera's view needs."""
+        """Keys with the value unknown that the check of the camera's view needs."""
         names = ("mounting", "lens", "board", "carried", "stands")
         return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 
@@ -224,7 +224,7 @@ class ConstraintsFile:
 
 
 def beside(path: Path) -> dict[str, Path]:
-    """Return the files named in a constraints file, by name: camera lens and board."""
+    """Return the camera lens and board files that a constraints file names, by name."""
     camera = read(ConstraintsFile, path, "", MOTION)[0].camera
     names = () if camera is None else (camera.lens, camera.board)
     return {name: path.parent / name for name in names if name != UNKNOWN}

@@ -62,7 +62,7 @@ class Limits:
     views: tuple[PoseConstraint, ...] = ()
 
     def space(self, seen: Observation, sight: bool = True) -> SearchSpace:
-        """Return the continuous problem of choosing poses for an observation Jacobian within these limits.
+        """Return the search space of pose selection: the observation Jacobian, joint limits and constraints.
 
         Args:
             seen: all targets' rows.
@@ -103,7 +103,7 @@ def read_limits(
     """
     known = (*constraints_file.DEFAULTS, *constraints_file.CELL)
     if unknown := sorted(set(without) - {*known}):
-        raise UsageError(f"without {unknown[0]}: there are {', '.join(known)}")
+        raise UsageError(f"without {unknown[0]}: expected one of {', '.join(known)}")
     stated, where = read(ConstraintsFile, given, "constraints", constraints_file.MOTION)
     limits = limits_of(stated, cell, source, where, without)
     if stated.camera is None:
@@ -139,7 +139,7 @@ def limits_of(
     without: Sequence[str] = (),
     seen: bool = True,
 ) -> Limits:
-    """Return the limits that a constraints file states for an arm; see `read_limits`.
+    """Return the pose limits of an arm from the content of a constraints file; see `read_limits`.
 
     Args:
         seen: False for motions, which nothing measures: no lines of sight.
@@ -162,7 +162,7 @@ def limits_of(
 
 
 def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
-    """Return the names of the limits that are not checked, for poses or (not `seen`) for motions."""
+    """Return the names of the limits that are not checked, for poses (`seen`) or for motions."""
     table, collision = stated.instrument or InstrumentTable(), stated.collision or CollisionTable()
     placed = bool(table.stated)
     missing = {
@@ -279,7 +279,7 @@ def _collision(
             if floor is None or table.floor is not None:
                 raise
             model, shapes, notes = place(None)
-            notes = (*notes, f"the floor is NOT checked: all postures are below {floor:g} m; state it in [collision]")
+            notes = (*notes, f"the floor is NOT checked: every posture is below {floor:g} m; set floor in [collision]")
             floor = None
     if model.excluded:
         pairs = listing((" with ".join(pair) for pair in model.excluded), 3)
@@ -297,7 +297,7 @@ def _collision(
 def _never_act(
     table: CollisionTable, obstacles: Sequence[Obstacle], walls: Sequence[Wall], cell: Installation, where: str
 ) -> tuple[set[str], tuple[str, ...]]:
-    """Return the names of the objects beyond the arm's reach, and a note on each.
+    """Return the names of walls and obstacles that the arm cannot reach, and a note on each.
 
     Raises:
         UsageError: for what stands `MAX_REACHES` times as far, and for links thicker than the arm is long.
@@ -314,11 +314,11 @@ def _never_act(
     away |= {one.name: float(signed_distance(one, base)[0][0]) for one in obstacles}
     beyond = {name: distance for name, distance in away.items() if distance > BODY * reach + table.margin}
     words = [
-        f"{name}: {distance:.3g} m from the base, the arm reaches {reach:.3g} m: it has no effect; is it in mm?"
+        f"{name}: {distance:.3g} m from the base, but the arm reaches {reach:.3g} m, so it has no effect; is it in mm?"
         for name, distance in beyond.items()
     ]
     for said, distance in zip(words, beyond.values()):
-        require(distance <= MAX_REACHES * reach, f"{where}: {said} Write lengths in m", UsageError)
+        require(distance <= MAX_REACHES * reach, f"{where}: {said} Give lengths in m", UsageError)
     return set(beyond), tuple(words)
 
 

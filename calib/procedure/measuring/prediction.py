@@ -46,10 +46,10 @@ class SelectionPrediction:
     sigmas: Array
 
     def check_robot(self, joints: Sequence[str]) -> None:
-        """Raise an error, before any work is done, if the selection belongs to another robot."""
+        """Raise an error if the selection belongs to a robot with other joints."""
         if self.joints != tuple(joints):
             ours, theirs = ", ".join(joints), ", ".join(self.joints)
-            raise UsageError(f"the selection belongs to another robot: its joints are {theirs}, here {ours}")
+            raise UsageError(f"the selection belongs to another robot: its joints are {theirs}; this robot has {ours}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Prediction(SelectionPrediction):
 
 
 def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
-    """Return the prediction for Jacobians (m, rows, p), with the tool's sigma at typical poses (s, n).
+    """Return the predicted accuracy of a fit from its Jacobians (m, rows, p), at typical poses (s, n).
 
     Args:
         seen: the observation Jacobian they come from.
@@ -101,7 +101,7 @@ def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, pos
 def by_count(
     seen: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
 ) -> tuple[Prediction, ...]:
-    """Return predictions for `COUNTS` poses, chosen greedily among candidates (N, rows, p).
+    """Return the predicted accuracy with `COUNTS` poses, chosen greedily among candidates (N, rows, p).
 
     Args:
         seen, typical: see `predicted`.
@@ -109,15 +109,15 @@ def by_count(
         before: (k, rows, p) Jacobians of poses measured before.
     """
     past = np.zeros((0, *candidates.shape[1:])) if before is None else before
-    wanted = [count for count in COUNTS if count <= len(candidates)]
-    if not wanted:
+    counts = [count for count in COUNTS if count <= len(candidates)]
+    if not counts:
         return ()
     try:
-        ready = prepared(candidates, wanted[-1], before)
+        ready = prepared(candidates, counts[-1], before)
     except (NotIdentifiable, TooFewCandidates):
         return ()
-    order = list(greedy(Pool(ready.z, ready.known), wanted[-1]).members)
-    found = [predicted(seen, np.concatenate([candidates[order[:k]], past]), typical, k) for k in wanted]
+    order = list(greedy(Pool(ready.z, ready.known), counts[-1]).members)
+    found = [predicted(seen, np.concatenate([candidates[order[:k]], past]), typical, k) for k in counts]
     return tuple(one for one in found if np.isfinite(one.rms))
 
 
@@ -169,7 +169,7 @@ def read(selection: Path) -> SelectionPrediction:
         found = sorted(selection.glob(f"*{SUFFIX}"))
         require(len(found) <= 1, f"{selection} contains {len(found)} predictions: name one CSV of poses", UsageError)
         path = found[0] if found else selection / f"*{SUFFIX}"
-    words = f"{path} not found; give the CSV written by calib select, its prediction file, or the folder of both"
+    words = f"{path} not found; give the CSV written by `calib select`, or its folder"
     require(path.is_file(), words, UsageError)
     return read_json(path, "choose the poses again", SelectionPrediction)
 

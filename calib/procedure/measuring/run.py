@@ -81,7 +81,7 @@ class Run:
 
     @property
     def cut_off(self) -> tuple[int, ...]:
-        """Numbers of the poses (in input order) without a clear path from the largest connected group."""
+        """Indices of the poses (in input order) without a clear path from the largest connected group."""
         parts = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
         most = max(parts, key=len)
         return tuple(sorted(int(k) for part in parts if part is not most for k in part))
@@ -149,7 +149,7 @@ def plan_run(
 
 
 def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the poses (m, n) with each revolute joint within one turn, its ends in the largest gap between poses.
+    """Return the poses (m, n) with each revolute joint within one turn, cut in the largest gap between its angles.
 
     A joint with more than one turn can stand everywhere on two; the cut is the middle of the largest gap between the
     poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
@@ -170,7 +170,7 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
-    """Return the fastest order, if moves may pass other poses, and its paths; unconnected pairs are left out."""
+    """Return the fastest order if moves may pass other poses, and its paths; pairs without a path are left out."""
     direct = np.full(cost.shape, np.inf)
     for one, two in clear:
         direct[one, two] = direct[two, one] = cost[one, two]
@@ -238,10 +238,10 @@ def lines(run: Run, settings: RunSettings) -> list[str]:
         f"{settings.dwell:g} s at each pose ({before:.1f} min in their original order with straight moves)"
     ]
     if run.around:
-        found.append(f"{run.around} of {len(run.ways)} paths lead around an obstacle: drive their via-points, too")
+        found.append(f"{run.around} of {len(run.ways)} paths lead around an obstacle: also drive their via-points")
     if run.blocked:
         pairs = ", ".join(f"{k + 1} to {k + 2}" for k in run.blocked)
-        found.append(f"NO clear path was found from pose {pairs}: jog the robot there, or leave the pose out")
+        found.append(f"NO clear path was found from pose {pairs}: drive there by hand, or leave out the pose")
     return found
 
 
@@ -313,7 +313,7 @@ MAX_STRAIGHT_TRIES, MAX_VIA_TRIES = 200, 4
 
 @dataclass(frozen=True, eq=False)
 class Exchange:
-    """Candidates to replace poses, and the index that judges them.
+    """Candidate poses that may replace others, and the index by which they are ranked.
 
     Attributes:
         jacobian: q (m, n) -> whitened observation Jacobians (m, rows, p).
@@ -366,7 +366,7 @@ class Drivable:
 
     @property
     def words(self) -> str:
-        """Text on the replaced poses, counted from 1 in the order of the run; "" if none."""
+        """Sentence on the replaced poses, counted from 1 in the order of the run; "" if none."""
         if not self.replaced:
             return ""
         numbers = ", ".join(f"{k}" for k, place in enumerate(self.run.order, 1) if place in self.replaced)
@@ -384,7 +384,7 @@ def drivable(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Drivable:
-    """Plan the run through poses q (m, n), and replace the poses that no clear path reaches on any joint turn.
+    """Return the run through poses q (m, n), in which poses without a clear path are replaced by candidates.
 
     Args:
         chain, limits, settings, seed, progress: see `calib.procedure.measuring.run.plan_run`.

@@ -96,7 +96,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class SeenOnly:
-    """An observation Jacobian (`calib.geometry.observability.Observation`) with zero rows for targets not seen."""
+    """Observation Jacobian with zero rows for targets that are not seen."""
 
     of: Observation
     sight: Sight

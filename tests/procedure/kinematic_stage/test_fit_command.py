@@ -167,7 +167,7 @@ def test_rows_that_count_twice_are_said_and_copies_prove_nothing(cell, calib):
     assert "a.csv: 1 row (41) identical to another row" in out
     assert "copy.csv: 20 rows (1, 2, 3, 4, 5, ...) identical to fitted rows" in out
     assert "by cross-validation only" in out and "NOT unseen" in out
-    assert "is the file given twice" in calib(*start[:3], file, *start[3:])[1]
+    assert "file given twice" in calib(*start[:3], file, *start[3:])[1]
     assert "with the numbers" not in calib("fit", "ur5", cell.write("b.csv", cell.measure(40, 5)), *start[3:])[1]
 
 
@@ -299,8 +299,8 @@ def test_orientations_are_held_against_the_arm(cell, calib):
     rows = cell.measure(40)
     names = ["qx", "qy", "qz", "qw"]
     for words, reading in (
-        ("Are the columns w first", ["qw", "qx", "qy", "qz"]),
-        ("target seen from the instrument", ["qx", "qy", "qz", "-qw"]),
+        ("If w comes first", ["qw", "qx", "qy", "qz"]),
+        ("target in the instrument's frame", ["qx", "qy", "qz", "-qw"]),
         ("", names),
     ):
         other = [

@@ -144,5 +144,5 @@ def test_a_validation_at_the_fits_joints_proves_nothing(files, capsys):
         ["fit", "ur5", "fit.csv", "--validate", "again.csv", "--model", "geometry", "--out", "done", "--no-plots"]
     )
     said = capsys.readouterr().out
-    assert "at joint values of fitted rows: not unseen" in said
+    assert "at joint values of fitted rows, so they do not count as validation" in said
     assert "NOT unseen" in said and code == 0

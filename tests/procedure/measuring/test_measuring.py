@@ -194,7 +194,7 @@ def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
     assert all(words in told for words in said)
     outlook = chosen.outlook
     assert outlook.blind is not None and outlook.blind[0] > outlook.comparable
-    with pytest.raises(calib.CalibError, match="of random postures keep: line of sight 0 %"):
+    with pytest.raises(calib.CalibError, match="of random postures that keep each constraint: line of sight 0 %"):
         (tmp_path / "d.toml").write_text(CELL.replace("30 deg", "0.1 deg"))
         calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "d.toml")
 
