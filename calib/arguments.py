@@ -1,4 +1,4 @@
-"""Checks of Python API arguments against their annotations: an argument of a wrong type is refused by name.
+"""Checks of the Python API's arguments by their annotations; the error for a wrong type names the argument.
 
 Loads nothing heavy: the command line builds default settings before it knows what it is asked for.
 """
@@ -20,7 +20,7 @@ _TABLE = "found a DataFrame: write it by frame.to_csv('table.csv', index=False) 
 
 
 def checked(given: C) -> C:
-    """Return a function, or a settings dataclass, that refuses arguments which do not match its annotations.
+    """Return a function or settings class that raises an error for arguments of a type other than annotated.
 
     A function runs with one thread of BLAS, `calib.workers.threads`. Settings are read as an option file's table is,
     see `calib.config.parse`; without arguments nothing is loaded for that.

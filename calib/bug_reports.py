@@ -38,7 +38,7 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
         except CalibError:
             continue
         return f"{said}; a bug report was written: {path}. Please check the input, too."
-    return f"{said}; --debug shows where. Please check the input, too."
+    return f"{said}; `calib --debug` shows the place. Please check the input, too."
 
 
 def _versions() -> list[str]:

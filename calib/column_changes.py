@@ -37,7 +37,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Changes of columns under which the model explains the data better than unchanged.
+    """Changes of columns with which the model explains the data better than without.
 
     Attributes:
         changes: one or more.
@@ -81,7 +81,7 @@ def best_changes(
     at_least: Callable[[Any], np.ndarray] | None = None,
     max_changes: int = 1,
 ) -> Explanation | None:
-    """Return the changes that explain the data best, added one by one while each is significant; None if none is.
+    """Return the changes that explain the data best, chosen one by one; None if no change is significant.
 
     Args:
         data: as recorded.
@@ -148,6 +148,6 @@ def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _share(after: np.ndarray, before: np.ndarray) -> float:
-    """Return the remaining rms as a share; of several shares the geometric mean."""
+    """Return the ratio of two rms residuals; for several residuals, the geometric mean of their ratios."""
     with np.errstate(all="ignore"):
         return float(np.exp(0.5 * np.mean(np.log(np.asarray(after) / before))))

@@ -59,7 +59,7 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
 
 
 def _check_size(found: Any, place: str, error: type[CalibError]) -> None:
-    """Refuse tables nested too deeply and integers outside TOML's range; without recursion."""
+    """Raise an error for tables nested too deeply and for integers of more than 64 bits."""
     ahead: list[tuple[tuple[Any, ...], Any]] = [((), found)]
     while ahead:
         loc, value = ahead.pop()
@@ -179,7 +179,7 @@ def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
 
 
 def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
-    """Return the table in `files` under the name of the file at `path`, or the end of its path; None if absent."""
+    """Return the table in `files` whose name is the end of the file's path; None if there is no such table."""
     parts = Path(path).parts
     for name, own in files.items():
         wanted = Path(name).parts
@@ -212,7 +212,7 @@ def _entries(docstring: str) -> dict[str, str]:
 def check_keys(
     found: Mapping[str, Any], keys: Collection[str], place: str, error: type[CalibError] = UsageError
 ) -> None:
-    """Refuse a key that is not among `keys`; the message suggests the most similar one."""
+    """Raise an error for a key that is not in `keys`; its message suggests the most similar key."""
     for key in found:
         if key not in keys:
             raise error(f"{place}: {_no_key(key, keys)}")

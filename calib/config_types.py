@@ -23,7 +23,7 @@ _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
 
 
 class _Short(reprlib.Repr):
-    """Representation of a value in about one line; dates in TOML format."""
+    """Shortened texts of values, about one line each; dates as in TOML."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -208,7 +208,7 @@ class Real(_Read):
 
 @dataclass(frozen=True)
 class Whole(_Read):
-    """A whole number from `least` to `most`, converted to count from `start`; `of` names what it counts."""
+    """A whole number from `least` to `most`; `start` is subtracted from it, and `of` names its unit in messages."""
 
     least: int = 0
     most: int = 2**63 - 1
@@ -228,7 +228,7 @@ class Whole(_Read):
 
 @dataclass(frozen=True)
 class OneOf(_Read):
-    """A text that is one of a few; `hint` is added to the error message.
+    """One of a few allowed texts; `hint` is added to the error message.
 
     Attributes:
         allowed: the texts; or ``module:Name`` of the `Literal` that holds them, of a module that is loaded late.

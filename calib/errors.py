@@ -137,23 +137,23 @@ class SessionError(CalibError):
 
 
 def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: Any) -> None:
-    """Raise `kind(message, *details)` unless `holds`; for messages that can be formatted in both cases."""
+    """Raise `kind(message, *details)` unless `holds` is true."""
     if not holds:
         raise kind(message, *details)
 
 
 def refuse_robot(place: object, words: str) -> NoReturn:
-    """Refuse a robot's description for an error at a location: a file, a line, a joint, a row."""
+    """Raise `RobotError` for an error in a robot's description; `place` is a file, a line, a joint or a row."""
     raise RobotError(f"{place}: {words}")
 
 
 def refuse_data(file: str | Path, words: str, column: str | None = None, row: int | None = None) -> NoReturn:
-    """Refuse measured data: a file (or a block of that name), a column of it, or a row (from 1)."""
+    """Raise `MeasurementError` for a file or block of measured data, with its column or row (from 1)."""
     raise MeasurementError(words, file, row, column)
 
 
 def refuse_option(place: object, words: str) -> NoReturn:
-    """Refuse an option, a command or an options file for an error at a location."""
+    """Raise `UsageError` for an option, a command or an options file; `place` names it."""
     raise UsageError(f"{place}: {words}")
 
 
@@ -223,9 +223,9 @@ def as_ours() -> Iterator[None]:
 
 
 def complaint(error: Exception) -> tuple[str, int] | None:
-    """Return message and exit code of an error that is not a bug of the toolkit; None for others.
+    """Return message and exit code of an expected error; None for an internal error.
 
-    Beside our own: what the operating system refuses with a file's name, or for want of room, and want of memory.
+    Expected are this toolkit's errors, the operating system's for a named file or a full disk, and lack of memory.
     """
     if (code := exit_code(error)) is not None:
         return str(error), code
@@ -233,7 +233,7 @@ def complaint(error: Exception) -> tuple[str, int] | None:
         place = "" if error.filename is None else f"{error.filename}: "
         return f"{place}{error.strerror or error}", 2
     if isinstance(error, MemoryError):
-        return f"not enough memory ({error}): is a number or a file larger than intended?", 2
+        return f"not enough memory ({error}): check whether a number or a file is larger than intended", 2
     return None
 
 
@@ -254,7 +254,7 @@ def quiet() -> Iterator[None]:
 
 
 def exit_code(error: Exception) -> int | None:
-    """Return the exit code of an error raised on purpose, 2 or 3 (not identifiable, not converged); None for others."""
+    """Return the exit code of this toolkit's errors: 3 if not identifiable or not converged, else 2; else None."""
     if isinstance(error, (NotConverged, Unidentifiable)):
         return 3
     if isinstance(error, CalibError):

@@ -36,24 +36,24 @@ ROOMS = "calib.rooms"
 
 
 def offered(what: str) -> list[Any]:
-    """Return the extensions of all packages under a name, in the order of the packages' names."""
+    """Return the extensions that packages registered under the name `what`, in the order of the packages' names."""
     return [_loaded(room, places[what]) for room, places in _offers().items() if what in places]
 
 
 def merged(what: str) -> dict[str, Any]:
-    """Return the merged tables of all packages under a name."""
+    """Return one table merged from the tables that packages registered under the name `what`."""
     return {key: value for table in offered(what) for key, value in table.items()}
 
 
 def needed(what: str) -> Any:
-    """Return the extension under a name, from the one package that provides it.
+    """Return the extension that a package registered under the name `what`.
 
     Raises:
         UsageError: where no room offers it.
     """
     for each in offered(what):
         return each
-    raise UsageError(f"{what.replace('_', ' ')}: no package of {ROOMS} provides it; is the installation complete?")
+    raise UsageError(f"{what.replace('_', ' ')}: no package of {ROOMS} provides it; install the toolkit again")
 
 
 @cache

@@ -34,7 +34,7 @@ _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", defaul
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Publish all files written in the block together at its end, or none if one cannot be written."""
+    """Put all files written in the block into place at its end, or none of them if one cannot be written."""
     if _staged.get() is not None:  # part of a larger whole
         yield
         return
@@ -55,7 +55,7 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> Iterator[None]:
-    """Write the files of the block together as results: checked (`check_results`) and registered as ours."""
+    """Write the block's files together as results: targets are checked (`check_results`), checksums recorded."""
     check_results(targets, inputs, overwrite)
     with together():
         yield
@@ -69,7 +69,7 @@ def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrit
 
 
 def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> None:
-    """Refuse, before any work is done, target files that cannot be written, are inputs, or coincide.
+    """Raise an error, before any work is done, for target files that cannot be written, are inputs, or coincide.
 
     Args:
         targets: to be written, each with the suffixes that it may have; what stands there is replaced where an earlier
@@ -162,7 +162,7 @@ def _alive(process: int) -> bool:
 
 
 def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Sequence[str] = ()) -> None:
-    """Refuse, before any work is done, a target file that cannot be written, has a wrong suffix, or is an input.
+    """Raise an error, before any work is done, for a target file that cannot be written or is an input.
 
     Args:
         out: the file to write.
@@ -211,7 +211,7 @@ def _reached(path: Path) -> bool:
 
 
 def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]) -> None:
-    """Refuse, before any work is done, a target that is one of the input files or folders.
+    """Raise an error, before any work is done, for a target that is one of the input files or folders.
 
     Args:
         targets: to be written.
@@ -234,7 +234,7 @@ def same_file(one: Path, other: Path) -> bool:
 
 
 def check_regular(path: str | Path, streams: bool = False) -> None:
-    """Refuse to read a pipe or a device.
+    """Raise an error if the path is a pipe or a device.
 
     Args:
         path: of a file, or a folder.

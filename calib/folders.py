@@ -40,7 +40,7 @@ class InFolder:
 def check_target(
     out: Path, ours: Collection[str], marks: Collection[str], what: str, inputs: Iterable[str | Path | None] = ()
 ) -> None:
-    """Refuse, before any work is done, a folder that cannot be written, or that contains files of another origin.
+    """Raise an error, before any work is done, for a folder that cannot be written or contains other files.
 
     Args:
         out: where results are to go.

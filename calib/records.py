@@ -75,7 +75,7 @@ def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
 def read_json(
     path: Path, advice: str = "make it again", kind: Any = dict, current: Callable[[Any], Any] | None = None
 ) -> Any:
-    """Return the content of a JSON file of ours as a value of `kind` (see `read_record`).
+    """Return the content of a JSON file of this toolkit as a value of type `kind` (see `read_record`).
 
     Args:
         current: moves what an earlier version wrote to today's keys.
@@ -148,7 +148,7 @@ def plain(value: Any, null: bool = False) -> Any:
 
 @cache
 def _keys(kind: type) -> dict[str, bool]:
-    """Return the names of a record's fields and stored properties, and whether null means NaN in each."""
+    """Return, for each field and stored property of a record type, whether null in JSON means NaN."""
     hints = get_type_hints(kind, include_extras=True)
     computed = [name for one in kind.__mro__ for name, item in vars(one).items() if isinstance(item, stored)]
     return {one.name: _nullable(hints[one.name]) for one in fields(kind)} | dict.fromkeys(computed, True)

@@ -53,16 +53,16 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
 
     @one_blas_thread()
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the standard deviations (N, rows) [N m or N] of the errors of `torques`: ± 1.96 σ covers 95 %.
+        """Return the standard deviations (N, rows) [N m or N] of predicted torques: ± 1.96 σ covers 95 %.
 
-        They are those of recorded torques, with what of them no model in the band explains.
+        They include the part of recorded torques that no model within the filter's band explains.
 
         Raises:
             UsageError: for a model of too short a recording to estimate errors from.
         """
         expected = self.errors
         if expected is None:
-            raise UsageError("the recording is too short to estimate torque errors: record longer")
+            raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
         return expected.sigma(self.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
     @checked
@@ -91,7 +91,7 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
     def section(self) -> Section:
-        """Return errors on other motion, friction and verdict as a section of a report."""
+        """Return a report section with the errors on other motion, the friction, and the verdict."""
         from calib.procedure.report import dynamics_section
 
         return dynamics_section.outcome_section(self)
@@ -144,7 +144,11 @@ def identify_dynamics(
         MeasurementError: for logs that cannot be right, naming row and column.
         Unidentifiable: where the motion identifies no parameter.
     """
-    require(settings is None or options is None, "settings and options overlap: give only one of them", UsageError)
+    require(
+        settings is None or options is None,
+        "settings and options were both given, but contain the same keys: give only one of them",
+        UsageError,
+    )
     progress = progress_shown(progress)
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
     chosen = chosen if settings is None else options_of(settings)

@@ -1,6 +1,6 @@
-"""Exports: calibrated geometry and identified dynamics in the formats of other programs.
+"""Exports of calibrated geometry and identified dynamics in the formats of other programs, and validation.
 
-Results held against measurements they have not seen.
+Validation compares a result with measurements that it was not estimated from.
 """
 
 import warnings
@@ -101,6 +101,8 @@ def _source_of(place: Path) -> Path:
     """Return the path of the robot description that a fit was made from."""
     source = geometry.read(place).source
     with refused_as(
-        UsageError, RobotError, f"{place} was fitted from {source}, which is missing: give its URDF (urdf)"
+        UsageError,
+        RobotError,
+        f"{place} was fitted from {source}, which is missing: give the robot's URDF (argument urdf)",
     ):
         return resolve(source)

@@ -150,7 +150,7 @@ class GeometryFit(Judged, fit.Outcome):
             UsageError: where no positions were measured.
         """
         if self.expected is None:
-            raise UsageError("no expected errors for this fit: at least 20 measured positions are needed")
+            raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
         return self.expected.position_sigma(self._poses(q), tool=tool)
 
     def _poses(self, q: Any) -> PoseMeasurements:
@@ -186,7 +186,7 @@ class GeometryFit(Judged, fit.Outcome):
         return data_frame(estimate_table(self.selection.fit, self.selection.nominal.cell).rows(), list(HEADER))
 
     def section(self) -> Section:
-        """Return errors on unseen poses, ladder and verdict as a section of a report."""
+        """Return a report section with the errors on unseen poses, the compared models, and the verdict."""
         from calib.procedure.report import geometry_section
 
         return geometry_section.outcome_section(folder.metrics(self))
@@ -207,7 +207,7 @@ class JointCommands(compensation.Commands):
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the commands as CSV; `partial` writes the reached targets even if others are not reached.
+        """Write the joint commands as CSV; with `partial`, also if some targets were not reached.
 
         A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
         """
@@ -315,7 +315,7 @@ def fit_geometry(
 
 
 def read_fitted(folder: str | Path) -> compensation.Fitted:
-    """Return the fitted arm in its cell from the folder of a fit, see `kinematic_stage.compensation.read`.
+    """Return the fitted arm with its instrument and tools from a fit's folder.
 
     Raises:
         UsageError: where it is none, lacks something, or is of a parallel robot.

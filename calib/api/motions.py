@@ -1,4 +1,4 @@
-"""Motions in Python: design of excitation, planning of time-optimal motions."""
+"""Design of excitation motions, and planning of time-optimal motions, in Python."""
 
 from __future__ import annotations
 

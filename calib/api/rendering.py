@@ -25,7 +25,7 @@ Progress = Callable[[str], None]
 
 
 def listed(given: object | Sequence[object]) -> list:
-    """Return one argument, or several (nested), as a flat list."""
+    """Return a single value as a list of one, and nested sequences as a flat list."""
     if isinstance(given, (str, Path)) or not isinstance(given, Sequence):
         return [given]
     return [one for each in given for one in listed(each)]
@@ -37,7 +37,7 @@ def optional(given: Any) -> Any:
 
 
 def progress_shown(progress: Progress | None) -> Progress | None:
-    """Return the progress reporter: the given one; by default a line under the cell in a notebook; else None."""
+    """Return the given progress reporter; without one, in a notebook, a line below the cell; otherwise None."""
     notebook = sys.modules.get("IPython")
     if progress is not None or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
         return progress

@@ -89,7 +89,7 @@ def run(arguments: list[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     for before, word in zip(["calib", *given], given):
         if word.encode(errors="ignore").decode() != word or not word:
-            what = "is not UTF-8 (rename the file)" if word else "is empty (leave the option out, or give it a value)"
+            what = "is not UTF-8; rename the file" if word else "is empty; leave the option out, or give it a value"
             return _complain(f"the argument after {before} {what}", 2)
     try:
         code = int(_command()(args=_spread(given), standalone_mode=False) or 0)

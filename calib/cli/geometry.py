@@ -153,7 +153,7 @@ def export(
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
         with progress() as show:
-            show("all formats, each file verified by reading it back")
+            show("writing all formats, and reading each file back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
         say_written(lines, into, delivery.verdicts(folder).level)
         return
@@ -171,7 +171,7 @@ def export(
         )
     say(*lines)
     if found.corrections is not None:
-        say(f"note: the corrections in {folder}/joint_corrections.csv are not included in these files")
+        say(f"note: these files do not include the corrections of {folder}/joint_corrections.csv")
     if own.level:
         say(str(own))
     exit_failed(own.level)

@@ -42,7 +42,7 @@ def new(
     from calib.procedure.session.questions import checked
 
     if dynamics_only:
-        words = f"--dynamics-only measures nothing; the instrument is {given.instrument}"
+        words = f"--dynamics-only needs no instrument, but --instrument is {given.instrument}: leave one of them out"
         require(given.instrument in (None, "none"), words, UsageError)
         given = replace(given, instrument="none")
     if given.robot is None or given.instrument is None:
@@ -61,7 +61,7 @@ def _asked(given: Answers) -> Answers:
 
     if not sys.stdin.isatty():
         missing = "--robot" if given.robot is None else "--instrument"
-        raise UsageError(f"{missing} is missing (calib new asks for it at a terminal)")
+        raise UsageError(f"{missing} is missing; at a terminal, `calib new` asks for it")
     for question in QUESTIONS:
         while question.open(given):
             answer = typer.prompt(question.words, default=question.default, show_default=bool(question.default))

@@ -26,7 +26,7 @@ from calib.units import plain_number
 
 
 def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder that `verb` must not write to, or that contains its inputs.
+    """Raise an error, before any work is done, if the command `verb` must not write its results to the folder `out`.
 
     Args:
         robot: a serial arm or another robot, as a person names it.
@@ -69,7 +69,7 @@ def make_console(**options: Any) -> Any:
 
 
 class _Output:
-    """Output of a command: everything with -v, else at most `MAX_LINES` without details (indented lines, tables)."""
+    """Output of a command: all lines with -v, otherwise at most `MAX_LINES`, without indented lines and tables."""
 
     def __init__(self, verbose: bool) -> None:
         self.verbose, self.printed, self.left_out = verbose, 0, 0
@@ -106,7 +106,7 @@ _OUTPUT: ContextVar[_Output | None] = ContextVar("output", default=None)
 
 @contextmanager
 def printing(verbose: bool) -> Iterator[None]:
-    """Print the lines given to `say` in the block, or the most important of them."""
+    """Print the lines that the block gives to `say`: all if `verbose`, otherwise the most important ones."""
     output = _Output(verbose)
     token = _OUTPUT.set(output)
     try:
@@ -117,14 +117,14 @@ def printing(verbose: bool) -> Iterator[None]:
 
 
 def say(*lines: Any, console: Any = None, result: bool = False) -> None:
-    """Print lines of text and rich renderables; a `result` was asked for and is never left out."""
+    """Print texts and rich renderables; those given as a `result` are always printed in full."""
     console, output = console or make_console(), _OUTPUT.get() or _Output(verbose=True)
     for line in lines:
         output.show(line, console, result)
 
 
 def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:
-    """Print lines, and the path of the results.
+    """Print the lines of a result and the path that it was written to.
 
     Raises:
         typer.Exit: with code 1 where the verdict is fail.
@@ -191,7 +191,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Common:
-    """Parameters that mean the same in all commands.
+    """Parameters with the same meaning in all commands.
 
     Attributes:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
@@ -287,7 +287,7 @@ def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _is_repeated(plain: Any) -> bool:
-    """Return whether an option is repeated per item of a tuple; numbers are given as one comma-separated text."""
+    """Return whether an option is given once per item; a list of numbers is given as one comma-separated text."""
     first, last = get_args(plain)[0], get_args(plain)[-1]
     return last is ... and _plain(first)[0] is not float
 

@@ -33,7 +33,7 @@ LEVELS = ("pass", PREDICTION_ONLY, "marginal", "fail")
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict: one of `LEVELS`, its reason in one sentence, the code of the deciding finding, and advice.
+    """Verdict on a result: one of `LEVELS`, the reason in one sentence, the code of the deciding finding, and advice.
 
     It equals the name of its level: ``fit.verdict == "pass"``.
     """
@@ -56,7 +56,7 @@ class Verdict:
 
     @classmethod
     def of(cls, figures: str, findings: Iterable[Finding] = ()) -> Verdict:
-        """Return the verdict by the worst finding (the first of equals); its reason begins with `figures`."""
+        """Return the verdict that follows from the worst finding; the reason begins with the text `figures`."""
         worst = max(findings, key=lambda one: RANKS.index(level_of(one)), default=None)
         if worst is None or level_of(worst) in ("", "note"):
             return cls("pass", figures)
@@ -64,7 +64,7 @@ class Verdict:
         return cls(level_of(worst), reason, worst.code, _filled(advice, worst.values))
 
     def for_prediction(self, why: str) -> Verdict:
-        """Return the verdict of a model that cannot be exported because of `why`: a pass becomes prediction only."""
+        """Return the verdict of a model that cannot be exported for the reason `why`: pass becomes prediction only."""
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {why}") if self.level == "pass" else self
 
 
@@ -131,7 +131,7 @@ def catalogue() -> Mapping[str, Entry]:
 
 
 def level_of(one: Finding) -> str:
-    """Return the level of a finding (one of `RANKS`) by the limits of the catalogue; accepted findings are notes."""
+    """Return the level of a finding (one of `RANKS`) from the catalogue's limits; an accepted finding is a note."""
     entry = catalogue()[one.code]
     reached = [
         max((name for name, limit in steps.items() if one.values[value] > limit), key=RANKS.index, default="")
@@ -147,7 +147,7 @@ def limit(code: str, value: str, level: str = "fail") -> float:
 
 
 def settle(found: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
-    """Return the findings that have a level, worst first; those accepted by the options are marked."""
+    """Return the findings that reach a level, worst first, with those marked that the options accept."""
     marked = [replace(one, accepted=catalogue()[one.code].accept in accepted) for one in found]
     return tuple(sorted(filter(level_of, marked), key=lambda one: -RANKS.index(level_of(one))))
 
@@ -158,7 +158,7 @@ def sentence(one: Finding) -> str:
 
 
 class Warned(str):
-    """Line on a finding that prevents the verdict pass: commands always print it."""
+    """Text of a finding that prevents the verdict pass; commands always print it."""
 
 
 def lines_of(found: Iterable[Finding]) -> list[str]:
@@ -193,7 +193,7 @@ def explain(code: str) -> str:
         return meaning
     if (entry := catalogue().get(code)) is None:
         near = suggestion(code, [*catalogue(), *glossary()])
-        raise UsageError(f"no finding or term '{code}'{near}; calib explain lists them")
+        raise UsageError(f"no finding or term is called '{code}'{near}; `calib explain` lists all")
     rules = [
         f"{level} where {value} > {limit:g}" for value, steps in entry.limits.items() for level, limit in steps.items()
     ]
@@ -203,7 +203,7 @@ def explain(code: str) -> str:
 
 
 def _filled(template: str, values: Mapping[str, Any]) -> str:
-    """Return a template with its values inserted; optional parts with a value None or empty are omitted."""
+    """Return a template with values inserted; an optional part ``<…>`` is left out if its value is None or empty."""
 
     def kept(part: re.Match[str]) -> str:
         needed = [name for _, name, _, _ in Formatter().parse(part[1]) if name]

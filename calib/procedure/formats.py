@@ -78,7 +78,7 @@ def describe(topic: str) -> str:
         UsageError: for an unknown topic, with the known ones.
     """
     if topic not in TOPICS:
-        raise UsageError(f"unknown format '{topic}'; known: {', '.join(TOPICS)}")
+        raise UsageError(f"unknown format '{topic}'; the known formats are {', '.join(TOPICS)}")
     parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1].split()]
     if topic == "session":
         from calib.procedure.session.settings import example
@@ -93,7 +93,7 @@ def describe(topic: str) -> str:
 
 
 def json_schema(topic: str) -> str:
-    """Return the JSON schema (draft 2020-12) of a TOML file, with which editors complete keys and check values.
+    """Return the JSON schema (draft 2020-12) of a kind of TOML file; editors use it to complete and check keys.
 
     Raises:
         UsageError: for a topic without one, with those that have one.

@@ -19,7 +19,7 @@ from calib.robot.chain import joint_kinds
 
 @dataclass(frozen=True)
 class Stage:
-    """Implementation of one command for a kind of robot.
+    """Implementation of one command for robots of one kind.
 
     Attributes:
         run: takes the robot and the arguments of the `calib` command; returns the same result type as for an arm.
@@ -69,16 +69,16 @@ class MechanismResult(Protocol):
     def verdict(self) -> Verdict: ...
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the same folder as the command."""
+        """Write the same result folder as `calib fit` or `calib identify`."""
         ...
 
     def with_unseen(self, unseen: Sequence[Any]) -> MechanismResult:
-        """Return the result with additional unseen files in its verdict; nothing is fitted or identified again."""
+        """Return the result with its verdict extended to more unseen files; nothing is fitted or identified again."""
         ...
 
 
 def mechanism(robot: object) -> Mechanism | None:
-    """Return the robot if `robot` is (or names) one that is not a serial arm; else None.
+    """Return `robot`, or the robot with that name or file, if it is not a serial arm; otherwise None.
 
     Raises:
         RobotError: for a file that contradicts itself.
@@ -89,7 +89,7 @@ def mechanism(robot: object) -> Mechanism | None:
 
 
 def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> Stage | None:
-    """Return the implementation of a command for a robot, `run` bound to that robot; None for serial arms.
+    """Return the implementation of a command for a robot (its `run` needs no robot argument); None for serial arms.
 
     Args:
         base, tip: links of a URDF; other robots have no such links.
@@ -112,7 +112,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
 
 
 def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
-    """Refuse settings that a stage does not read, unless they have their default or are switched off.
+    """Raise an error for settings that a stage does not use, unless they have the default value or are False.
 
     Args:
         settings, plain: dataclasses of one type: the given values, and the defaults.

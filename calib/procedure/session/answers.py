@@ -1,4 +1,4 @@
-"""Answers to `calib new`, by options or at a terminal; imports little, for a fast start of the command line."""
+"""Answers to `calib new`, given as options or at a terminal. This module imports little: `calib` starts fast."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +16,9 @@ Torques = Annotated[str, OneOf(("motor", "link", "both"))]
 @strict
 @dataclass(frozen=True)
 class Answers:
-    """Answers as typed; None: not answered.
+    """Answers to `calib new` as texts and numbers; None if not answered.
 
-    Of the cell, "unknown" says that it is not known and not checked, "none" that there is no such thing.
+    For the cell, "unknown" means not known and therefore not checked; "none" means that it does not exist.
 
     Attributes:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
@@ -60,5 +60,5 @@ class Answers:
 
     @property
     def cell(self) -> dict[str, Any]:
-        """The answers on the cell, by name."""
+        """The answers that describe the cell: option name -> answer."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

@@ -1,4 +1,4 @@
-"""The certificate of a session: both stages' findings gathered from its folders and printed on one page."""
+"""The certificate of a session: the results of both stages, read from the session's folders, on one page."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,14 +93,14 @@ def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
 
 
 def _with_arrival(section: Section, lines: list[str]) -> Section:
-    """Return a section, extended by the notes on its files that it does not contain yet."""
+    """Return a section with the missing notes on its input files appended."""
     said = {line for block in section.blocks if isinstance(block, Text) for line in block.lines}
     fresh = [line for line in dict.fromkeys(lines) if line not in said]
     return replace(section, blocks=[*section.blocks, Text("Notes on the files when they were read", fresh)])
 
 
 def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str, str]]:
-    """Return the rows of Setup (label, value), for geometry and dynamics as far as the session has them."""
+    """Return the rows (label, value) of the certificate's table "Setup", for the stages that the session has."""
     settings, chain = session.settings, chain_of(session)
     described = settings.robot.given if found else f"{settings.robot.given}, taken as calibrated"
     rows = [*(("simulated", line) for line in read_lines(session.path(MARK)))]
@@ -138,14 +138,16 @@ def _instrument(session: Session, found: FitMetrics) -> str:
     said, turned = instrument.measures, found.fit.calibrated.orientation_deg is not None
     used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
     other = used.get((said, turned))
-    measures = f"stated to measure {said}; the files contain {other}, which were used" if other else f"measures {said}"
+    measures = (
+        f"stated to measure {said}, but the files contain {other}; these were used" if other else f"measures {said}"
+    )
     stated = f"σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else "σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
     return f"{instrument.name}, {measures}, {stated}{turning}"
 
 
 def _named(paths: list[Path]) -> str:
-    """Return the file names as text, without dates: file dates are those of copying, not of measuring."""
+    """Return the file names as one text; no dates, since a file's date may be that of a copy."""
     return ", ".join(path.name for path in paths)
 
 
@@ -162,11 +164,11 @@ def _session_plan(session: Session) -> _Plan:
     path = session.path(SELECTION)
     if not session.settings.poses.plan or not path.exists():
         return _Plan("poses not planned here")
-    return read_json(path, "calib redo makes it again", _Plan)
+    return read_json(path, "repeat the step with `calib redo`", _Plan)
 
 
 def _filed(paths: list[Path]) -> list[Path]:
-    """Return the measured files to archive; for image folders the files of detected corners."""
+    """Return the measured files to archive; an image folder is represented by its file of detected corners."""
     own = [
         (path / CORNERS if (path / CORNERS).exists() else path / JOINTS) if path.is_dir() else path for path in paths
     ]
@@ -174,7 +176,7 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 
 def listed(session: Session) -> list[FileRow]:
-    """Return the input files of the certificate, those to archive first: name, content, bytes, SHA-256."""
+    """Return name, content, size [bytes] and SHA-256 of the certificate's files, the most important ones first."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
     filed = [

@@ -1,6 +1,6 @@
-"""The guided procedure behind the commands `calib new`, `next`, `status` and `redo`.
+"""The guided procedure of the commands `calib new`, `calib next`, `calib status` and `calib redo`.
 
-What a session asks of people, in two lines: what to do at the robot, and which file to bring, in which form.
+A waiting session prints two lines: what to do at the robot, and which file to provide in which format.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -132,7 +132,7 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
 UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}  # of a log: positions and torques
 LIMITS = "limits.toml"
 CAMERA_FILES = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
-HEAD = "# The cell, as stated to calib new; calib formats limits lists the possible keys.\n"
+HEAD = "# The cell, as given to `calib new`. `calib formats limits` lists the possible keys.\n"
 COLOURS = {
     **page.COLOURS, "done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow",
     "waits": "yellow", "after": "dim", "failed": "red",
@@ -141,7 +141,7 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class _Stop:
-    """The end of `go_on`: the waiting step, lines of instructions, and the verdict if the session is complete."""
+    """Result of `go_on`: the waiting step, instructions as lines, and the verdict if the session is complete."""
 
     session: Session
     waiting: State | None
@@ -187,7 +187,7 @@ def new_session(
     """
     stage_of(robot, "a guided session")
     device, source = instrument_named(instrument), resolve(robot)
-    words = "neither geometry nor dynamics are requested: choose an instrument, or identify the dynamics"
+    words = "neither geometry nor dynamics were requested: choose an instrument, or identify the dynamics"
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     copied, named = _limits(limits, chain, source, dynamics)
@@ -205,7 +205,7 @@ def new_session(
 def _limits(
     stated: str | Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
-    """Return the files to copy (name -> content) for the stated, checked limits, and the name of the limits file."""
+    """Return the files of the given limits (name -> path or text) after checking them, and the limits file's name."""
     if stated is None:
         return {}, ""
     if not isinstance(stated, Mapping):
@@ -227,7 +227,7 @@ def _limits(
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
-    """Run all steps that can run, and return where it stopped with instructions.
+    """Run all steps that have their inputs, and return the step that waits, with instructions.
 
     Args:
         folder: of the session.

@@ -1,4 +1,4 @@
-"""Steps of a session's dynamics: design motions, check recordings, identify, validate on unseen motion.
+"""Steps of a session for the dynamics: design motions, check recordings, identify, validate on unseen motion.
 
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
@@ -46,7 +46,7 @@ VALIDATION_SEED = 3  # added to the seed for the validation motion
 
 
 def options_of(session: Session) -> IdentifyOptions:
-    """Return the options of identification, from the options file or ``session.toml``; payloads by file name."""
+    """Return the identification options from the options file or ``session.toml``, with each recording's payloads."""
     section = session.settings.dynamics
     options = read_options(session.named(section.options))
     settings = options.settings
@@ -73,7 +73,7 @@ def excite(session: Session, say: Say) -> list[str]:
 
     section, notes, draw = session.settings.dynamics, [], None
     if not section.plan:
-        return ["no motion is designed: the recorded files contain other motions (plan = false)"]
+        return ["no motion was designed, since plan = false: the recordings may contain any motions"]
     if session.plots:
         from calib.procedure.report.motion_figures import write_design as draw
     limits = session.named(section.limits)
@@ -102,7 +102,7 @@ def excite(session: Session, say: Say) -> list[str]:
         said = (*designed.inputs.limits.bounds.lines(), *designed.notes)
         notes += [f"{name}: {note}" for note in said if first]
     if limits is None:
-        notes.append("only the robot's own limits were checked: watch for collisions, or state a limits file")
+        notes.append("only the limits in the robot's file were checked: watch for collisions, or give a limits file")
     return notes
 
 
@@ -175,7 +175,7 @@ def check_motion(
 
 
 def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | None) -> Finding:
-    """Return a finding on what a recording contains instead of the designed motion."""
+    """Return the finding that names what a recording contains instead of the designed motion."""
     if found is None and recording.duration < motion.period:
         return finding("motion-short", duration=recording.duration, period=motion.period)
     if found is None:
@@ -193,7 +193,7 @@ def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | 
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:
-    """Raise an error if recorded torques have reversed signs or other units than those of the nominal masses.
+    """Raise an error if recorded torques have the wrong sign or unit, compared with torques of the nominal masses.
 
     Raises:
         MeasurementError: if torques of heavily loaded joints are reversed, or of another magnitude.
@@ -229,13 +229,13 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
 
 
 def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
-    """Return the paths of recordings, each with the cut that contains the motion."""
+    """Return each recording's path with the time range of the motion appended, as ``log.csv@0:9``."""
     marked = {path: cuts.get(path.name) for path in paths}
     return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
-    """Return the training recordings and the held-out parts, as paths with cuts."""
+    """Return training recordings and held-out recordings, as paths with time ranges (``log.csv@0:9``)."""
     cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")
@@ -250,7 +250,7 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
 def _gathered(
     session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
 ) -> inputs.IdentificationInputs:
-    """Return the calibrated robot with its recordings (paths with cuts) for identification and validation."""
+    """Return the inputs of the identification: calibrated robot, training recordings, validation recordings."""
     options, seed = options_of(session), session.settings.seed
     return inputs.gather(session.fit.path, training, unseen, options=options, seed=seed, progress=say)
 
@@ -302,7 +302,7 @@ def predict(session: Session, say: Say) -> list[str]:
 
 
 def _as_delivered(session: Session, found: Assessment) -> Verdict:
-    """Return the verdict on the robot as exported; a model that cannot be exported is for prediction only."""
+    """Return the verdict on the exported robot; a model that cannot be exported is for prediction only."""
     from calib.procedure.export.delivery import Export, deliver
     from calib.procedure.export.delivery import prediction as prediction_of_export
 

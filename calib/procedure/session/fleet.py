@@ -1,4 +1,4 @@
-"""Parallel run of many sessions, one folder per robot: each runs as far as it can, a failure stops no other."""
+"""Parallel run of many sessions, one folder per robot; a session that fails does not stop the others."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -107,7 +107,7 @@ def run_sessions(
 def run(
     folders: Sequence[Path], workers: AbstractContextManager[Workers], command: str, plots: bool = True
 ) -> Iterator[FleetRow]:
-    """Run every session, and yield each outcome; on workers of other machines the folders must have the same paths."""
+    """Run every session and yield each outcome; workers on other machines need the folders at the same paths."""
     with workers as crew:
         sent = folders if crew.here else [folder.absolute() for folder in folders]
         for number, outcome in crew.completed(partial(run_one, command=command, plots=plots), sent):
@@ -117,7 +117,7 @@ def run(
 
 
 def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> FleetRow:
-    """Run one session as far as possible, its output written to ``run.log``. Only Ctrl-C leaves this function."""
+    """Run one session as far as possible, and write its output to ``run.log``. It raises nothing but Ctrl-C."""
     started, said = time.perf_counter(), []
     try:
         outcome = _go_on(folder, said.append, command, plots)
@@ -173,7 +173,7 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
-    """Return a line that counts the sessions by state and verdict."""
+    """Return one line with the number of sessions for each state and verdict."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
     judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
     words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)

@@ -90,7 +90,7 @@ class StateFile:
     running: Text = ""
 
     def without(self, *names: str) -> StateFile:
-        """Return the state without these steps and without a running one."""
+        """Return the state with the named steps and the running step removed."""
         return StateFile({name: record for name, record in self.steps.items() if name not in names})
 
     def notes(self, step: str) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ class StateFile:
 
 @dataclass(frozen=True)
 class Session:
-    """An open session: folder, current settings, and whether figures are drawn."""
+    """An open session: its folder, its settings, and whether figures are drawn."""
 
     folder: Path
     settings: SessionSettings
@@ -116,7 +116,7 @@ class Session:
 
     @property
     def links(self) -> dict[str, Any]:
-        """The arm's first and last link as given to `calib new`; None: as the robot's file says."""
+        """The arm's first and last link as given to `calib new`; None for those of the robot's file."""
         return {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
 
     @property
@@ -125,7 +125,7 @@ class Session:
         return self.path(self.settings.robot.file)
 
     def brought(self, *kinds: str) -> list[Path]:
-        """Return the user's files, and folders of images or bags, of these kinds (`BROUGHT`); files come first."""
+        """Return the user's files of these kinds (`BROUGHT`), and then the folders with images or bags."""
         result = []
         for folder, prefix in (BROUGHT[kind] for kind in kinds):
             others = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
@@ -136,23 +136,23 @@ class Session:
         return result
 
     def files_brought(self, kind: str) -> list[Path]:
-        """Return the user's files of a kind, folders expanded, without the corner files written by the toolkit."""
+        """Return the user's files of a kind, including those in folders, but not the toolkit's own corner files."""
         behind = (sorted(each for each in path.rglob("*") if each.is_file()) or [path] for path in self.brought(kind))
         return [each for paths in behind for each in paths if each.name != CORNERS]
 
     @property
     def dynamic(self) -> bool:
-        """Whether the dynamics are identified, too."""
+        """Whether the session identifies the dynamics."""
         return self.settings.dynamics.wanted
 
     @property
     def geometric(self) -> bool:
-        """Whether the geometry is fitted; else the described one is used."""
+        """Whether the session fits the geometry; otherwise it uses that of the robot's file."""
         return self.settings.instrument.measures != NOTHING
 
     @property
     def fit(self) -> FitFolder:
-        """Folder of the geometric fit; without one, of the robot as described."""
+        """Folder of the fitted geometry; without a fit, the folder of the nominal robot."""
         return FitFolder(self.folder / (IN_SESSION if self.geometric else AS_GIVEN))
 
     @property
@@ -175,7 +175,7 @@ class Session:
         files.write_json(self.path("state.json"), {"schema": SCHEMA, **plain(state)})
 
     def verdicts(self) -> Verdicts:
-        """Return the verdict of each stage; dynamics that were not exported are for prediction only."""
+        """Return the verdict of each stage; without an export, the dynamics are for prediction only."""
         geometry = self.validation.metrics() if self.geometric else None
         judged = {"geometry": geometry, "dynamics": self.identification.unseen.read() if self.dynamic else None}
         found = {stage: Verdict(one.verdict, one.reason) for stage, one in judged.items() if one}
@@ -262,7 +262,7 @@ def read_state(session: Session) -> StateFile:
     path = session.path("state.json")
     if not path.exists():
         return StateFile()
-    damaged = f"{path} is damaged ({{}}); delete it, and calib next repeats the steps"
+    damaged = f"{path} is damaged ({{}}); delete it, and `calib next` repeats the steps"
     with refused_as(SessionError, (OSError, ValueError, RecursionError), damaged):
         state = json.loads(path.read_text(encoding="utf-8"))
     check_schema(path, state.get("schema") if isinstance(state, dict) else None)
@@ -272,7 +272,7 @@ def read_state(session: Session) -> StateFile:
 
 @contextmanager
 def locked(session: Session, say: Say = print) -> Iterator[None]:
-    """Lock the session for one command; the lock of a killed command is taken over.
+    """Lock the session for one command; the lock of a killed command is replaced.
 
     The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
 

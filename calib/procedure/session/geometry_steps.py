@@ -1,6 +1,6 @@
-"""Steps of a session's geometry and its export, by the functions of the scriptable commands.
+"""Steps of a session for the geometry, and its export; they call the functions of `calib fit` and `calib export`.
 
-Which poses a session asks for: chosen ones for the fit, random ones within the same limits for validation.
+A session asks for two sets of poses: optimised ones for the fit, and random ones for validation.
 """
 
 import shutil
@@ -59,11 +59,11 @@ from calib.units import JOINT
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
 
-HOW = "state [camera] in the limits file: calib formats constraints"
+HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
 
 def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
-    """Choose poses as set in ``session.toml``, and write them, the run through them, and predicted sigmas."""
+    """Choose poses as set in ``session.toml``; write them, the order to drive them in, and the predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
     sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
@@ -114,7 +114,7 @@ def _seen_as(measures: str) -> str:
 
 
 def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
-    """Return random poses (count, n) within limits and constraints, with another random stream than the candidates."""
+    """Return random poses (count, n) within all limits, independent of the poses chosen for the fit."""
     if not count:
         return np.zeros((0, chain.n))
     cell = targets_of(chain, [session.settings.instrument.tool])
@@ -137,7 +137,7 @@ def chain_of(session: Session) -> Chain:
 
 
 def _options_of(session: Session) -> FitOptions:
-    """Return the fit options, with the instrument's sigmas for files that state none."""
+    """Return the fit options; files without a stated sigma get that of the instrument."""
     instrument = session.settings.instrument
     options = read_options(session.named(session.settings.fit.options))
     position, turn = instrument.sigma_position, instrument.sigma_orientation
@@ -168,7 +168,7 @@ def describe(session: Session, say: Say) -> list[str]:
     known = load_calibrated(session.robot_file, **session.links)
     session.fit.path.mkdir(exist_ok=True)
     calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
-    return [lines[0], "nothing is measured: the described geometry is used"]
+    return [lines[0], "nothing is measured: the geometry of the robot's file is used"]
 
 
 def select(session: Session, say: Say) -> list[str]:
@@ -220,7 +220,7 @@ def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMe
         if block.kind == IMAGES:
             found.append(needed("image_words")(block))
         elif measures == IMAGES:
-            found.append("not images, although the instrument is a camera; it is fitted")
+            found.append("contains no images, although the instrument is a camera; it is fitted all the same")
         found += block.notes
         if planned is not None:
             found += [*check_against(planned, block), *lines_of(readback(planned, block))]
@@ -229,7 +229,7 @@ def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMe
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
-    """Return findings on measured minus commanded joint values (m, n) [rad or m]; empty for other poses."""
+    """Return findings on measured minus planned joint values (m, n) [rad or m]; empty if all poses are others."""
     distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
     close = distance <= MAX_JOINT_DIFFERENCE
     if not close.any():
@@ -244,7 +244,7 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
 def drift(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
 ) -> list[Finding]:
-    """Return findings on drift: repeated poses at the end, and within each block.
+    """Return findings on drift, from poses measured again at the end and poses repeated within a block.
 
     Args:
         chain: the nominal arm.
@@ -264,7 +264,7 @@ def drift(
 
 
 def _fit_settings(session: Session) -> FitSettings:
-    """Return the fit settings of session.toml; values of ``auto`` are taken from the options file."""
+    """Return the fit settings of ``session.toml``; a value ``auto`` leaves the choice to the options file."""
     section = session.settings.fit
     model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
     return FitSettings(
@@ -275,7 +275,7 @@ def _fit_settings(session: Session) -> FitSettings:
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
-    """Return the robot with the fit's measurements, and with validation files if asked for."""
+    """Return the inputs of the fit: robot, measurements, and the given validation files."""
     chain, links = chain_of(session), session.links
     if session.robot_file.suffix == ".urdf":  # whatever joints the files' columns name
         links = {"base": chain.base, "tip": chain.tip}

@@ -1,4 +1,4 @@
-"""Questions of `calib new`: instruments by name, options or questions at a terminal, each answer checked."""
+"""Questions of `calib new`: the known instruments, the questions at a terminal, and the checks of the answers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -93,7 +93,7 @@ QUESTIONS = tuple(Question(one.name, DEFAULTS.get(one.name, "unknown")) for one 
 
 
 def with_answer(given: Answers, question: Question, text: str) -> Answers:
-    """Return the answers, extended by one.
+    """Return the answers with the text of one more answer added, after checking it.
 
     Raises:
         UsageError: for an invalid answer, with the valid form.
@@ -158,10 +158,10 @@ ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}
 
 
 def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
-    """Return the tables of a limits file from the answers to `calib new`; empty if nothing is known.
+    """Return the content of a limits file, from the answers on the cell; empty if nothing is known.
 
-    "unknown" is an answer to every question: what it is about is then not checked, and the certificate says so. "none"
-    says that there is no such thing, and nothing is missing.
+    Every question may be answered by "unknown": the subject is then not checked, and the certificate says so. "none"
+    means that it does not exist, so that nothing has to be checked.
 
     Args:
         answers: by the names of `calib.procedure.session.answers.Answers`.
@@ -241,7 +241,11 @@ def _file(read: str, text: str) -> str:
 
 def _turned(name: str, most: float, text: str, known: dict[str, str]) -> dict[str, list[float]]:
     """Return a placement with z along the viewing direction: that of the camera, or opposite to the board's normal."""
-    require("mounting" in known, "of the camera or of the board? State --mounting, too", ValueError)
+    require(
+        "mounting" in known,
+        "it is not known whether the arm carries the camera or the board; give --mounting, too",
+        ValueError,
+    )
     looks = (_mounting(known["mounting"]) == IN_HAND) == (name == "carried")
     spot, _, way = text.partition("facing")
     if not way.strip() and name == "stands":

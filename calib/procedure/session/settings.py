@@ -211,7 +211,7 @@ class DynamicsSection:
     def __post_init__(self) -> None:
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
-                f"period {self.period:g} s at rate {self.rate:g} Hz, {self.repeats} times: more than "
+                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times: more than "
                 f"{MAX_SAMPLES:.0e} samples"
             )
 
@@ -265,11 +265,11 @@ def check_schema(path: Path, found: Any) -> None:
     if isinstance(found, int) and found > SCHEMA:
         raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
     if found is None:
-        raise SessionError(f"{path} states no schema: was it truncated while copying? Copy the session again")
+        raise SessionError(
+            f"{path} contains no key 'schema', maybe since it was truncated while copying; copy the session again"
+        )
     known = " and ".join(map(str, READ))
-    raise SessionError(
-        f"{path}: schema {shown(found)} is unknown to this version, which reads {known}; make a new session"
-    )
+    raise SessionError(f"{path}: schema {shown(found)} is unknown, this version reads {known}; make a new session")
 
 
 def default_keys(section: str) -> dict[str, Any]:

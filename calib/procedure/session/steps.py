@@ -1,9 +1,9 @@
-"""Status of a session's steps: stale ones, waiting ones, and the run of the next one.
+"""Status of a session's steps (done, stale, waiting …), and the run of the next steps.
 
-A step is current while its inputs' fingerprints are those recorded when it was made. Outputs that a person has replaced
-are kept and said. Before a step runs, it is marked as running; a killed one is found marked and made again.
+A step is done while its inputs have the fingerprints that were recorded with it. Outputs that a person has replaced
+are kept and reported. A running step is marked; if its command was killed, the step is repeated.
 
-The steps of a session as a table: what each reads, its settings, what it makes and what people bring to it.
+`STEPS` lists the steps: the files that each reads and writes, its settings, and the files that people provide.
 """
 
 import json
@@ -97,7 +97,7 @@ class SessionStep:
 
 
 def _paths(session: Session, name: str) -> Iterator[Path]:
-    """Yield the files that a name in `reads` stands for."""
+    """Yield the paths of the files that one name in `SessionStep.reads` stands for."""
     left_out = () if session.geometric else FOLDERS["geometry"]
     left_out += () if session.dynamic else FOLDERS["dynamics"]
     if name in BROUGHT:
@@ -121,7 +121,7 @@ STEPS = (
         "select", "choose the poses to measure", geometry_steps.select, "robot:file poses:constraints",
         f"2-poses/{POSES} 2-poses/{WAYS} 2-poses/{UNSEEN} {SELECTION} {PREDICTED} {PREDICTION}",
         "robot instrument poses seed", "geometry",
-        kept=(("measured",), "files were measured at these poses (calib redo select: new poses)"),
+        kept=(("measured",), "files were already measured at these poses; `calib redo select` chooses new ones"),
     ),
     SessionStep(
         "measure", "check what was measured", geometry_steps.arrive,
@@ -133,14 +133,14 @@ STEPS = (
         "robot instrument fit seed", "geometry",
     ),
     SessionStep(
-        "validate", "judge it on unseen poses", geometry_steps.validate,
+        "validate", "validate the geometry on unseen poses", geometry_steps.validate,
         f"fit/robot.toml fit/report.json 2-poses/{UNSEEN}? fit:options validation", "5-validation/*",
         "robot instrument poses fit seed", "geometry", ("validation", "a file of measured validation poses"),
     ),
     SessionStep(
         "excite", "design the motions to record", dynamics_steps.excite, "fit/robot.toml dynamics:limits",
         "6-excitation/*/*", "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed", "dynamics",
-        kept=(("training", "unseen"), "files were recorded with these motions (calib redo excite: new motions)"),
+        kept=(("training", "unseen"), "files were already recorded with them; `calib redo excite` designs new motions"),
     ),
     SessionStep(
         "record", "check what was recorded", dynamics_steps.record,
@@ -153,7 +153,7 @@ STEPS = (
         f"fit/robot.toml {CUTS} dynamics:options training", "8-dynamics/*", f"dynamics.{MODEL} seed", "dynamics",
     ),
     SessionStep(
-        "predict", "judge it on unseen motion", dynamics_steps.predict,
+        "predict", "validate the dynamics on unseen motion", dynamics_steps.predict,
         "8-dynamics/robot.toml 8-dynamics/dynamics.json 8-dynamics/metrics.json "
         f"6-excitation/validation/{MOTION}? {CUTS} dynamics:options training unseen",
         "8-dynamics/unseen/*", f"dynamics.plan,validation,repeats,tolerance_percent,{MODEL} seed", "dynamics",
@@ -187,7 +187,7 @@ class State:
 
 
 def _steps_of(session: Session) -> tuple[SessionStep, ...]:
-    """Return the steps that a session with its settings has."""
+    """Return the steps of a session; its settings may exclude a stage."""
     left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric}
     return tuple(step for step in STEPS if not left_out.get(step.stage))
 
@@ -212,7 +212,11 @@ def states(session: Session) -> list[State]:
     """Return the status of every step."""
     recorded, result, current = read_state(session), [], True
     for step in _steps_of(session):
-        words = "completed before; an earlier step comes first" if step.name in recorded.steps else "comes later"
+        words = (
+            "was completed, but an earlier step has to be repeated first"
+            if step.name in recorded.steps
+            else "comes later"
+        )
         state = _state(session, step, recorded) if current else State(step, AFTER, words)
         result.append(state)
         current = current and state.kind in (DONE, KEPT)
@@ -268,7 +272,7 @@ def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 def _value(name: str, mark: str) -> Any:
-    """Return a fingerprint in comparable form; settings as values (3 equals 3.0), a missing key (``{}``) as default."""
+    """Return a fingerprint in comparable form: settings as values (3 equals 3.0), missing keys as their defaults."""
     if not name.startswith(SETTINGS):
         return mark
     section, _, key = name.removeprefix(f"{SETTINGS} [").partition("]")

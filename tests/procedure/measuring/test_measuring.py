@@ -115,7 +115,7 @@ def test_the_cell_as_told_becomes_tables():
         ({"box": "1,2,-1,1,0,2"}, "the robot's base, at 0,0, is outside"),
         ({"box": "1,-1,-1,1,0,2"}, "the smaller one first"),
         ({"mounting": "on top"}, "expected one of in hand, to hand"),
-        ({"carried": "0,0,0.1"}, "State --mounting, too"),
+        ({"carried": "0,0,0.1"}, "give --mounting, too"),
         ({"mounting": "in hand", "carried": "40,0,60"}, "are these mm"),
         ({"mounting": "in hand", "stands": "0.5,0,0"}, "and a direction"),
         ({"mounting": "in hand", "stands": "0.5,0,0 facing up"}, "--stands .*cannot read"),

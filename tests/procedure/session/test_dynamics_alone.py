@@ -99,7 +99,7 @@ def refuse(*arguments: object) -> None:
 
 def test_a_session_has_something_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for others, said in (
-        (("--instrument", "cmm"), "measures nothing"),
+        (("--instrument", "cmm"), "needs no instrument"),
         (("--geometry-only",), "neither geometry nor dynamics"),
     ):
         assert run("new", tmp_path / "cell", "--robot", "ur5", "--dynamics-only", *others) == 2
