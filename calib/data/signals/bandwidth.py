@@ -54,10 +54,13 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     Args:
         dynamics: f_dyn if known [Hz] (the bandwidth of the position loop); else estimated from the data.
     """
+    from scipy.signal import welch  # slow to load
+
     own = longest(sampled.segment)
     window_length = 4.0  # length of the spectra's windows [s]
     size = min(own.stop - own.start, max(64, int(window_length * sampled.rate)))
-    f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
+    overlap = size - size // 2
+    f, power = welch(sampled.series["q"][own], sampled.rate, "hann", size, overlap, detrend="linear", axis=0)
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
     active = _active(sampled.series["q"][own])
     read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
@@ -73,24 +76,6 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     band = USABLE * sampled.rate / (2 * factor)
     reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"]
     return Cutoffs(dynamics, position, band, factor, frozen(np.sqrt(floor * sampled.rate / 2)), tuple(reasons))
-
-
-def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (F,) [Hz] and one-sided power densities (F, n) [unit²/Hz] of `values` (N, n), by Welch.
-
-    Hann windows of `size` samples, half overlapping, each with its straight line subtracted.
-    """
-    window = np.hanning(size + 1)[:-1]
-    line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
-    starts = range(0, len(values) - size + 1, max(1, size // 2))
-    power = np.zeros((size // 2 + 1, values.shape[1]))
-    for start in starts:
-        own = values[start : start + size]
-        own = own - line @ (line.T @ own)
-        power += np.abs(np.fft.rfft(own.T * window, axis=1).T) ** 2
-    power *= 2 / (len(starts) * rate * (window**2).sum())
-    power[0] /= 2
-    return np.arange(size // 2 + 1) * rate / size, power
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.data.recordings.recording import Recording
-from calib.data.signals.bandwidth import propose_cutoffs, spectrum
+from calib.data.signals.bandwidth import propose_cutoffs
 from calib.data.signals.filtering import decimate
 from calib.data.signals.motion import FilterOptions, make_motion, moving, thin
 from calib.data.signals.persistency import repeats, report_excitation
@@ -214,16 +214,6 @@ def test_a_repeat_is_recognised_however_it_is_shifted():
     assert repeats(training, training) == 1.0
     assert repeats(training, slower) < 0.2
     assert repeats(training, other) < 0.2
-
-
-def test_the_spectrum_is_welchs():
-    from scipy.signal import welch
-
-    x = np.random.default_rng(5).normal(size=(3000, 2)) + np.arange(3000)[:, None] / 500
-    f, power = spectrum(x, 200.0, 400)
-    g, theirs = welch(x, 200.0, "hann", 400, axis=0, detrend="linear")
-    np.testing.assert_allclose(f, g)
-    np.testing.assert_allclose(power[:-1], theirs[:-1], rtol=1e-9, atol=1e-15)  # but for the Nyquist line, never used
 
 
 def test_velocities_of_quiet_encoders_keep_the_corner_that_friction_makes():
