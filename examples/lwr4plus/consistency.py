@@ -35,6 +35,7 @@ from calib.dynamics.torque_rows import torque_rows
 from calib.errors import TaskLost
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
+from calib.geometry.weighing import calibrated_chain
 from calib.identification import geometry_uncertainty
 from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
 from calib.identification.rows import Case, make_case
@@ -161,7 +162,7 @@ def cases_of(
 def calibrate(given: World, seed: list[int]) -> CalibratedChain:
     """Measure the poses and fit: the calibrated robot, with the covariance of its elements."""
     measured = measure(given.cell, given.poses, np.random.default_rng([*seed, 1]))
-    return fit(install(given.cell.nominal, [measured]), [measured]).calibrated
+    return calibrated_chain(fit(install(given.cell.nominal, [measured]), [measured]))
 
 
 def once(given: World, seed: list[int]) -> np.ndarray:
