@@ -32,7 +32,7 @@ LEFT = 1.6  # by which relative gains are further off than noise and blocks of t
 
 @dataclass(frozen=True, eq=False)
 class DriveGains:
-    """Drive gains with the other results of their estimation.
+    """Estimated drive gains with covariance, and the other parameters of the fit.
 
     Attributes:
         gains: (n,) torque per current [N m/A or N/A].
@@ -169,7 +169,7 @@ def identify_gains(
 
 
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
-    """Return gains relative to one joint's; those that the motion does not identify are set to one.
+    """Return the gains relative to that of a reference joint; gains that the motion does not identify are set to one.
 
     Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
     which sees part of what the model leaves, times `LEFT`. A gain is identified where its sigma is below `max_sigma` of

@@ -97,7 +97,7 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
 
 
 def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return the change of φ (p,) without the rows of nearly standing joints; for models with one row per joint."""
+    """Return the change of the estimate (p,) if the rows of nearly standing joints are left out."""
     how, decimator = estimator(found), common_decimator(cases, found.settings)
     faster = [
         replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
@@ -124,7 +124,7 @@ def stacked(rows: ObservationRows) -> np.ndarray:
 
 
 def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
-    """Return 1 / deviation (or 1 / `by`) of each stacked row; zero for rows not used in training."""
+    """Return the weight of each stacked row, 1 / deviation (or 1 / `by`); zero for rows not used in training."""
     return (rows.present / (how.deviation if by is None else by)).ravel()
 
 
@@ -172,7 +172,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def sigma_geometry(self) -> np.ndarray:
-        """Standard deviation by the geometry (p,), zero where the geometry is taken as exact."""
+        """Standard deviation (p,) of the parameters due to the uncertain geometry; zero if it is taken as exact."""
         if self.geometry is None:
             return np.zeros(len(self.names))
         return np.sqrt(np.clip(np.diag(self.geometry), 0.0, None))
@@ -195,7 +195,7 @@ class GeometryUncertainty(Frozen):
 def propagate(
     found: Identification, robot: Chain | CalibratedChain, cases: Sequence[Case], progress: Progress | None = None
 ) -> GeometryUncertainty:
-    """Return the contribution of a calibrated geometry's covariance to that of the identified dynamics.
+    """Return the share of the identified parameters' covariance that comes from the covariance of the geometry.
 
     Args:
         found: the identification.
@@ -257,7 +257,7 @@ def sensitivity(
 
 
 def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
-    """Return pairs of bodies with each element, then each tilt of gravity, `STEP` above and below its value."""
+    """Return pairs of bodies with one geometric element or one tilt of gravity changed by `STEP` up and down."""
 
     def moved(step: np.ndarray) -> Bodies:
         return make_model(chain.with_values(np.array(chain.values) + step), found.settings).bodies
@@ -359,7 +359,7 @@ class GeometryComparison:
 def compare(
     found: Identification, carried: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
 ) -> GeometryComparison:
-    """Return the comparison of the estimate with one from the same columns and torques on the nominal geometry.
+    """Return the comparison of the estimate with one from the same torques on the nominal geometry.
 
     Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
     """

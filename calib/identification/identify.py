@@ -205,7 +205,7 @@ def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
 def find_base(
     model: RegressorModel, cases: Sequence[Case], states: States, nominal: RegressorModel | None = None
 ) -> Base:
-    """Return base columns of a model over states and the cases' payloads, selected and regrouped on the nominal one."""
+    """Return the base columns of a model, selected over states and payloads on the nominal geometry if one is given."""
     loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
     found = bases.find(model if nominal is None else nominal, states, loads)
     return found if nominal is None else bases.regroup(found, model, states, loads)
@@ -218,7 +218,7 @@ def _known_masses(chain: Chain) -> np.ndarray | None:
 
 
 def _torque_limits(chain: Chain) -> np.ndarray | None:
-    """Return the joints' torque limits (n,) from the robot's description; None unless all are stated."""
+    """Return the joints' torque limits (n,) from the robot's description; None if any limit is missing."""
     limits = np.array([joint.effort for joint in chain.joints])
     return limits if (np.isfinite(limits) & (limits > 0.0)).all() else None
 
@@ -292,7 +292,7 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the torque noise (rows,) from repeats of the motion, mean square over the cases; None if not requested.
+    """Return the torque noise (rows,) estimated from repeats of the motion (rms over the cases); None if not requested.
 
     Raises:
         UsageError: for another method than WLS, or rows with torques that no variance is read for.
@@ -302,7 +302,7 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
         return None
     if not method_named(settings.method).takes_prior or not settings.torque_rows.motors_alone:
         raise UsageError(
-            f'weights = "repeats" requires method wls and rows motor, found {settings.method} and '
+            f'weights = "repeats" needs method wls and rows motor; the options state {settings.method} and '
             f"{settings.torque_rows.name}"
         )
     for case in cases:

@@ -127,7 +127,7 @@ Gains = Annotated[tuple[float, ...], Expect("a list of finite numbers other than
 @strict
 @dataclass(frozen=True)
 class FileSettings:
-    """Settings of one recording: reader's options, filters, payload labels, gains, and the file of its reference."""
+    """Settings of one recording: how it is read and filtered, payload labels, gains, and the file of its reference."""
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)

@@ -135,7 +135,7 @@ def check_loop(table: Any) -> Any:
     for other, keys in OWNED.items():
         wrong = [key for key in keys if key in table and key not in OWNED[kind]]
         if wrong:
-            raise ValueError(f"'{wrong[0]}' belongs to controller '{other}', found controller '{kind}'")
+            raise ValueError(f"'{wrong[0]}' is a key of controller '{other}', but controller = '{kind}' is stated")
     for key in NEEDED[kind]:
         if key not in table:
             raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; '{key}' is missing")
@@ -226,7 +226,7 @@ class ExogeneityTest:
 
 @dataclass(frozen=True, eq=False)
 class LoopMetrics:
-    """Results of a test of an estimate with instruments from a simulated loop.
+    """Results of testing an estimate with instrumental variables from a simulated closed loop.
 
     Attributes:
         failure: why there are no instruments.
@@ -262,7 +262,7 @@ class LoopMetrics:
 
 @dataclass(frozen=True)
 class LoopDisagreement:
-    """Comparison of an estimate that relies on the stated loop with one that does not.
+    """Differences between an estimate that simulates the stated loop and one that does not.
 
     Attributes:
         method, beside: methods of the two estimates.
@@ -282,7 +282,7 @@ class LoopDisagreement:
 
 @dataclass(frozen=True, eq=False)
 class LoopResults:
-    """Results of simulating the recordings' closed loop beside an estimate; empty where no loop is stated.
+    """Results of simulating the closed loop of the recordings; empty if no loop is stated in the options.
 
     Attributes:
         metrics: as ``metrics.json`` stores them; None without a loop.
@@ -324,5 +324,5 @@ class Replay:
 
     @stored
     def feedback_over_model(self) -> float:
-        """Tracking error of feedback alone over that with the model fed forward, geometric mean over the joints."""
+        """Ratio of the tracking errors without and with the model as feedforward, geometric mean over the joints."""
         return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))

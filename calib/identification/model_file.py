@@ -145,13 +145,13 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
 
 
 def regrouping(base: Base) -> dict[str, dict[str, float]]:
-    """Return base parameter → standard parameter → its coefficient."""
+    """Return for each base parameter its standard parameters and their coefficients."""
     rows = zip(base.names, base.transform)
     return {name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)} for name, row in rows}
 
 
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
-    """Return the model from a table of `to_table`, on the chain of that model."""
+    """Return the model of a chain from a table that `to_table` made."""
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)

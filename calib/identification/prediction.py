@@ -176,7 +176,7 @@ def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[f
 
 
 def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErrors:
-    """Return the errors of all rows from their sums (3,); the total excludes the rows `apart`."""
+    """Return prediction errors from the sums (3,) of each torque row; the total excludes the rows `apart`."""
     square, size, count = np.array(sums).T
     alike = ~np.isin(np.arange(len(square)), apart)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -215,7 +215,7 @@ class Dynamics(Frozen, Generic[Model]):
     values: np.ndarray
 
     def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
-        """Return the torques (N, n) that the gears transmit to the bodies; load-dependent friction needs them."""
+        """Return the torques (N, n) that the gears transmit to the bodies, for load-dependent friction."""
         model, motion = self.model, case.motion
         result = np.empty(motion.q.shape)
         for start in range(0, len(motion), BLOCK):

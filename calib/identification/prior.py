@@ -98,7 +98,7 @@ class Prior:
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
     def widened(self, more: int) -> np.ndarray:
-        """Return these rows with zeros for `more` columns after the base columns."""
+        """Return the prior's rows with `more` zero columns inserted after the base columns."""
         return np.insert(self.rows, [len(self.own)] * more, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
@@ -191,7 +191,7 @@ def find_prior(
 
 
 def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
-    """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a fit that always exists."""
+    """Return a minimum-norm fit: standard deviation and inflation of its residuals (rows,), and values (b,)."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
     std, tau = np.ones(count), np.ones(count)
@@ -229,7 +229,7 @@ def weighing(
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the stated noise (rows,) times a common factor from the residuals' `std`; without it, `std`.
+    """Return the stated noise (rows,) scaled to the residuals by one common factor; `std` if no noise is stated.
 
     Relative between joints, with a common scale (our choice): the variance over repeats does not see what every period
     has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
@@ -270,7 +270,7 @@ def _kind(term: DriveTerm) -> str:
 
 
 def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, more: np.ndarray) -> _Sizes:
-    """Return the kinds of parameters and the prior of their sizes; the groups of `more` have no names."""
+    """Return the kinds of parameters with the prior of their sizes; groups in `more` have no names."""
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
     kinds += [_kind(one) for one in model.columns]
     own = tuple(dict.fromkeys(kinds))
@@ -314,7 +314,7 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
 def _whitened(
     factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return R, the solution, the posterior root's inverse, and log det, in units of the prior's deviations."""
+    """Return R, the solution, the inverse root of the information, and log det, in units of the prior's deviations."""
     b, p = columns.shape
     own = factor[:b, :b] @ (columns * deviations)
     stacked = np.zeros((b + p, p + 1))

@@ -194,7 +194,7 @@ def observe_terms(
     terms: Sequence[DriveTerm], case: Case, decimator: Decimator, load: np.ndarray | None = None,
     torque_rows: TorqueRows = MOTOR,
 ) -> np.ndarray:  # fmt: skip
-    """Return the columns of drive terms (M, rows, k), filtered and decimated; for rows without a projection.
+    """Return the regressor columns of drive terms (M, rows, k), filtered and decimated.
 
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
     """

@@ -153,7 +153,7 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 
 
 def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:
-    """Return the settings of a method that simulates, with standard friction, which can be simulated.
+    """Return the settings for a method that simulates: with standard friction only.
 
     Args:
         with_loop: whether it simulates the closed loop, or the robot alone.
@@ -174,5 +174,5 @@ def require_simulable(settings: IdentificationSettings, with_loop: bool) -> Iden
         )
     if settings.friction not in ("auto", "standard"):
         words = f"simulates standard friction only, not friction = '{settings.friction}'"
-        refuse_option(place, f"{words}; use wls, which is tested for bias if a [loop] is stated")
+        refuse_option(place, f"{words}; use wls (with a [loop], it is tested for bias)")
     return replace(settings, friction="standard")

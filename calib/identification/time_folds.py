@@ -94,7 +94,7 @@ class CrossValidation:
     _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
-        """Return the squared errors (blocks, rows) on each block by a model with these columns fitted to the others.
+        """Return the squared errors (blocks, rows) on each held-out block of a model with these columns.
 
         Squares are of samples, not whitened; blocks that a recording's gaps left empty hold zeros.
 
@@ -113,7 +113,7 @@ class CrossValidation:
         return self._known[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (regimes, rows) in each regime by a model with these columns fitted to the rest."""
+        """Return the squared errors (regimes, rows) in each held-out regime of a model with these columns."""
         assert self.regimes is not None
         index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
@@ -139,7 +139,7 @@ class CrossValidation:
         return result
 
     def _fitted(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the least-squares fit to the blocks outside each run, from their triangles."""
+        """Return for each run of blocks the least-squares fit to all other blocks."""
         chosen, group = self.data.select(columns), self.group[columns]
         prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
         folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
@@ -147,7 +147,7 @@ class CrossValidation:
         return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
 
     def _regularised(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the ridge estimates from the blocks outside each run, computed from [W y]ᵀ[W y]."""
+        """Return for each run of blocks the ridge estimate from all other blocks."""
         index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
         squares = self._squares.take(index, 1).take(index, 2)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]

@@ -100,7 +100,7 @@ def parameter_variances(
 
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
-    """Return the uncertainty in ``covariance.csv`` of an identification; None without the file."""
+    """Read the covariance of an identification's parameters from its folder; None without the file."""
     if not (folder / COVARIANCE).is_file():
         return None
     names, covariance = read_covariance(folder)
@@ -111,7 +111,7 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
 
 COVERED, SIGMAS = 0.95, 1.96
 OPTIMISM = 0.6
-"""Factor on the deviations between blocks by which errors on other motion exceed those on held-out time.
+"""Factor by which errors on other motion exceed those on held-out time, on the deviations between blocks.
 
 Friction and filters were chosen on that time, too. It holds 95 % on average over two kinds of pairs that count alike:
 33 of parts of real recordings (1.35 to 50 s to learn from; 92.5 %) and 14 of simulated arms, which are the same on
@@ -151,7 +151,7 @@ class TorqueDiscrepancy:
         return np.log1p(np.broadcast_to(away.sum(axis=1)[:, None], (len(q), rows)) if left else np.tile(away, own))
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return whether states leave the training range, by q, v, a and joint (3, N, n) bool."""
+        """Return the mask (3, N, n) of states outside the training range, by q, v, a and joint."""
         max_outside = 0.05  # of what was learnt from, by which a motion may leave it before that is said (our choice)
         return self._outside(q, v, a) > max_outside * (np.array(self.upper) - np.array(self.lower))[:, None]
 
@@ -195,7 +195,7 @@ class TorqueErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class TorqueIntervals:
-    """Predicted intervals of a model's errors on one recording and whether they contain the errors, at M samples.
+    """Predicted error intervals of a model on one recording, and whether they contain the errors, at M samples.
 
     Attributes:
         index: (M,) indices of the samples.
@@ -238,7 +238,7 @@ class TorqueIntervals:
         return np.asarray(self.extrapolated.any(axis=(0, 2)))
 
     def coverage(self) -> IntervalCoverage:
-        """Return the shares of errors within their intervals, as a record."""
+        """Return the record of the shares of errors within their intervals."""
         return IntervalCoverage(
             100.0 * self.covered, 100.0 * self.joints, self.median, int(self.known.sum()),
             100.0 * float(self.beyond.mean()),
@@ -255,7 +255,7 @@ class TorqueIntervals:
 
 
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
-    """Return the intervals of a model's errors on a recording, compared with those of its prediction (N, rows)."""
+    """Return the error intervals of a model on a recording, compared with the errors of `predicted` (N, rows)."""
     motion = case.motion
     max_samples = 5000  # samples of a recording that intervals are evaluated at
     index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), max_samples)).astype(int))
@@ -270,7 +270,7 @@ def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicte
 def learn_torque_errors(
     found: Identification, cases: Sequence[Case], covariance: np.ndarray | None = None
 ) -> TorqueErrorModel | None:
-    """Return a model of the torque's errors estimated from those on held-out time; None where this is too short.
+    """Return a model of the torque errors, estimated on held-out time; None if the recordings are too short.
 
     Args:
         found: the model and its rows.
@@ -326,7 +326,7 @@ class _Samples:
     values: np.ndarray
 
     def box(self, chosen: np.ndarray | slice = slice(None)) -> TorqueDiscrepancy:
-        """Return the range of the selected states, without expected errors, in units of the variation of all states."""
+        """Return the range of the selected states with the standard deviation of all states; error terms are empty."""
         own = self.states[:, chosen]
         edges = own.min(axis=1), own.max(axis=1), np.maximum(self.states.std(axis=1), 1e-6)
         return TorqueDiscrepancy((), (), (), *(tuple(map(tuple, one.tolist())) for one in edges))
@@ -376,7 +376,7 @@ def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
 
 
 def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (p,) estimated from some blocks with prior and ridges, and a root (p, k) of their covariance."""
+    """Return the values (p,) estimated from some time blocks, and a root (p, k) of their covariance."""
     fitted, b = found.fitted, found.base.b
     group = np.concatenate([np.full(b, -1), np.asarray(found.friction.groups, dtype=int)])
     prior = None if found.prior is None else found.prior.widened(len(group) - b)
@@ -413,7 +413,7 @@ def _left_out(
 
 
 def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors_used: int = 4000) -> np.ndarray:
-    """Return weights (rows, 3) of the errors' variance terms, each row's regularised towards those of all rows.
+    """Return the weights (rows, 3) of the error variance's terms, regularised towards those of all rows.
 
     In units of a row's own mean square every row's κ, and its u over v, are of one kind. Behind a row's errors stand
     those of all others, worth `BORROWED` blocks, and what is known beforehand: the covariance is as it says, worth a
@@ -454,7 +454,7 @@ def _weights(folds: Sequence[tuple[np.ndarray, np.ndarray]], blocks: int, errors
 def _in_units(
     folds: Sequence[tuple[np.ndarray, np.ndarray]], row: int, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the log size of a row's errors in each fold, relative to the weights (3,), and normalised errors."""
+    """Return for one row the log rms of error over predicted sigma in each fold, and the normalised errors."""
     each = [(error[:, row] ** 2, shapes[:, row] @ weights) for error, shapes in folds]
     least = max(MIN_ERROR**2 * float(np.mean(np.concatenate([square for square, _ in each]))), 1e-30)
     units = [np.sqrt(square / np.maximum(own, least)) for square, own in each]

@@ -191,7 +191,7 @@ REFUSED = [
     ({}, 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "2 values for 3 joints"),
     ({}, 'controller = "pd"\nkp = [1]\n', "needs kp and kd"),
     ({}, 'controller = "pid"\n', "one of pd, cascade, identify"),
-    ({}, GAINS + "reset = 1.0\n", "belongs to controller 'cascade'"),
+    ({}, GAINS + "reset = 1.0\n", "is a key of controller 'cascade'"),
     ({}, "kp = [1]\n", "'controller' is missing"),
     ({}, GAINS + 'reference = "nowhere.csv"\n', "cannot be read"),
     ({}, GAINS + 'reference = "short.csv"\n', "do not span"),

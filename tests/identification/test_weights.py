@@ -61,7 +61,7 @@ def test_the_file_and_the_option_reach_the_weights(tmp_path, prior):
 
 
 @pytest.mark.parametrize(
-    ("content", "method", "said"), [({}, "wls", "has no variances"), (averaged(), "ols", "requires method wls")]
+    ("content", "method", "said"), [({}, "wls", "has no variances"), (averaged(), "ols", "needs method wls")]
 )
 def test_what_cannot_be_weighed_so_is_refused(robot, tmp_path, capsys, content, method, said):
     path, options = planted.write(tmp_path, "avg.npz", 0, **content), tmp_path / "options.toml"

@@ -1,4 +1,4 @@
-"""Checks of a recording: does it contain the designed motion, or which other one, and do its torques fit the masses?
+"""Checks of a recording against the designed motion and the robot's nominal masses.
 
 Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions. What quick
 looks at torques share stands here, too: a few samples of a recording, and how much columns explain of its torques.
@@ -76,7 +76,7 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
 
 
 def another_motion(recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]) -> Change | None:
-    """Return what a recording contains instead of the designed motion; None if no tested change explains it.
+    """Return the change of the designed motion that explains a recording, e.g. other units; None if no tested one does.
 
     Args:
         recording: of n joints.
@@ -113,7 +113,7 @@ def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _coarse(t: np.ndarray, max_gap: float = 60.0) -> np.ndarray:
-    """Return times every `STEP` over the sample times (N,) [s]; of a gap, only its first `max_gap` seconds are covered.
+    """Return a time grid with spacing `STEP` [s] over sample times (N,); gaps longer than `max_gap` are cut to that.
 
     `max_gap`: between samples that the grid bridges [s]; a log may go on after weeks.
     """
@@ -127,7 +127,7 @@ def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
-    """Return the positions of one period about every `STEP`, without the last, at `speed` times the designed speed."""
+    """Return the positions (P, n) of one period of a motion, sampled about every `STEP`, at `speed` times its speed."""
     count = round(motion.period / speed / STEP)
     return motion.orders(np.arange(count) * motion.period / count)[0]
 
@@ -141,13 +141,13 @@ def _found(q: np.ndarray, reference: np.ndarray, min_likeness: float = 0.9) -> R
 
 
 def _unlike(data: Pair) -> np.ndarray:
-    """Return the share (1,) of a motion's variance that no recorded period explains; 1 if the motion does not occur."""
+    """Return the share (1,) of a motion's variance that the worst recorded period leaves unexplained; 1 without one."""
     found = _found(*data)
     return np.array([1.0 if found is None else max(1.0 - min(found.likeness), 1e-9)])
 
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the recorded column (n,) and sign (n,) that correlate best with each joint's motion, over all shifts."""
+    """Return for each joint the recorded column (n,) and its sign (n,) that correlate best with the designed motion."""
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
     for j in range(n):
@@ -164,7 +164,7 @@ def share_of_nominal(
     t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
     static: bool = False,
 ) -> np.ndarray:  # fmt: skip
-    """Return recorded gravity torques over those of the nominal masses (n,), with friction estimated.
+    """Return the ratios (n,) of recorded torques to those of the nominal masses, with friction estimated as well.
 
     Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
     rigid-body torque is more than `min_torque` of its limit and the partial correlation of both torques is above
@@ -206,7 +206,7 @@ def share_of_nominal(
 
 
 def bodies_under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
-    """Return the bodies of a chain under a stated gravity [m/s²]; None: the chain's own."""
+    """Return the bodies of a chain with a gravity vector [m/s²]; with None, that of the chain."""
     bodies = bodies_of(chain)
     return bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))
 

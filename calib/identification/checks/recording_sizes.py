@@ -52,7 +52,7 @@ class ClockRatio:
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
-    """Return the ratio of inertias to masses; None where the motion or the arm does not identify both.
+    """Return the ratio of inertias to masses; None if the motion or the arm does not identify both.
 
     Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
     gravity beside any torque of motion; drives free in both.
@@ -94,7 +94,7 @@ def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray, rounds: in
 
 
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
-    """Return the joints with reversed torques, or with positions relative to another joint's; None if all are right.
+    """Return the joints with reversed torques or with positions coupled to another joint; None if all joints are right.
 
     One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
     negative, since no drive brakes backwards. The robot's own masses need not be known. What is left are shares of the
@@ -120,7 +120,7 @@ def wrong_joints(samples: MotionSamples) -> Explanation | None:
 
 
 def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of the torques' signs (n,) to the unexplained share of each joint's torque variance (n,)."""
+    """Return a function from torque signs (n,) to the unexplained share of each joint's torque variance (n,)."""
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
@@ -143,7 +143,7 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints, or shift of one joint's zero, that best explains the torques, or None.
+    """Return the exchange of two joints or the zero offset of one that best explains the torques; None if none does.
 
     The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
     """
@@ -197,7 +197,7 @@ FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are 
 
 @dataclass(frozen=True)
 class RecordingSizes:
-    """Comparison of a recording with its stated robot.
+    """Results of comparing a recording with the robot's description: masses, limits, velocities, lag and clock.
 
     Attributes:
         name: name of the case.
@@ -232,7 +232,7 @@ class RecordingSizes:
 def compare_sizes(
     case: Case, chain: Chain, gravity: Sequence[float] | None = None, newtons: bool = True
 ) -> RecordingSizes:
-    """Compare a recording of the motors' torques with its robot.
+    """Return a comparison of recorded motor torques, velocities and time stamps with the robot's description.
 
     Args:
         case: a recording.
@@ -264,7 +264,7 @@ def compare_sizes(
 
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
-    """Return joints with reversed torques, or positions relative to another joint's; see `compare_sizes`."""
+    """Return the joints of a recording with reversed torques or coupled positions; None if it is too short."""
     few = take_samples(case, bodies_under(chain, gravity), MAX_SAMPLES)
     return None if few is None else wrong_joints(few)
 
@@ -272,7 +272,7 @@ def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -
 def _speed_ratio(
     t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n,) ratios of measured velocities to slopes of the positions (N, n), their sigmas, and the correlations.
+    """Return ratios of measured velocities to differentiated positions, their sigmas, and correlations, (n,) each.
 
     That is ∫v dt on q, both without their trend: integrals compare where slopes are noise; each segment (N,) by itself,
     since nobody knows the speed in a gap. Of a short motion little is left beside its trend, while an error of the

@@ -72,7 +72,7 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
 
 
 def _alone(whole: Lag, halves: Sequence[Lag], max_lag_difference: float = 0.5) -> int | None:
-    """Return the only joint whose lag differs, in the whole recording and in both halves; None if no joint does.
+    """Return the one joint whose lag differs from the common lag in both halves of the recording; None without one.
 
     `max_lag_difference`: share of that lag by which those of both halves may differ from it.
     """
@@ -92,7 +92,7 @@ def _part(samples: MotionSamples, part: slice) -> MotionSamples:
 
 
 def _lag_in(samples: MotionSamples, rate: float, rounds: int = 4, lag_sigma: float = 0.005) -> Lag:
-    """Return the least-squares lag, with a sigma from the spread between joints.
+    """Return the least-squares lag of the samples, with its sigma from the spread between joints.
 
     `rounds`: of weighing joints by what is left of them.
 
@@ -165,7 +165,7 @@ class _Fit:
         return places
 
     def gain(self, places: np.ndarray, joint: int, common: int) -> float:
-        """Return the residual of a joint at the common lag over that at its separate one; `places` (n,): all lags."""
+        """Return the ratio of a joint's residuals at the common lag and at its own lag; `places` (n,): all lags."""
         along, own = self.along(places, joint), float((self.left(places)[joint] ** 2).sum())
         return float(np.sqrt(1.0 + max(along[common] - along[places[joint]], 0.0) / max(own, 1e-300)))
 
@@ -180,7 +180,7 @@ class _Fit:
 
 
 def _turning(samples: MotionSamples, rate: float, free_time: float = 0.03) -> list[np.ndarray]:
-    """Return friction columns (m, n, n) whose sign changes early, and late.
+    """Return two friction regressors (m, n, n) whose sign changes `free_time` too early, and too late.
 
     `free_time`: by which friction may turn over early or late by itself [s].
     """

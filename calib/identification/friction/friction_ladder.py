@@ -83,7 +83,7 @@ class FrictionSelection:
     off: tuple[str, ...] = ()
 
     def fitted(self, sigma: np.ndarray) -> FrictionSelection:
-        """Return the selection after the final fit, from its terms' σ (k,): terms switched off are no longer kept."""
+        """Return the selection without the terms that the final fit switched off, from the σ (k,) of its terms."""
         min_sigma = 1e-9  # σ of a term below which its ridge holds it at zero
         off = tuple(one.name for one, own in zip(self.terms, sigma, strict=True) if own < min_sigma)
         joints = {one.name: _joints(one) for one in self.terms if one.name not in off}
@@ -266,7 +266,7 @@ def _flat(at: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether a joint's rms error, each half of the time predicted by the other, grew by `MIN_GAIN` at most."""
+    """Return whether the rms error of cross-validation with two halves grew by at most the share `MIN_GAIN`."""
     return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
 
 
@@ -277,7 +277,7 @@ def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _pays(before: np.ndarray, after: np.ndarray, min_blocks_won: float = 0.6) -> bool:
-    """Return whether a joint's squared errors per block decreased enough, and on enough blocks.
+    """Return whether the squared errors per time block decreased by enough in total, and on enough blocks.
 
     `min_blocks_won`: smallest share of blocks with a smaller error.
     """
@@ -303,7 +303,7 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
 
 
 def _couplings(candidates: FrictionCandidates, min_explained: float = 0.05) -> list[DriveTerm]:
-    """Return coupling terms of neighbouring joints that explain both residual torques of the standard model.
+    """Return the coupling terms of neighbouring joints that explain residual torques of the standard model.
 
     A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
 

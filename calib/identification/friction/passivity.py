@@ -71,7 +71,7 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
 
 
 def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
-    """Return for each joint whether its friction adds energy (n,) bool."""
+    """Return the mask (n,) of joints whose identified friction adds energy."""
     return np.asarray(_dissipated(dynamics, cases) < MIN_ENERGY_SHARE)
 
 

@@ -76,7 +76,7 @@ class Ripple:
 
     @property
     def found(self) -> RippleWaves:
-        """The waves and the share that they explain, as a record."""
+        """Record of the waves and of the share of the residual that they explain."""
         return RippleWaves(self.joint + 1, tuple(GearWave(j + 1, order) for j, order in self.waves), self.share)
 
 
@@ -136,7 +136,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
 
 
 def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
-    """Return the ripple in a joint's torque if held-out blocks confirm it, or None.
+    """Return the ripple in a joint's torque; None if held-out time blocks do not confirm it.
 
     Args:
         residual: (N,) torque not explained, without its slow part, at the samples of `track`.
@@ -174,7 +174,7 @@ def _family(n: int) -> tuple[tuple[int, ...], ...]:
 def _terms(
     joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None
 ) -> tuple[DriveTerm, ...]:
-    """Return the terms of the ripple in a joint's torque, wave by wave; without a track, valid at all positions."""
+    """Return the drive terms of a joint's ripple, wave by wave; without `track` they hold at all positions."""
     edges = (0.0, *nodes, np.inf)
     found = []
     for source, order in waves:

@@ -22,7 +22,7 @@ from calib.records import Frozen
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """Tangent plane of the cone at an optimum: normal ν (p,), bound νᵀ β*, and the labels of bodies on the border."""
+    """Tangent plane of the cone at an optimum β*: normal ν (p,), bound νᵀ β*, labels of the bodies on the border."""
 
     normal: np.ndarray
     bound: float
@@ -31,7 +31,7 @@ class _Plane:
 
 @dataclass(frozen=True, eq=False)
 class BodyCone(Frozen):
-    """Base parameters that physically consistent bodies and drives can have.
+    """Convex cone of the base parameters that physically consistent bodies and drives can have.
 
     Attributes:
         transform: T (b, P) of the standard parameters, ten by body, then the drives' terms.

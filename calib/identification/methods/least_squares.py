@@ -78,7 +78,7 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
 
 
 def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals' std and inflation (rows,) of a problem whose data identify every parameter."""
+    """Return the standard deviation and variance inflation (rows,) of a problem's residuals by WLS without a prior."""
     pooled, noise = problem.pooled, problem.noise
     std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
     return std, residual_inflation(problem.rows, wls(pooled, std).estimate.values)
@@ -87,7 +87,7 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
 def _regularised(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
-    """Return WLS with ridges of richer friction chosen by evidence, and with a prior of the base columns.
+    """Return the WLS fit with a prior of the base columns and with ridges of richer friction chosen by evidence.
 
     Also returned: the covariance (p, p) of both, infinite without prior or ridge, and their whitened rows (k, p).
     The prior counts `tempering` times.
@@ -131,7 +131,7 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
 
 
 def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the estimate (p,) with dissipative friction, except at joints where that fits much worse."""
+    """Return the estimate (p,) with dissipative friction, except at joints where the data contradict it."""
     fastest = np.max([np.abs(case.motion.v).max(axis=0) for case in problem.cases], axis=0)
     terms, pooled = problem.terms, problem.pooled
     factor = retriangulate(np.vstack([combine(pooled, std), np.pad(known, ((0, 0), (0, 1)))]))
@@ -150,7 +150,7 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
 
 
 def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
-    """Return at which joints (n,) friction adds energy, by an estimate without bounds."""
+    """Return the mask (n,) of joints where friction of an unconstrained estimate adds energy."""
     model, own = problem.model, problem.base.b
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
         return np.zeros(0, dtype=bool)
@@ -174,7 +174,7 @@ class _ConstrainedLeastSquares(Method):
     free: _LeastSquares
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate under the problem's constraints; for its covariance binding ones are equalities.
+        """Return the estimate under the problem's constraints; its covariance takes binding ones as equalities.
 
         Raises:
             UsageError: for constraints that contradict each other.
@@ -228,7 +228,7 @@ IRLS = _LeastSquares(
 )  # fmt: skip
 TLS = _LeastSquares(
     "tls",
-    f"columns of W are noisy too, by {COLUMN_NOISE:.0%} of their rms, each joint's torque by its "
+    f"W has noise of {COLUMN_NOISE:.0%} of each column's rms, each joint's torque that of its "
     "residuals, both up to a common estimated factor, independently in each row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
     description="total least squares with scaled columns", version=2,

@@ -106,7 +106,7 @@ class IdentificationProblem:
 
     @property
     def exact(self) -> np.ndarray:
-        """Columns without noise from measured positions (p,) bool."""
+        """Mask (p,) of columns that have no noise from measured positions: constants and signs."""
         return np.array([one is not None and one.form.exact for one in self.terms], dtype=bool)
 
 
@@ -180,7 +180,7 @@ class MethodEstimate:
 
 
 def _standing_for(estimate: Estimate) -> Triangles:
-    """Return triangles of one group that give, by least squares, an estimate, its covariance and degrees of freedom."""
+    """Return triangles of one group whose least-squares solution is an estimate with its covariance."""
     p = len(estimate.values)
     factor = np.zeros((1, p + 1, p + 1))
     factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
@@ -232,7 +232,7 @@ class Method(ABC):
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
-    """Return the result of `run` on a problem with its computing time; a failure is returned as a status."""
+    """Return the result of `run` with its computing time; an error of the estimation becomes a status."""
     began = time.perf_counter()
     try:
         found = run()

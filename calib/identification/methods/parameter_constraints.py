@@ -54,7 +54,7 @@ class WeightedSum:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lower and upper bound; infinite if not stated."""
+        """Lower and upper bound of the sum; infinite if not stated."""
         low, high = (self.least, self.most) if self.equal is None else (self.equal, self.equal)
         return -np.inf if low is None else low, np.inf if high is None else high
 
@@ -128,7 +128,7 @@ class Constraints(Frozen):
         return "; ".join(self.names) or "them"
 
     def raised(self) -> Constraints | None:
-        """Return these constraints with M(q) three times as far from singular; None beyond `MAX_EIGENVALUE`.
+        """Return these constraints with a three times larger least eigenvalue of M(q); None beyond `MAX_EIGENVALUE`.
 
         A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
         """
@@ -136,7 +136,7 @@ class Constraints(Frozen):
         return replace(self, least=least) if len(self.inertia) and least <= MAX_EIGENVALUE else None
 
     def touched(self, factor: np.ndarray) -> Constraints:
-        """Return these constraints with the cone of bodies replaced by its tangent plane at the optimum of `factor`.
+        """Return the constraints with the cone of consistent bodies replaced by its tangent plane at the optimum.
 
         Raises:
             NotConverged: where no physically consistent bodies satisfy the other constraints.
@@ -156,7 +156,7 @@ class Constraints(Frozen):
 
 @contextmanager
 def _unsatisfied(words: str) -> Iterator[None]:
-    """Prefix a `NotConverged` raised inside with `words`, the reason."""
+    """Put `words` in front of the message of a `NotConverged` that is raised inside."""
     try:
         yield
     except NotConverged as error:
@@ -274,7 +274,7 @@ def make_constraints(
 def hold(
     fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated: bool
 ) -> tuple[LinearFit, Held]:
-    """Return a fit under constraints, its covariance with binding ones as equalities, and the binding constraints.
+    """Return a fit under constraints, with binding ones as equalities in its covariance, and those constraints.
 
     Args:
         fit: the free estimate.
@@ -301,7 +301,7 @@ def hold(
 
 
 def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> Held:
-    """Return the binding constraints from multipliers in the order of `within`."""
+    """Return the binding constraints of a solution, by its multipliers in the order of `within`."""
     same = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~same)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~same)
@@ -361,7 +361,7 @@ def _without_effect(weights: Mapping[str, float], base: Base) -> str:
     lines = bases.expressions(base)
     parts = [line for line in lines if any(name in line.replace("=", " ").split() for name in weights)]
     sums = "; ".join(parts[:4])
-    return f"{', '.join(weights)}: torques identify it only in sums with others: {sums}. State the bound for such a sum"
+    return f"{', '.join(weights)}: identifiable only in sums with others: {sums}. State the bound for such a sum"
 
 
 def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p: int) -> np.ndarray:

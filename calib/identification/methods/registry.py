@@ -1,4 +1,4 @@
-"""All methods by their names in options and files, in the order of lists."""
+"""Table of all identification methods by name, those of rooms included."""
 
 from collections.abc import Mapping
 
@@ -14,7 +14,7 @@ VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()
 
 
 def method_named(name: str) -> Method:
-    """Return the method of this name in options and files.
+    """Return the identification method with a name.
 
     Raises:
         UsageError: for a name that is none of `METHODS`.

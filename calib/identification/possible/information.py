@@ -70,7 +70,7 @@ class Information(Frozen):
 
 
 def of(found: Identification, chain: Chain) -> Information:
-    """Return the information of an identification in memory, without reading its files."""
+    """Return the information of the data of an identification in memory."""
     estimate, standard = found.fitted.estimate, found.dynamics.model.names
     transform = _transform(found.names, regrouping(found.base), standard)
     return Information(
@@ -131,7 +131,7 @@ def read(folder: str | Path) -> Information:
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
-    """Return the regrouping T (b, p), the identity for richer friction."""
+    """Return the regrouping matrix T (b, p) of standard parameters; rows of richer friction are unit rows."""
     place = {name: k for k, name in enumerate(standard)}
     result = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):

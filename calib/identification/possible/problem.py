@@ -133,7 +133,7 @@ class BodyCost:
 
 
 def make_problem(information: Information, references: PriorBodies) -> BodyCost:
-    """Return the cost function of an identified model, with sizes of drive terms from the torque they could explain."""
+    """Return the cost function of an identified model; prior sizes of drive terms come from the recorded torque."""
     model = information.dynamics.model
     bodies = model.bodies.count
     columns = information.factor[:, :-1] @ information.transform

@@ -37,7 +37,7 @@ class Reference:
             object.__setattr__(self, name, frozen(shaped(getattr(self, name), np.shape(self.q), name)))
         if len(self.t) != len(self.q) or len(self.t) < 2:
             raise CalibError(
-                f"a reference needs at least two times, one per position; found {len(self.t)}, {len(self.q)}"
+                f"{len(self.t)} times, {len(self.q)} positions: a reference needs as many times as positions, two at least"
             )
 
     @property
@@ -102,7 +102,7 @@ def computed_torque(
 
 
 def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
-    """Return the controller with saturation, delay and filter of the settings added to its gains."""
+    """Return the controller with the saturation, delay and velocity filter that the settings state."""
     return Controller(
         controller.kp, controller.kd, controller.ki, np.full(n, loop.share), loop.per_joint("limit", n),
         loop.per_joint("windup", n), delay=loop.delay, cutoff=loop.velocity_cutoff,
@@ -110,7 +110,7 @@ def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
 
 
 def stated_controller(loop: LoopSettings, n: int) -> Controller:
-    """Return the controller with the stated gains, for n joints.
+    """Return the controller of n joints that the settings [loop] state.
 
     Raises:
         UsageError: where the length of a list is not the number of joints.
@@ -142,7 +142,7 @@ def identify_controller(
     reference: Reference, measured: np.ndarray, tau: np.ndarray, rate: float, band: float = BAND,
     orders: tuple[int, int] = ORDERS, integral: bool = False,
 ) -> IdentifiedController:  # fmt: skip
-    """Return the controller identified from a log.
+    """Return a PD or PID identified from logged positions and torques and their reference.
 
     Args:
         reference: at any multiple of the log's rate; its first instant is the log's.
@@ -177,7 +177,7 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
-    """Return the control periods (count,) of a log's samples, whole numbers if they are within 0.1 %."""
+    """Return the times (count,) of a log's samples in control periods, rounded if they are whole within 0.1 %."""
     every = 1.0 / (rate * reference.period)
     return np.arange(count) * (round(every) if abs(every / max(round(every), 1) - 1.0) < 1e-3 else every)
 
@@ -197,7 +197,7 @@ def _joint(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ARX coefficients a, b of one joint by two-stage least squares with an orthonormal instrument basis."""
     if not np.ptp(error) > 0.0:
-        raise MeasurementError("the position error is zero throughout: log encoder positions, not the reference")
+        raise MeasurementError("the position error is zero throughout: log measured positions, not the reference")
     na, nb = orders
     first, count = max(orders), len(error)
     own = basis[first:]
@@ -210,7 +210,7 @@ def _joint(
 
 
 def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integral: bool) -> np.ndarray:
-    """Return kp, kd, ki with the best relative fit to C(ω) from 1/40 to 1/2 of the band."""
+    """Return the kp, kd, ki (3,) that fit the ARX model's frequency response best, from 1/40 to 1/2 of the band."""
     omega = 2.0 * np.pi * np.geomspace(band / 40.0, band / 2.0, 60)
     shift = np.exp(-1j * omega / rate)
     response = np.polyval(errors[::-1], shift) / (1.0 - shift * np.polyval(past[::-1], shift))

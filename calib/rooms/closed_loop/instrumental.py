@@ -247,7 +247,7 @@ class _Fixed:
     constraints: Constraints | None
 
     def after(self, found: _Found) -> _Fixed:
-        """Return the task of the next iteration, with the postures in which constraints are likely to bind."""
+        """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
         if self.constraints is None or found.bound is None:
             return self
         return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
@@ -271,7 +271,7 @@ class _Found:
 
 
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
-    """Return the estimate with instruments from these runs; `tau`: variance inflation, from the last iteration."""
+    """Return the estimate with instruments from simulated runs; `tau`: variance inflation, from the last round."""
     columns = task.base.kept
     moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
     simulated = [observe(task.model, columns, case, task.decimator).matrix for case in moved]
@@ -286,7 +286,7 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
 def _with_signs(
     task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, moved: Case
 ) -> ObservationRows:
-    """Return rows in which Coulomb signs dominated by noise are replaced (see the module).
+    """Return the rows with columns of Coulomb signs replaced where velocity noise exceeds their smoothing.
 
     Args:
         simulated: (M, rows, p) of `moved`, the case as it was simulated.
@@ -307,7 +307,7 @@ def _with_signs(
 
 
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
-    """Return which columns (p,) are Coulomb signs of a joint whose speed noise exceeds their smoothing."""
+    """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the sign's smoothing."""
     noise, found = case.motion.velocity_noise(), np.zeros(len(columns), dtype=bool)
     for place, k in enumerate(columns - model.inertial):
         if k < 0 or model.columns[k].shape != "sign":
@@ -333,7 +333,7 @@ def _result(
 
 
 def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
-    """Return a robot whose only inertia is diag(J); its last n terms are J."""
+    """Return the robot of the first simulation: joint inertias J only, no gravity; J are its last n parameters."""
     if inertia is None:
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
@@ -345,7 +345,7 @@ def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None)
 
 
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return a simulated run of every loop, without noise."""
+    """Return the noise-free simulation of every recording's loop."""
     result: Runs = []
     for case, loop in cases:
         robot, controller = _loaded(plant, case), loop.controller
@@ -364,7 +364,7 @@ def _loaded(plant: Plant, case: Case) -> Plant:
 def _simulate_new(
     task: _Fixed, found: _Found, old: Plant, std: np.ndarray, tau: float
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
-    """Return the runs with the new parameters; after a failure, with parameters further from a singular inertia.
+    """Return the simulations with the new parameters, or, if they fail, with smaller steps towards these.
 
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
@@ -385,7 +385,7 @@ def _simulate_new(
                 task, found = further, replace(found, fit=fit, bound=held)
                 continue
         retreats += 1
-    raise CannotSimulate(f"the estimate and smaller steps cannot be simulated: {problem}", task.plant(old, found))
+    raise CannotSimulate(f"neither the estimate nor smaller steps can be simulated: {problem}", task.plant(old, found))
 
 
 def _stack(
@@ -442,7 +442,7 @@ def _distance(runs: Runs) -> np.ndarray:
 
 
 def _stray(runs: Runs) -> np.ndarray:
-    """Return the regression slopes (n,) of q_ref - q on q_ref - q_s, unbiased by noise in q; see `Instrumental`."""
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
     pairs = []
     for (case, loop), run in runs:
         motion, used = case.motion, simulated_samples(case, run.t, loop)

@@ -118,7 +118,7 @@ def instrument(
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
-    """Return empty triangles of [Z W y] (no rows yet) for columns of W with these names and units."""
+    """Return triangles of [Z W y] without rows, for columns of W with these names and units."""
     return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
 
 
@@ -166,7 +166,7 @@ def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: 
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
-    """Return measures of how well the instruments explain the columns, all from one R factor.
+    """Return the strength of the instruments: how well they explain the columns of W.
 
     Args:
         problem: triangles of [Z W y].

@@ -112,7 +112,7 @@ def take(case: Case, part: slice) -> Case:
 
 
 def _check_reference(motion: Motion) -> None:
-    """Raise an error for a motion without a reference, or with another motion's or one in degrees."""
+    """Raise an error for a motion whose reference is missing, of another motion, or in degrees."""
     if motion.q_ref is None:
         refuse_data(
             motion.file,
@@ -176,7 +176,7 @@ def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: fl
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
-    """Return the control periods per sample, not always whole; without `rate`, the fewest that reach `min_rate`.
+    """Return the control periods per sample, not always whole; without `rate`, for a controller of at least `min_rate`.
 
     Raises:
         UsageError: where the control rate is below the motion's.
@@ -196,7 +196,7 @@ def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
 
 
 def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
-    """Return the slice of samples to compare, without settling time and filter borders.
+    """Return the slice of samples that are compared: without settling time and filter borders.
 
     `settling_time`: [s] our choice.
     """
@@ -207,7 +207,7 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
 def _controller(
     loop: LoopSettings, longest: tuple[Case, Reference]
 ) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
-    """Return the controller, stated or identified from the longest part, with its identification and remarks."""
+    """Return the controller, stated or identified from the longest part, its identification, and notes."""
     case, reference = longest
     n = case.motion.n
     if loop.controller != "identify":
@@ -222,8 +222,8 @@ def _controller(
     shown = ", ".join(f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, found.explained))
     if len(bad):
         raise NotConverged(
-            f"{case.name}: the log identifies no controller at joint {bad[0] + 1} (kp/kd by joint: {shown}); state the "
-            "gains, or lower [loop] band",
+            f"{case.name}: the log does not identify the controller of joint {bad[0] + 1} (kp/kd by joint: {shown}); "
+            "state the gains, or lower [loop] band",
             found,
         )
     note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {shown}"

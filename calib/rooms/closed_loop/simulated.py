@@ -140,7 +140,7 @@ class LoopTest:
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
-    """Return the result of instruments from simulation on an estimate's problem, whose loop is stated.
+    """Return the result of instrumental variables on the problem of an estimate whose loop is stated.
 
     An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
@@ -169,13 +169,13 @@ def _distance(found: Instrumental) -> list[Finding]:
 
 
 def _gains(found: Instrumental) -> list[Finding]:
-    """Return a finding on joints whose stated gains are not those of the recording, though the simulation follows."""
+    """Return the finding on joints whose stated gains differ from those of the recording."""
     joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
     return [finding("loop-gains-off", joints=joints)] if joints else []
 
 
 def _biased(found: Instrumental) -> list[Finding]:
-    """Return a finding on a bias of least squares; none if the loop fits worse than the model, or for a small bias."""
+    """Return the finding on a bias of least squares; none if the bias is small or the loop fits badly."""
     shift, min_shift = found.shift, 1.0  # standard deviations of a shift that is worth a word (our choice)
     if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
         return []
@@ -184,7 +184,7 @@ def _biased(found: Instrumental) -> list[Finding]:
 
 
 def _blurred(found: Instrumental, loops: ClosedLoops) -> list[Finding]:
-    """Return a finding on joints where W is not its true value plus noise, as instruments assume."""
+    """Return the finding on joints whose Coulomb sign is dominated by velocity noise, which instruments cannot cure."""
     if not found.estimator.measured:
         return []
     noise, max_blur = loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
@@ -198,7 +198,7 @@ SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choic
 
 
 def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
-    """Return how recorded torques contradict an output-error estimate; None if they do not, or for another method.
+    """Return the disagreement of an output-error estimate with the recorded torques; None if they agree.
 
     Args:
         problem: of both.
@@ -230,14 +230,14 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
 
 
 def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray) -> tuple[float, ...]:
-    """Return for each torque row the regression slope of torques W own on torques W other."""
+    """Return for each torque row the ratio (regression slope) of the torques of two estimates."""
     factors = problem.pooled.factors[:, :, :-1]
     mine, theirs = factors @ own, factors @ other
     return tuple(map(float, np.sum(mine * theirs, axis=1) / np.maximum(np.sum(theirs**2, axis=1), 1e-300)))
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
-    """Return the results of simulating the closed loop beside an estimate of a problem."""
+    """Return the loop test of an estimate, as the core stores and prints it."""
     test = compare_with_loop(problem, estimate)
     taken = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     return LoopResults(
