@@ -37,7 +37,7 @@ class Reference:
             object.__setattr__(self, name, frozen(shaped(getattr(self, name), np.shape(self.q), name)))
         if len(self.t) != len(self.q) or len(self.t) < 2:
             raise CalibError(
-                f"{len(self.t)} times, {len(self.q)} positions: a reference needs as many times as positions, two at least"
+                f"{len(self.t)} times, {len(self.q)} positions: a reference needs as many of each, two at least"
             )
 
     @property
