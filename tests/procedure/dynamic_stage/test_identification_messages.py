@@ -40,6 +40,7 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "_command", lambda: stop)
+    monkeypatch.setattr(cli, "_spread", list)
     assert cli.run([command, "folder"]) == 130
     assert words in capsys.readouterr().err
 
