@@ -84,7 +84,7 @@ class Deflection:
         return replace(self, coefficients=np.asarray(values, dtype=float))
 
     def names(self, chain: Chain) -> tuple[str, ...]:
-        """Return one readable name per term, e.g. ``theta3 per N·m``, ``theta3 sin 2 q4``."""
+        """Return one name per term for tables, e.g. ``theta3 per N·m``, ``theta3 sin 2 q4``."""
         return tuple(_name(term, chain) for term in self.terms)
 
 
@@ -156,7 +156,7 @@ ROBOT, COVARIANCE = "robot.toml", "chain_covariance.csv"
 
 @dataclass(frozen=True, eq=False)
 class CorrectedChain:
-    """Geometry fitted together with joint corrections; without them it is worse than the best rigid geometry.
+    """Geometry fitted together with joint corrections; to be used with them only.
 
     Attributes:
         chain: the geometry.
@@ -299,7 +299,7 @@ def write(
     record: Mapping[str, Any] | None = None,
     comment: str = "",
 ) -> None:
-    """Write ``robot.toml`` and the covariance (``chain_covariance.csv``), so that `read` returns the same robot.
+    """Write a calibrated robot to ``robot.toml`` and ``chain_covariance.csv``; `read` returns the same robot.
 
     Args:
         folder: that exists.

@@ -245,13 +245,13 @@ class Capsules:
 
         q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
         good = clear(q, *self._compiled, margin)
-        beside = self._beside
-        if beside is not None and good.any():
+        near_obstacles = self._with_obstacles
+        if near_obstacles is not None and good.any():
             unsure = np.flatnonzero(good)
             lines = self._lines(q[unsure])
-            near = ~np.all(beside._measured(lines, rough=True)[0] > margin, axis=1)
+            near = ~np.all(near_obstacles._measured(lines, rough=True)[0] > margin, axis=1)
             some = _Lines(*(part[near] for part in (lines.start, lines.end, lines.axes, lines.places)))
-            good[unsure[near]] = np.all(beside._measured(some)[0] > margin, axis=1)
+            good[unsure[near]] = np.all(near_obstacles._measured(some)[0] > margin, axis=1)
         return good
 
     @cached_property
@@ -274,7 +274,7 @@ class Capsules:
         )  # fmt: skip
 
     @cached_property
-    def _beside(self) -> Capsules | None:
+    def _with_obstacles(self) -> Capsules | None:
         """The same model with the pairs of arm and obstacles only; None without obstacles."""
         world = self.world[self.world[:, 1] >= len(self.walls)]
         return replace(self, own=self.own[:0], world=world) if len(world) else None

@@ -246,7 +246,7 @@ def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0)
 
 
 def element_length(chain: Chain, k: int) -> float:
-    """Return the constant displacement along translation k [m], including the part in its joint's placement.
+    """Return the constant displacement along translation k [m], including the part from its joint's placement.
 
     A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths stand in the placement.
     Zero for rotations and for what a joint moves.

@@ -157,15 +157,15 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
         chain = mdh.from_table(robot, str(path), propose_beta)
     else:
         chain = _from_elements(robot, str(path))
-    return chain, _beside(table)
+    return chain, _extra_tables(table)
 
 
 def read_extra(path: str | Path) -> dict[str, Any]:
     """Return the extra tables of a robot file (`EXTRA`) as plain dictionaries."""
-    return _beside(tables.load(path))
+    return _extra_tables(tables.load(path))
 
 
-def _beside(table: Mapping[str, Any]) -> dict[str, Any]:
+def _extra_tables(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in table.items() if key in EXTRA}
 
 

@@ -76,8 +76,8 @@ class Sigma:
     """Standard deviations of measurements; None where not stated.
 
     Attributes:
-        position, orientation: per axis [m], [rad].
-        distance: [m].
+        position, orientation: per axis [m], [rad]; one number for all axes, or three.
+        distance: of a measured distance [m].
         floor: lower bound to which sigmas of the file's columns are raised [m].
     """
 
@@ -106,9 +106,9 @@ class FileOptions:
     """Options for reading one measurement file; by default its header determines everything. Keys as in the file.
 
     Attributes:
-        columns: our column name → the file's.
-        units: our column name or a family of columns → unit.
-        where: column → texts; only rows with one of them are kept.
+        columns: the toolkit's name of a column → the file's name.
+        units: the toolkit's name of a column, or a family of columns → its unit.
+        where: column → texts; only rows with one of these texts are used.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -180,7 +180,6 @@ def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
     """Refuse a [files] table for a file that is not among `paths`."""
     names = [Path(path).name for path in paths]
     for name in options.files:
-        wanted = Path(name).parts
-        if not any(Path(path).parts[-len(wanted) :] == wanted for path in paths):
+        if not any(own_table({name: name}, path) for path in paths):
             near = suggestion(name, names)
             refuse_option(options.source, f'files."{name}" is not among the files given{near}: {", ".join(names)}')

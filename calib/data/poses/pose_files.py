@@ -144,9 +144,9 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
             if a in sockets and b in sockets:
                 links.append((sockets[a], sockets[b], options.socket_distance))
     if not links:
-        wanted = ", ".join(f"{a} and {b}" for a, b in options.socket_pairs) or "two sockets"
+        expected = ", ".join(f"{a} and {b}" for a, b in options.socket_pairs) or "two sockets"
         found = ", ".join(dict.fromkeys(texts[-1]))
-        message = f"no fixture position has {wanted}, needed for socket_distance; found {found}"
+        message = f"no fixture position has {expected}, needed for socket_distance; found {found}"
         sheet.fail(message, layout.group[-1])
     return tuple(links)
 

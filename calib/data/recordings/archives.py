@@ -198,8 +198,8 @@ def _stamps(archive: _Archive, found: Mapping[str, str], options: RecordingOptio
         own = archive.few(stated, 1) if not options.rate else None
         rate = options.rate or (0.0 if own is None else float(own[0]))
         if not rate > 0:
-            wanted = f"{', '.join(SYNONYMS['t'])}, or {', '.join(RATES)}"
-            archive.fail(f"has neither stamps nor a rate ({wanted}); found: {', '.join(archive.members)}")
+            expected = f"{', '.join(SYNONYMS['t'])}, or {', '.join(RATES)}"
+            archive.fail(f"has neither stamps nor a rate ({expected}); found: {', '.join(archive.members)}")
         return np.arange(count) / rate
     t = archive.read(found["t"], exact=True, kinds="fiu").ravel()
     if len(t) != count:

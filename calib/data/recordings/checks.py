@@ -195,8 +195,8 @@ def _check_speed(recording: Recording) -> None:
     mean = (recording.v[1:] + recording.v[:-1]) / 2
     power, own, product = (slope**2).sum(axis=0), (mean**2).sum(axis=0), (slope * mean).sum(axis=0)
     ratio = product / np.maximum(power, 1e-300)
-    alike = product > 0.9 * np.sqrt(power * own)  # a joint that hardly moves shows noise alone
-    for j in np.flatnonzero(alike & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
+    proportional = product > 0.9 * np.sqrt(power * own)  # a joint that hardly moves shows noise alone
+    for j in np.flatnonzero(proportional & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
         for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
                 found = f"v is {ratio[j]:.3g} times the slope of q: {wrong}"

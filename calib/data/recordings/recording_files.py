@@ -78,8 +78,8 @@ def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tup
     found = _find(table, here, joints.names)
     ours = "q_ref" if "q_ref" in found else "q"
     if ours not in found:
-        wanted = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
-        message = f"has no reference positions ({wanted}, with the joints' numbers or names)"
+        expected = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
+        message = f"has no reference positions ({expected}, with the joints' numbers or names)"
         refuse_data(path, f"{message}; found: {', '.join(table.header)}")
     q = np.column_stack([_values(table, place, ours, options) for place in found[ours]])
     return _stamps(table, found, options), q
@@ -160,8 +160,8 @@ def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions
         return t - t[0]
     if options.rate:
         return np.arange(len(table)) / options.rate
-    wanted = ", ".join(SYNONYMS["t"])
-    message = f"has no column of stamps ({wanted}), and the options state no rate; found: {', '.join(table.header)}"
+    expected = ", ".join(SYNONYMS["t"])
+    message = f"has no column of stamps ({expected}), and the options state no rate; found: {', '.join(table.header)}"
     table.fail(message)
 
 

@@ -83,13 +83,13 @@ class RecordingOptions:
     """Options for reading a recording; by default the file determines everything.
 
     Attributes:
-        kind: ``torque`` or ``current``, if a file has both, or currents named as torques.
-        names: our name (`SYNONYMS`) → the file's.
-        units: our name → unit, if the file states none; default SI.
+        kind: what the efforts are: needed if a file has torques and currents, or currents under a torque's name.
+        names: the toolkit's name of a series → the file's name.
+        units: the toolkit's name of a series → its unit, if the file states none; SI by default.
         rate: sampling rate of a file without stamps [Hz].
-        topic: of a ROS bag with several topics of joint states.
+        topic: name of the topic to read, for a ROS bag with several topics of joint states.
         use_range: use only the rows of the file's `use_range` if the path has no cut.
-        lag: delay of torques and currents relative to the positions of their row [s].
+        lag: delay of torques and currents relative to the positions in the same row [s].
         rows: name of the torques to be explained, for messages.
         motors, sensors: whether these need the motors' torques, the torques of sensors after the gears; if they need
             sensors and no column is named torque or current, tau_motor is the effort.
@@ -169,8 +169,8 @@ def one_effort(
 ) -> dict[str, str]:
     """Return `found` with either ``torque`` or ``current``; without both, ``tau_link`` becomes the torque."""
     if "q" not in found:
-        wanted = ", ".join(SYNONYMS["q"])
-        message = f"has no joint positions ({wanted}); found: {', '.join(members)}"
+        expected = ", ".join(SYNONYMS["q"])
+        message = f"has no joint positions ({expected}); found: {', '.join(members)}"
         refuse_data(path, message + _cure(found, members))
     kinds = [kind for kind in ("torque", "current") if kind in found]
     if not kinds and options.sensors:
@@ -179,8 +179,8 @@ def one_effort(
         found["torque"] = found.pop("tau_link")
         kinds = ["torque"]
     if not kinds:
-        wanted = ", ".join((*SYNONYMS["torque"], *SYNONYMS["current"]))
-        message = f"has no torques and no currents ({wanted}); found: {', '.join(members)}"
+        expected = ", ".join((*SYNONYMS["torque"], *SYNONYMS["current"]))
+        message = f"has no torques and no currents ({expected}); found: {', '.join(members)}"
         refuse_data(path, message + _cure(found, members))
     kind = options.kind or kinds[0]
     if kind not in found:  # the options say that what is called a torque is a current

@@ -142,7 +142,7 @@ def _choose(per_joint: np.ndarray, stated: float | None, max_cutoff: float = 20.
 
 
 def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float, min_rise: float = 30.0) -> tuple[float, float]:
-    """Return the highest frequency of one joint's motion and of a resonance above it [Hz] (NaN: none).
+    """Return the highest frequency of one joint's motion, and that of a resonance above it or NaN [Hz].
 
     `min_rise`: a power that rises this far again above the motion is a resonance, not a gap between two lines.
     """

@@ -1,7 +1,7 @@
 """Motion for identification from a raw recording: filtered positions, derivatives and torques on one even grid.
 
-`Motion` is the only type that carries accelerations, so an unfiltered log cannot reach a regressor. Its torques are as
-recorded (on the even grid): what filters them is the parallel decimation, which filters every column of W alike
+`Motion` is the only type with accelerations, so that an unfiltered log cannot reach a regressor. Its torques are as
+recorded (on the even grid): the parallel decimation filters them, and every column of W in the same way
 (`calib.data.signals.filtering`).
 """
 
@@ -37,19 +37,20 @@ CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
 @strict
 @dataclass(frozen=True)
 class FilterOptions:
-    """Options of filtering a recording; None: from the data, by Gautier's rules (`calib.data.signals.bandwidth`).
+    """Options of filtering a recording; None: chosen from the data (`calib.data.signals.bandwidth`).
 
     Attributes:
-        cutoff: cut-off f_q of the positions' Butterworth filter [Hz], one, or one per joint.
-        velocity_cutoff: cut-off f_v of the positions differentiated to velocities [Hz]; None: f_q if that is stated,
-            else above it (`Motion`).
-        order: of one pass of the Butterworth filter.
-        band: cut-off f_p of the parallel decimation [Hz]; only lower frequencies are compared.
+        cutoff: cut-off f_q of the positions' Butterworth filter [Hz]; one number, or one per joint.
+        velocity_cutoff: cut-off f_v of the positions that velocities are computed from [Hz]; None: f_q if that is
+            stated, else above it.
+        order: order of the Butterworth filter in one pass; it runs forwards and backwards.
+        band: cut-off f_p of the parallel decimation [Hz]; torques are compared below it.
         dynamics: bandwidth f_dyn of the robot's motion [Hz], if known.
-        width: half-width of the central differences (`calib.data.signals.filtering`).
-        clock, gap: as in `calib.data.signals.resampling`; gap [s].
+        width: samples on each side that the central differences use.
+        clock: how samples are dated: by their stamps, evenly, or by counting steps (auto: the smoothest positions).
+        gap: longest time without a sample that is interpolated [s].
         borders: time removed at both ends of each segment [s].
-        decimator: ``kaiser`` or ``chebyshev``.
+        decimator: low-pass filter of the decimation.
     """
 
     cutoff: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
@@ -286,7 +287,7 @@ def _differences(
 
 
 def _inside(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
-    """Return the mask (N,) of samples not affected by the filters' ends; refuse a motion without any."""
+    """Return the mask (N,) of samples that the filters' ends do not affect; refuse a motion without such samples."""
     inside = np.zeros(len(sampled.t), dtype=bool)
     edge = filtering.border(sampled.rate, float(cutoff.min()))
     edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))

@@ -80,7 +80,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
 
 
 def _even_times(t: np.ndarray, drift_samples: int = 101) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return even times (N,) k T + drift (k counts lost samples), a mask that keeps all, and T [s]; None if uneven.
+    """Return even times k T + drift (N,), k counting lost samples, a mask of ones, and T [s]; None if uneven.
 
     `drift_samples`: samples over which a drift of the stamps is followed.
     """

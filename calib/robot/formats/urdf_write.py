@@ -152,13 +152,13 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     frames, calibrated_frames = moving_frames(nominal, q), moving_frames(calibrated, q)
     base = _base_offset(tree, path, nominal, frames, links)
     offsets = invert(frames[:, 0]) @ base @ links[:, 0]
-    wanted = invert(base) @ calibrated_frames @ offsets[:, None]
-    origins = _origins(tree, path, wanted[:, 0])
-    origins |= _tip_origin(tree, path, nominal, calibrated, base @ links[-1, 0], base @ wanted[-1, 0])
+    goal = invert(base) @ calibrated_frames @ offsets[:, None]
+    origins = _origins(tree, path, goal[:, 0])
+    origins |= _tip_origin(tree, path, nominal, calibrated, base @ links[-1, 0], base @ goal[-1, 0])
     changes = [one for name, origin in origins.items() for one in _change(source, tree.joints[name], origin)]
     result = edited(source, changes)
     written = read_tree(result, where)
-    error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
+    error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - goal).max()
     max_difference = 1e-9
     if error > max_difference:
         refuse_robot(where, f"the edited URDF differs from the calibrated robot by {error:.2g}; report this as a bug")
@@ -305,8 +305,8 @@ def _base_offset(
     return best
 
 
-def _origins(tree: UrdfTree, path: list[JointTag], wanted: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the new origins (4, 4) by joint name; `wanted` (moving, 4, 4): link frames at q = 0."""
+def _origins(tree: UrdfTree, path: list[JointTag], goal: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the new origins (4, 4) by joint name; `goal` (moving, 4, 4): link frames at q = 0."""
     frame, origins, k = np.eye(4), {}, 0
     for joint in path:
         if not joint.moves:
@@ -314,18 +314,18 @@ def _origins(tree: UrdfTree, path: list[JointTag], wanted: np.ndarray) -> dict[s
             continue
         _, _, offset = drive(tree, joint)
         stance = _screw(joint.axis, np.asarray(offset), joint.kind == "prismatic")
-        origins[joint.name] = invert(frame) @ wanted[k] @ invert(stance)
-        frame, k = wanted[k], k + 1
+        origins[joint.name] = invert(frame) @ goal[k] @ invert(stance)
+        frame, k = goal[k], k + 1
     return origins
 
 
 def _tip_origin(
-    tree: UrdfTree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, wanted: np.ndarray
+    tree: UrdfTree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, goal: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the new origin of the first fixed joint after the last moving one, if the chain changed there.
 
     Args:
-        last, wanted: (4, 4), the last moving link at q = 0 in the chain's base, before and after.
+        last, goal: (4, 4), the last moving link at q = 0 in the chain's base, before and after.
     """
     zero = np.zeros((1, nominal.n))
     ends = [invert(moving_frames(chain, zero)[-1, 0]) @ forward(chain, zero)[0] for chain in (nominal, calibrated)]
@@ -343,7 +343,7 @@ def _tip_origin(
         rest = rest @ joint.origin
     tip = last @ path[place].origin @ rest
     offset = invert(forward(nominal, zero)[0]) @ tip
-    return {path[place].name: invert(wanted) @ forward(calibrated, zero)[0] @ offset @ invert(rest)}
+    return {path[place].name: invert(goal) @ forward(calibrated, zero)[0] @ offset @ invert(rest)}
 
 
 def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int, int, str]]:

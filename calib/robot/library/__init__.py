@@ -44,9 +44,9 @@ def load(
 
 
 def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
-    for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
-        if wanted is not None and wanted != found:
-            refuse_robot(path, f"its {option} is '{found}', not '{wanted}'; only a URDF allows to choose base and tip")
+    for option, given, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
+        if given is not None and given != found:
+            refuse_robot(path, f"its {option} is '{found}', not '{given}'; only a URDF allows to choose base and tip")
     return chain
 
 
