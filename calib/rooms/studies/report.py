@@ -125,7 +125,7 @@ ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered 
 
 
 def overview(conditions: Sequence[ConditionSummary]) -> Table:
-    """Return the recommended method of each condition."""
+    """Return a table of the recommended method of each condition."""
     lines = []
     for one in conditions:
         if not one.methods:
@@ -146,7 +146,7 @@ def overview(conditions: Sequence[ConditionSummary]) -> Table:
 
 
 def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
-    """Return the median torque error of every method on every condition."""
+    """Return a table of the median torque error of every method on every condition."""
     names = list(dict.fromkeys(method.method for one in conditions for method in one.methods))
     lines = []
     for one in conditions:
@@ -168,7 +168,7 @@ def _median_cell(one: MethodSummary | None) -> str:
 
 
 def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
-    """Return the reasons for conditions without a recommended method."""
+    """Return sentences that say why conditions have no recommended method."""
     found: dict[str, list[str]] = {}
     for one in conditions:
         if why := one.why_none:
@@ -180,7 +180,7 @@ def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
 
 
 def _described(one: Condition) -> str:
-    """Return a one-line description of a condition."""
+    """Return a condition as one line: robot, noise, decimation, cutoff, mismatch."""
     filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
     wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
     degrees = math.degrees(one.sigma_q)
@@ -188,14 +188,14 @@ def _described(one: Condition) -> str:
 
 
 def condition_table(one: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:
-    """Return a table of all methods of a condition, best first, by default with the columns for a terminal."""
+    """Return a table of all methods on a condition, best first; by default with the columns for a terminal."""
     columns = [column for column in COLUMNS if column.name in names]
     title = f"Methods on {one.condition.name}"
     return table(title, columns, one.methods, _described(one.condition), lambda method: method.chosen)
 
 
 def failures(one: ConditionSummary) -> list[Text]:
-    """Return each way in which a method failed on a condition, how often, and the first one's message; or nothing."""
+    """Return the failures of each method on a condition: kind, number, and first message; empty without any."""
     said = [
         f"{method.method}: {count} {status}, e.g. {method.examples[status]}"
         for method in sorted(one.methods, key=lambda method: method.method)
@@ -225,7 +225,7 @@ def make_page(
     notes: Sequence[str],
     plots: bool = True,
 ) -> str:
-    """Return the report as HTML.
+    """Return the report of a study as HTML.
 
     Args:
         rows: of these conditions.
@@ -352,7 +352,7 @@ def run_study(
 
 
 def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
-    """Refuse, before any work, a file as output folder, or a folder with other files of these names."""
+    """Raise if the output folder is a file, or contains files of these names that no study has written."""
     require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], named)
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]

@@ -62,7 +62,7 @@ def span(seconds: float) -> str:
 
 
 def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
-    """Yield the tasks without rows in the store, data set by data set, so that all conditions progress equally."""
+    """Yield the tasks that have no rows in the store, data set by data set over all conditions."""
     most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
     for number in range(most):
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):

@@ -34,7 +34,7 @@ _TYPES = [get_type_hints(TrialRow)[name] for name in COLUMNS]
 
 
 class RowStore:
-    """Rows of a folder, locked by one process; created by `opened`.
+    """Rows of a study's folder, locked for one process; made by `opened`.
 
     Attributes:
         folder: where they are.
@@ -54,7 +54,7 @@ class RowStore:
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:
-        """Append rows; they are on the disk when this returns.
+        """Append rows and write them to the disk before returning.
 
         Raises:
             CalibError: where the disk is full; rows of before are kept, none of these.
@@ -73,7 +73,7 @@ class RowStore:
         self.rows.update((row.key, row) for row in fresh)
 
     def _taken_back(self, size: int, error: OSError) -> CalibError:
-        """Cut the journal to its intact part; return what happened."""
+        """Cut the journal to its intact `size` bytes; return the error to raise."""
         path = self.folder / JOURNAL
         self._journal.close()
         os.truncate(path, size)
@@ -101,7 +101,7 @@ class RowStore:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[RowStore]:
-    """Return a folder's store, locked for one command; the kernel releases the lock when the process ends.
+    """Yield the store of a folder, locked for one command until the process ends.
 
     Raises:
         UsageError: while another command works on it; for a store of another version, or a damaged one.
@@ -139,7 +139,7 @@ def read_rows(folder: Path) -> list[TrialRow]:
 
 
 def _open_journal(path: Path, size: int) -> IO[bytes]:
-    """Return the journal cut to `size` bytes and ready to append, with its header; 0: a new one."""
+    """Return the journal, cut to `size` bytes and open for appending; with size 0 a new one with its header."""
     if size == 0:
         files.write(path, ",".join(_HEAD) + "\n")
     else:
@@ -174,7 +174,7 @@ def _read_journal(path: Path) -> tuple[list[TrialRow], int, int]:
 
 
 def _row(cells: Sequence[str]) -> TrialRow:
-    """Return the row of a line's cells.
+    """Return the trial row described by the cells of a line.
 
     Raises:
         ValueError: for a line that is short, a number that is none, a status that no trial ends with.

@@ -30,7 +30,7 @@ FIGURES = (
 
 
 class Quartiles(NamedTuple):
-    """Median and quartiles of a figure over runs; failures count as infinite errors, and are excluded otherwise."""
+    """Median and quartiles of a figure over runs; a failed run counts as an infinite error."""
 
     median: float
     lower: float
@@ -104,7 +104,7 @@ class ConditionSummary:
 
 
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
-    """Return the summary of each condition of a study over all methods with rows.
+    """Return the summary of each condition of a study, over all methods that have rows.
 
     Rows of other conditions do not count, nor do those of a method that has changed since.
 
@@ -144,7 +144,7 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
 
 
 def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
-    """Return the median of a method's error over another's on the same data sets; infinite without common data sets."""
+    """Return the median ratio of two methods' errors on the same data sets; infinite without common data sets."""
     both = [(one[seed], other[seed]) for seed in one.keys() & other.keys() if np.isfinite(other[seed])]
     return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
 
@@ -173,7 +173,7 @@ def spread(values: Sequence[float]) -> Quartiles:
 
 
 def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
-    """Return the two-sided p of the sign test that one method's error exceeds the other's as often as not.
+    """Return the two-sided p value of the sign test between the errors of two methods.
 
     Args:
         one, other: seed → error; seeds in both count, ties do not.

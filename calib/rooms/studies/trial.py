@@ -99,7 +99,7 @@ COLUMNS = tuple(one.name for one in fields(TrialRow))
 
 @dataclass(frozen=True)
 class Trials:
-    """Trials of several methods on one data set: what a worker is given."""
+    """Trials of several methods on one data set: one task for a worker."""
 
     condition: Condition
     methods: tuple[str, ...]
@@ -112,7 +112,7 @@ def run_trials(trials: Trials) -> list[TrialRow]:
 
 
 def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
-    """Return the row of a condition, a method and a seed: the same wherever and whenever it runs, but for the times."""
+    """Return the row of a condition, a method and a seed; always the same, except for the times."""
     known = {key: value for key, value in asdict(condition).items() if key not in ("name", "resimulated")}
     head = {"condition": condition.name, "digest": condition.digest, "method": method, "seed": seed, **known}
     own = method_named(method)
@@ -132,7 +132,7 @@ def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
         return TrialRow(status=status, message=_said(why), **head, **times)
     values = found.estimate.values[: data.problem.base.b]
     if not np.isfinite(values).all():
-        return TrialRow(status=EstimateStatus.DIVERGED.value, message="an estimate that is not finite", **head, **times)
+        return TrialRow(status=EstimateStatus.DIVERGED.value, message="the estimate is not finite", **head, **times)
     merit = _merit(data, found, values) | {"survey_q": _resimulated(condition, data, values, seed)}
     return TrialRow(status=FOUND, message="", **head, **merit, **times)
 
@@ -169,7 +169,7 @@ def _survey_tau(data: Experiment, values: np.ndarray) -> float:
 
 
 def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, seed: int) -> float:
-    """Return the survey's d_q, without noise in the second simulation; NaN if not requested or not computable."""
+    """Return the survey's position error d_q [%] of an estimate, simulated again without noise; NaN if unavailable."""
     if seed >= condition.resimulated:
         return NAN
     setup, problem, model = set_up(condition.robot, condition.duration), data.problem, data.model
@@ -186,7 +186,7 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
 
 
 def _said(error: BaseException | None) -> str:
-    """Return an error as one line, an unexpected one with its class."""
+    """Return the message of an error as one line, with its class if it is an unexpected one."""
     if error is None:
         return ""
     words = str(error) if isinstance(error, CalibError) else f"{type(error).__name__}: {error}"
@@ -202,7 +202,7 @@ def _version(method: str) -> str:
 
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:
-    """Return the trials of one data set as tasks: methods that simulate by themselves, all others in one."""
+    """Return the trials of one data set as tasks: one per simulating method, one for all other methods."""
     plain = tuple(name for name in methods if not method_named(name).needs_simulation)
     alone = [Trials(condition, (name,), seed) for name in methods if name not in plain]
     return [*([Trials(condition, plain, seed)] if plain else []), *alone]

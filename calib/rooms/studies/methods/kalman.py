@@ -70,7 +70,7 @@ class Belief:
 
 
 def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
-    """Return a belief with independent components of standard deviations sigma (L,)."""
+    """Return the belief with a mean (L,) and independent components of standard deviation sigma (L,)."""
     return Belief(np.array(mean, dtype=float), np.diag(sigma if kind.root else sigma**2), kind.root)
 
 
@@ -144,5 +144,5 @@ def _packed(
 
 
 def _triangle(wide: np.ndarray) -> np.ndarray:
-    """Return the lower triangular L with L Lᵀ = A Aᵀ, A (L, k)."""
+    """Return the lower triangular matrix L with L Lᵀ = A Aᵀ, from A (L, k) by QR."""
     return np.asarray(scipy.linalg.qr(wide.T, mode="r", check_finite=False, overwrite_a=True)[0])[: len(wide)].T

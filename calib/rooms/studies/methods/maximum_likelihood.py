@@ -37,7 +37,7 @@ BLOCK = 1000  # samples at a time
 
 @dataclass(frozen=True)
 class _MaximumLikelihood(Method):
-    """Errors in variables; see the module."""
+    """Identification by maximum likelihood with errors in variables."""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's columns, with the torque noise as weights.
@@ -62,7 +62,7 @@ class _MaximumLikelihood(Method):
             steps.append(float(np.max(np.abs(found.values - values) / found.sigma)))
             values = found.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
-                raise Diverged("maximum likelihood: the noise of the positions is too large to be linear in", values)
+                raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
             if steps[-1] < tolerance:
                 break
         else:
@@ -78,7 +78,7 @@ class _MaximumLikelihood(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Recording:
-    """Data of one recording.
+    """States of one recording at the kept samples, with their noise.
 
     Attributes:
         own: its samples among all.
@@ -110,7 +110,7 @@ class _NoisyStates:
 
 
 def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> _NoisyStates:
-    """Return the samples with the covariance of their states' noise."""
+    """Return all samples of a problem, with the covariance of the noise in q, v and a."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     smooth = np.array([one is None or one.form.slopes for one in problem.terms], dtype=bool)
     parts, first = [], 0
@@ -145,7 +145,7 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
 
 
 def _slopes(task: _NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
-    """Return B (M, n, 3, n): slopes of W β by q, v and a of every joint."""
+    """Return B (M, n, 3, n), the Jacobian of W β with respect to q, v and a of each joint."""
     used = task.smooth & (part.present > 0.0)
     order = np.argsort(task.columns[used])
     columns, own = task.columns[used][order], values[used][order]
@@ -163,7 +163,7 @@ def _slopes(task: _NoisyStates, part: _Recording, values: np.ndarray) -> np.ndar
 
 
 def _residuals(task: _NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return r (M, n), G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n) of a recording."""
+    """Return the residuals r (M, n), and G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n), of a recording."""
     by_state = _slopes(task, part, values)
     spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
     residual = np.where(task.present[part.own], task.target[part.own] - task.matrix[part.own] @ values, 0.0)
@@ -171,7 +171,7 @@ def _residuals(task: _NoisyStates, part: _Recording, values: np.ndarray) -> tupl
 
 
 def _inverse(other: np.ndarray, noise: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return S⁻¹ (M, n, n) with S = Σ_τ + other over the rows in use (M, n), zero elsewhere."""
+    """Return the inverse (M, n, n) of S = Σ_τ + other for the rows in use (M, n); zero for other rows."""
     both = used[:, :, None] & used[:, None, :]
     return np.where(both, np.linalg.inv(np.where(both, other + np.diag(noise), np.eye(len(noise)))), 0.0)
 
@@ -208,7 +208,7 @@ class _Round:
 
 
 def _step(task: _NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
-    """Return the next round from parameters and the torques' noise."""
+    """Return the next round of the iteration, from parameters (p,) and torque noise (n,)."""
     p = len(values)
     cross, score, white, left = np.zeros((p, p)), np.zeros(p), [], []
     for part in task.parts:
@@ -242,7 +242,7 @@ def _change(task: _NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarr
 
 
 def _packed(problem: IdentificationProblem, found: _Round, noise: np.ndarray) -> LinearFit:
-    """Return the fit of the last round, with a covariance for residuals correlated in time."""
+    """Return the fit of the last round; its covariance allows for residuals correlated in time."""
     plain = wls(problem.pooled, np.sqrt(noise))
     p, rows = len(found.values), int(problem.pooled.rows.sum())
     meat = sum(scatter(own, left) for own, left in zip(found.white, found.residual))

@@ -22,7 +22,7 @@ EPOCHS = 60  # at most
 def adaline(
     data: Samples, triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, seed: int = 0
 ) -> tuple[LinearFit, int]:
-    """Return the estimate of an adaptive linear neuron trained in random order, and the number of epochs.
+    """Return the estimate of an adaptive linear neuron, trained in random order, and the number of epochs.
 
         w ← w + μ_k Z_kᵀ (y_k - Z_k w),    Z_k = R⁻¹ W_k T,    x = T w
 
@@ -67,7 +67,7 @@ def adaline(
 def hopfield(
     triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, bound: np.ndarray | None = None
 ) -> tuple[LinearFit, int]:
-    """Return the estimate of a Hopfield-Tank network of p neurons at rest, and the number of steps.
+    """Return the estimate of a Hopfield-Tank network of p neurons in equilibrium, and the number of steps.
 
         u̇ = -∂E/∂x = -(Wᵀ R⁻¹ W x - Wᵀ R⁻¹ y),    x_i = α_i tanh(u_i / α_i),    E = ½ ‖R^(-½) (y - W x)‖²
 
@@ -110,7 +110,7 @@ def hopfield(
         inner, step = moved, 4.0 * step
     saturation = 0.9  # of the box
     saturated = [name for name, x, most in zip(triangles.names, outer, reach) if abs(x) > saturation * most]
-    cause = f"neurons saturate: {', '.join(saturated[:5])}; widen their bounds" if saturated else "it is not at rest"
+    cause = f"neurons saturate: {', '.join(saturated[:5])}; widen their bounds" if saturated else "it has not settled"
     raise NotConverged(f"the network after {count} steps: {cause}", outer / norms)
 
 
@@ -119,7 +119,7 @@ Train = Callable[[IdentificationProblem, np.ndarray, np.ndarray], tuple[LinearFi
 
 @dataclass(frozen=True)
 class _Network(Method):
-    """A method that converges to weighted least squares.
+    """Identification by a neural network that converges to weighted least squares.
 
     Attributes:
         train: the problem, (rows,) standard deviations and inflation to the fit, and the number of rounds.
@@ -128,7 +128,7 @@ class _Network(Method):
     train: Train
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the network at rest, with the covariances of least squares and of training."""
+        """Return the estimate of the trained network; its covariance includes the noise of training."""
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -137,7 +137,7 @@ class _Network(Method):
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, iterations=rounds)
 
 
-_LIKE_WLS = "each joint's torque is as noisy as its own residuals say, q, v and a exact"
+_LIKE_WLS = "torque noise of each joint from its residuals; q, v and a exact"
 ADALINE = _Network(
     "adaline", f"{_LIKE_WLS}; samples in random order",
     lambda problem, std, tau: adaline(samples_of(problem), problem.pooled, std, tau),

@@ -40,7 +40,7 @@ from calib.rooms.studies.methods.simulated_robot import (
 
 @dataclass(frozen=True)
 class _OutputError(Method):
-    """A method that fits the simulated closed loop to the recordings; see the module.
+    """Identification that fits the simulated closed loop to the recordings.
 
     Attributes:
         torques: whether torques are compared, and not positions.
@@ -52,7 +52,7 @@ class _OutputError(Method):
     torques: bool
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's columns; one simulation gives motion and tangents.
+        """Return the estimate of the problem's parameters; one simulation gives motion and Jacobian.
 
         Raises:
             UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
@@ -103,7 +103,7 @@ class _Comparison:
     count: list[int] = field(default_factory=lambda: [0])
 
     def simulated(self, values: np.ndarray) -> None:
-        """Return the simulated loops; raise if they cannot be simulated."""
+        """Simulate all loops with the parameters (p,); raise if that fails."""
         for case, loop in self.loops.pairs:
             plant, controller = self.robot.at(values, case), loop.controller
             if loop.design is not None:
@@ -112,7 +112,7 @@ class _Comparison:
             simulate(plant, controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, n), zero at samples not compared, and slopes (M, n, p) of the simulated signals."""
+        """Return residuals (M, n), zero at samples not compared, and the Jacobian (M, n, p) of simulated signals."""
         residuals, slopes = [], []
         for case, loop in self.loops.pairs:
             plant, controller, relative = self.robot.at(values, case), loop.controller, None
@@ -136,12 +136,12 @@ class _Comparison:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
-        """Return the slopes (n, p) of the mean diagonal of the inertia, which is linear in the parameters."""
+        """Return the Jacobian (n, p) of the mean diagonal of the inertia matrix with respect to the parameters."""
         p = len(self.robot.columns)
         return np.array([self.robot.at(np.eye(p)[k]).inertia_diagonal(q) for k in range(p)]).T
 
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M n,) and slopes (M n, p) over (n,) std; huge values if the simulation fails."""
+        """Return residuals (M n,) and Jacobian (M n, p) divided by std (n,); huge residuals if the simulation fails."""
         p = len(values)
         impossible = 1e60  # residual of parameters that cannot be simulated: any step that can is better
         try:
@@ -151,7 +151,7 @@ class _Comparison:
         return (residual / std).ravel(), np.asfortranarray((slopes / std[:, None]).reshape(-1, p))
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
-        """Return the parameters that minimise the residuals over (n,) std."""
+        """Return the parameters that minimise the residuals divided by std (n,)."""
         first_damping = 1e-3  # at first
         max_simulations = 25  # simulations with tangents per round
         step_tolerance = 0.05  # standard deviations of the estimate
@@ -169,7 +169,7 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss-Newton step in standard deviations of white residuals: Qᵀ r."""
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of white residuals."""
     p = slopes.shape[2]
     return np.linalg.qr(slopes.reshape(-1, p))[0].T @ residual.ravel()
 
@@ -182,7 +182,7 @@ def _packed(
     slopes: np.ndarray,
     std: np.ndarray,
 ) -> LinearFit:
-    """Return the fit with the covariance H⁻¹ S H⁻¹.
+    """Return the fit for parameters, residuals and Jacobian, with the covariance H⁻¹ S H⁻¹.
 
     Raises:
         Unidentifiable: where the simulated motion does not distinguish parameters.

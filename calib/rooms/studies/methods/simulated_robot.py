@@ -20,7 +20,7 @@ from calib.rooms.closed_loop.simulation import LOWER, Packed, Plant, body_rows, 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """A simulated motion without noise, and its slopes by parameters; M samples, c parameters.
+    """Simulated noise-free motion of M samples, and its derivatives with respect to c parameters.
 
     Attributes:
         t: (M,) [s].
@@ -41,7 +41,7 @@ def simulate_tangents(
     plant: Plant, controller: Controller, reference: Reference, columns: np.ndarray, every: float = 1,
     relative: np.ndarray | None = None,
 ) -> Sensitivities:  # fmt: skip
-    """Return a noise-free simulated motion along a reference, with its slopes by the parameters: exactly, in one pass.
+    """Return a noise-free simulated motion along a reference, and its exact derivatives with respect to the parameters.
 
     Args:
         plant: whose friction hangs on position and velocity alone.
@@ -58,7 +58,7 @@ def simulate_tangents(
     from calib.rooms.studies.methods import tangent_kernels
 
     for one in plant.terms:
-        require(one.form.slopes, f"term '{one.name}' ({one.shape}): no tangents for friction by load or history")
+        require(one.form.slopes, f"term '{one.name}' ({one.shape}): no derivatives for this friction")
     n, count, c = plant.bodies.n, len(reference.t), len(columns)
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = np.arange(c)
@@ -76,14 +76,14 @@ def simulate_tangents(
     # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
     max_slope = 1e20
     if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:  # saturated torques keep only the motion finite
-        raise Diverged(f"the loop is unstable, its slopes diverge: {LOWER}", None)
+        raise Diverged(f"the loop is unstable, its derivatives diverge: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
 
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """A plant prepared for single steps with varying parameters and states."""
+    """Simulated robot prepared for single time steps with varying parameters and states."""
 
     parts: Packed
     layout: Packed
@@ -91,7 +91,7 @@ class Stepper:
     def points(
         self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return states (K, n) a period later under one torque (n,), and M⁻¹ (n, n) of the first.
+        """Return q and v (K, n) one period later under one torque (n,), and M⁻¹ (n, n) of the first state.
 
         Args:
             parameters: (K, p) of each state's robot.
@@ -112,7 +112,7 @@ class Stepper:
     def linearised(
         self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float, columns: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, v (n,) a period later, M⁻¹ (n, n), and slopes (2 n, 2 n + columns) by q, v and parameters."""
+        """Return q, v (n,) one period later, M⁻¹ (n, n), and their Jacobian with respect to q, v and parameters."""
         from calib.rooms.closed_loop import loop_kernels
         from calib.rooms.studies.methods import tangent_kernels
 
@@ -127,7 +127,7 @@ class Stepper:
 
 
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return a plant prepared for single steps, with slopes by the parameters `columns` (c,)."""
+    """Return the stepper of a robot, with derivatives with respect to the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
     return Stepper(packed(plant), (*layout_of(plant), find))
@@ -139,7 +139,7 @@ SHARES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class BelievedRobot:
-    """Robot model whose parameters are a problem's columns.
+    """Robot model to be simulated with the parameters of an identification problem.
 
     Attributes:
         model: with richer friction, where the problem has any.
@@ -152,20 +152,20 @@ class BelievedRobot:
     plant: Plant
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Plant:
-        """Return the robot with the problem's parameters (p,), with the case's payloads only."""
+        """Return the robot with parameters (p,), carrying the payloads of a case."""
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         return replace(self.plant, parameters=parameters * self.carried(case))
 
     def carried(self, case: Case | None) -> np.ndarray:
-        """Return (plant's parameters,) zero for payloads absent from a case, otherwise one."""
+        """Return a factor per robot parameter: 0 for payloads that a case does not carry, otherwise 1."""
         if case is None:
             return np.ones(len(self.plant.parameters))
         return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
 
 
 def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationModel:
-    """Return the model of a problem; refuse other models than motor torques of a serial arm.
+    """Return the model of a problem; raise unless it is a serial arm with motor torques.
 
     Raises:
         UsageError: for another.
@@ -177,7 +177,7 @@ def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationMod
 
 
 def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot:
-    """Return the robot model of an identification problem.
+    """Return the robot model that simulates an identification problem.
 
     Raises:
         UsageError: for a model that is no serial arm with motor torques.
@@ -190,7 +190,7 @@ def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot
 
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
-    """Return a problem's model with its richer friction, and the index (p,) of each problem column in it."""
+    """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
     extra = [one for one in problem.terms[problem.base.b :] if one is not None]
     model = model.with_terms(*extra)
     return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
@@ -203,7 +203,7 @@ def start_of(
     inertia: np.ndarray,
     simulated: Callable[[np.ndarray], object],
 ) -> np.ndarray:
-    """Return initial parameter values (p,): those stated, or those nearest to least squares that can be simulated.
+    """Return initial parameters (p,): the stated ones, or the nearest to least squares that can be simulated.
 
     Args:
         method: name of the one that simulates.
@@ -234,11 +234,11 @@ def start_of(
             failure = failure or error
         else:
             return values
-    raise CannotSimulate(f"no simulable robot between least squares and regular inertias: {failure}", plain)
+    raise CannotSimulate(f"no parameters between least squares and regular inertias can be simulated: {failure}", plain)
 
 
 def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
-    """Return parameters (p,) of bodies with only this inertia about the joint axis, or this mass along it."""
+    """Return parameters (p,) of bodies that have only the inertia (n,) about their joint axis, or the mass along it."""
     result = np.zeros(model.p)
     for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
         if coordinate >= 0:

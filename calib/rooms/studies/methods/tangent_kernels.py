@@ -1,4 +1,4 @@
-"""Compiled tangents of the closed loop (numba): derivatives of a simulated motion by each parameter.
+"""Compiled derivatives of the closed loop (numba): a simulated motion's Jacobian with respect to parameters.
 
 The exact derivative of what `loop_kernels` computes, step by step. With K = ∂tau/∂q, D = ∂tau/∂v and Y = ∂tau/∂χ of the
 inverse dynamics at a state and its accelerations,
@@ -45,7 +45,7 @@ from calib.rooms.closed_loop.loop_kernels import (
 
 @njit(**OPTIONS)
 def _outward(tree, body, v, a, work, own, more):
-    """Write accelerations, ψ̇, ψ̈, and of each body alone inertia, wrench, P and L; `work` as `dynamics` left it."""
+    """Write accelerations, ψ̇ and ψ̈, and each body's inertia, wrench, P and L; `work` is that of `dynamics`."""
     count = tree.shape[0]
     for i in range(count):
         for r in range(10):
@@ -108,7 +108,7 @@ def _outward(tree, body, v, a, work, own, more):
 
 @njit(**OPTIONS)
 def _slopes(tree, work, more, by_q, by_v):
-    """Add K and D (n, n) of the bodies; composites are summed up on the way."""
+    """Add the bodies' part of K and D (n, n), summing composite quantities from the tips to the base."""
     count = tree.shape[0]
     for i in range(count - 1, -1, -1):
         p, c = tree[i, 0], tree[i, 2]
@@ -178,7 +178,7 @@ def _slopes(tree, work, more, by_q, by_v):
 
 @njit(**OPTIONS)
 def _columns(tree, order, find, work, more, ten, out):
-    """Add Y (n, c) of the bodies' parameters that have a column."""
+    """Add the derivatives Y (n, c) with respect to the bodies' parameters that have a column."""
     count = tree.shape[0]
     for i in range(count):
         wanted = False
@@ -234,7 +234,7 @@ def _linearise(
     tree, body, linear, kinds, acts, order, entries, shares, owners, find, memory, q, v, a, work, own, more, ten,
     by_q, by_v, out,
 ):  # fmt: skip
-    """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a; `work` as `dynamics` left it."""
+    """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a; `work` is that of `dynamics`."""
     n = q.shape[0]
     by_q[:] = 0.0
     out[:] = 0.0
@@ -349,7 +349,7 @@ def _workspace(bodies, n, c):
 
 @njit(**OPTIONS)
 def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
-    """Advance a state q, v (n,) with parameters (p,) by a period under one torque (n,), with its slopes.
+    """Advance a state q, v (n,) by a period under one torque (n,); write its Jacobian into dq and dv.
 
     dq, dv (n, 2 n + c): slopes by q, v and the c parameters of `layout`, whose columns start at 2 n. Writes M⁻¹ into
     gain (n, n); returns a status.
@@ -383,7 +383,7 @@ def _command_tangent(
     plant, layout, model, empty, gains, relative, ahead, read, speed, dread, dspeed, dintegral, feedback, wish, dwish,
     work, matrix, rooms,
 ):  # fmt: skip
-    """Write the tangents of the command (n, c) before saturation; feedback (n,): what it is without torque ahead."""
+    """Write the derivatives (n, c) of the command before saturation; feedback (n,) is its feedback part."""
     own, more, ten, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
     n = len(dwish)
