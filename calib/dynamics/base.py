@@ -127,13 +127,13 @@ class BaseModel:
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of Σ weights · regressor by q, v, a, each (N, n); weights (N, rows, b)."""
+        """Return the gradients of Σ weights · regressor, weights (N, rows, b), for q, v and a, (N, n) each."""
         return self.model.regressor_gradient(q, v, a, weights, self.base.kept)
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of Σ weights · regressor values by q, v, a, each (N, n); weights (N, rows)."""
+        """Return the gradients of Σ weights · (regressor values), weights (N, rows), for q, v and a, (N, n) each."""
         standard = np.zeros(self.model.p)
         standard[self.base.kept] = values
         return self.model.torque_gradient(q, v, a, standard, weights)
@@ -263,7 +263,7 @@ def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, samples: int) -> Base:
-    """Return the base with ‖W_d - W_k K‖ per dropped column, relative and as rms torque."""
+    """Return the base with the remainder ‖W_d - W_k K‖ of each dropped column, relative and as rms torque."""
     silent, scale = _norms(factor)
     rest = np.linalg.norm(factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients, axis=0)
     rest[silent[split.dropped]] = 0.0

@@ -59,7 +59,7 @@ class DriveTerm:
 
     @property
     def joint(self) -> int | None:
-        """Joint of a term that couples its torque to its own motion; None for a coupling of joints."""
+        """Joint whose motion a single-joint term depends on; None for a coupling of joints."""
         if len(self.acts) != 1 or self.acts[0][1] != ((self.acts[0][0], 1.0),):
             return None
         return self.acts[0][0]
@@ -92,12 +92,12 @@ class DriveTerm:
         return found * np.abs(seen.load) if self.form.loaded and seen.load is not None else found
 
     def slopes(self, seen: Joined) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the derivatives of the column by x, v (N,) and a."""
+        """Return the derivatives of the column with respect to position and velocity (N,), and to acceleration."""
         _, by_x, by_v = self._evaluated(seen, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
     def _evaluated(self, seen: Joined, rows: int) -> np.ndarray:
-        """Return the value (1, N), or value and derivatives by x and v (3, N)."""
+        """Return the value (1, N), or the value with its derivatives with respect to position and velocity (3, N)."""
         from calib.dynamics import shape_kernels
 
         acts, out = np.zeros((1, 8)), np.empty((rows, len(seen.v)))
@@ -200,7 +200,7 @@ def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) ->
 def slopes(
     terms: Sequence[DriveTerm], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
 ) -> None:
-    """Add the derivatives of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
+    """Add the gradients of Σ weights · columns, weights (k, n, N), with respect to q, v and a to `out`, (n, N) each."""
     for weight, one in zip(weights, terms, strict=True):
         require(one.form.slopes, f"term '{one.name}' ({one.shape}) depends on past motion or torques: no derivatives")
         for row, motion in one.acts:
@@ -211,7 +211,7 @@ def slopes(
 
 
 def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
-    """Return the stop operators' states (s, N) of one uninterrupted record q (n, N), starting unstressed.
+    """Return the states (s, N) of friction with memory along one uninterrupted record q (n, N), starting unstressed.
 
         z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1):
 

@@ -68,7 +68,7 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
 
 @njit(**OPTIONS)
 def _unjoint(links, i, rate, motion, slopes):
-    """Reverse the joint terms of `advance`; return the derivatives by joint rate and by its change."""
+    """Reverse the joint terms of `advance`; return the derivatives with respect to joint rate and acceleration."""
     h = i + 1
     if links[i, KIND] == FIXED:
         return 0.0, 0.0
@@ -85,7 +85,7 @@ def _unjoint(links, i, rate, motion, slopes):
 
 @njit(**OPTIONS)
 def _unadvance(links, i, rate, frames, motion, slopes):
-    """Propagate the derivatives by body i's motion to its parent's; return the derivative by the joint position."""
+    """Propagate body i's motion derivatives to its parent; return the derivative with respect to the joint position."""
     p, h = links[i, PARENT] + 1, i + 1
     by_amount = 0.0
     if links[i, KIND] == REVOLUTE:  # d(Rᵀ x)/dθ = -z × Rᵀ x, of the rotated parts of w, dw, a alone
@@ -124,7 +124,7 @@ def _unadvance(links, i, rate, frames, motion, slopes):
 
 @njit(**OPTIONS)
 def _uncarry(links, i, frames, twists, bars):
-    """Propagate the derivatives by body i's twists to its parent's; return the derivative by the joint position."""
+    """Propagate body i's twist derivatives to its parent; return the derivative with respect to the joint position."""
     p, h = links[i, PARENT], i + 1
     x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
     by_amount = 0.0
@@ -168,7 +168,7 @@ def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, g
 
 @njit(**OPTIONS)
 def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weights, gq, gv, ga):
-    """Add the derivatives of Σ weights · Y(q, v, a) by q, v, a to gq, gv, ga (N, n), initially 0; weights (N, n, 10 B).
+    """Add the gradients of Σ weights · Y(q, v, a), weights (N, n, 10 B), to gq, gv, ga (N, n), which start at 0.
 
     Reverse differentiation of the regressor, by hand: one forward pass, one pass back, O(n B) per sample.
     """
@@ -200,7 +200,7 @@ def hung_on_one(links: np.ndarray) -> np.ndarray:
 
 @njit(**OPTIONS)
 def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, parameters, weights, gq, gv, ga):
-    """Add the derivatives of Σ weights · tau(q, v, a), weights (N, n), by q, v, a to gq, gv, ga (N, n), initially 0.
+    """Add the gradients of Σ weights · tau(q, v, a), weights (N, n), to gq, gv, ga (N, n), which start at 0.
 
     `regressor_gradient` for weights of rank one: the joints' twists enter only as their weighted sum, so one virtual
     joint, which every body hangs on (``chain``, `hung_on_one`), does for all of them: O(B) per sample. ``parameters``

@@ -101,7 +101,7 @@ class IdentificationModel:
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the regressor (N, rows, p); memory order (p, rows, N), so that stacking needs no copy.
+        """Return the regressor (N, rows, p), in the memory order (p, rows, N), which stacks without a copy.
 
         Args:
             q, v, a: (N, n) [rad or m, and per s, per s²].
@@ -123,7 +123,7 @@ class IdentificationModel:
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray, columns: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the exact derivatives of Σ weights · regressor(q, v, a) by q, v, a, each (N, n), with all payloads.
+        """Return the exact gradients of Σ weights · regressor(q, v, a) for q, v and a, (N, n) each, with all payloads.
 
         Args:
             weights: (N, rows, c).
@@ -148,7 +148,7 @@ class IdentificationModel:
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of Σ weights · regressor(q, v, a) values by q, v, a, each (N, n), with all payloads.
+        """Return the gradients of Σ weights · (regressor values) for q, v and a, (N, n) each, with all payloads.
 
         Args:
             values: (p,) of the parameters.

@@ -14,7 +14,7 @@ SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def from_standard(parameters: np.ndarray) -> np.ndarray:
-    """Return P (…, 4, 4) of standard parameters XX XY XZ YY YZ ZZ MX MY MZ M (…, 10)."""
+    """Return the pseudo-inertia P (…, 4, 4) of standard parameters XX XY XZ YY YZ ZZ MX MY MZ M (…, 10)."""
     return np.tensordot(np.asarray(parameters, dtype=float), BASIS, axes=1)
 
 
@@ -43,7 +43,7 @@ def margin(parameters: np.ndarray) -> float:
 
 
 def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
-    """Return D(P ‖ P₀) = tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4, Bregman's for -log det (Lee, Wensing & Park 2020).
+    """Return the entropic divergence tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4 of P from P₀ (Lee, Wensing & Park 2020).
 
     Zero only at P = P₀, infinite at the boundary, independent of frame and units.
     """

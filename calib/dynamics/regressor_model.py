@@ -108,7 +108,7 @@ class RegressorModel(Protocol):
         ...
 
     def load_cases(self) -> Loads:
-        """Return the load cases for choosing base columns, each as argument `carried` of the regressor."""
+        """Return the payload combinations for choosing base columns, as in the regressor's argument `carried`."""
         ...
 
     def sample(

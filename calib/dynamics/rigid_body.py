@@ -79,7 +79,7 @@ def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
 def regressor_gradient(
     bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the exact derivatives of s = Σ weights · Y(q, v, a) by q, v and a, three arrays (N, n).
+    """Return the exact gradients of Σ weights · Y(q, v, a) with respect to q, v and a, three arrays (N, n).
 
     Args:
         weights: (N, n, 10 B); rank one, ``weights[k] = outer(lambda_k, chi)``, gives the derivatives of
@@ -99,7 +99,7 @@ def regressor_gradient(
 def torque_gradient(
     bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the exact derivatives of Σ weights · tau(q, v, a) by q, v and a, three arrays (N, n); weights (N, n).
+    """Return the exact gradients of Σ weights · tau(q, v, a), weights (N, n), for q, v and a, three arrays (N, n).
 
     As `regressor_gradient` with weights of rank one, at a fraction of its cost.
 
@@ -152,7 +152,7 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the joint-space inertia M(q) of the bodies, (N, n, n), each column the torques of a unit acceleration."""
+    """Return the joint-space inertia matrices M(q) (N, n, n) of the bodies."""
     q, free = np.asarray(q, dtype=float), bodies.with_gravity(np.zeros(3))
     units = (np.broadcast_to(one, q.shape) for one in np.eye(bodies.n))
     return np.stack([inverse_dynamics(free, parameters, q, np.zeros_like(q), one) for one in units], axis=2)

@@ -48,7 +48,7 @@ def _band(acts, t, x, v):
 
 @njit(**OPTIONS)
 def shape(code, acts, t, x, v, state):
-    """Return a shape per unit of its parameter (and load, if it has one), and its derivatives by x and v.
+    """Return the value of a shape per unit parameter, and its derivatives with respect to position and velocity.
 
     Args:
         code: which shape.
@@ -101,7 +101,7 @@ def shape(code, acts, t, x, v, state):
 
 @njit(**OPTIONS)
 def steepest(code, acts, t):
-    """Return a smoothed sign's largest slope by v, the |v| where it occurs, its width, and the stiffness of a stop."""
+    """Return a smoothed sign's largest slope, the |v| where it occurs, its width, and the stiffness of a stop."""
     first, second, third = acts[t, 1], acts[t, 2], acts[t, 3]
     if code in (SIGN, LOAD):
         return 1.0 / first, 0.0, first, 0.0
@@ -120,7 +120,7 @@ def steepest(code, acts, t):
 
 @njit(**OPTIONS)
 def fill(code, acts, x, v, state, out):
-    """Write the values of one shape into out (1, N), with derivatives by x and v for out (3, N)."""
+    """Write the values of one shape into out (1, N); for out (3, N) also the derivatives for position and velocity."""
     for k in range(v.shape[0]):
         value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
         out[0, k] = value

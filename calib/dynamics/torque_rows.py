@@ -95,12 +95,12 @@ class TorqueRows:
 
     @property
     def motors_alone(self) -> bool:
-        """Whether the rows are only the motors' torques, joint by joint."""
+        """Whether the rows are the motor torques only, one per joint."""
         return self.projection is None and self.with_motors and len(self.blocks) == 1
 
     @property
     def with_motors(self) -> bool:
-        """Whether the last rows are the motors' whole torques, joint by joint."""
+        """Whether the last rows are the complete motor torques, one per joint."""
         last = self.blocks[-1]
         return self.projection is None and last.motor == 1.0 and last.sensor == 0.0 and BODIES in last.sides
 
@@ -208,13 +208,13 @@ class TorqueRows:
         return np.einsum("nrk,nk->nr", own(q, v), stacked)
 
     def repeated(self, n: int) -> np.ndarray:
-        """Return for each row (rows,) the row with the same non-zero entries; itself if there are none."""
+        """Return for each row (rows,) the index of a row with the same non-zero entries, else its own index."""
         rows = np.arange(self.count(n))
         return rows if self.projection is not None else rows % n + n * (len(self.blocks) - 1)
 
 
 def projected(name: str, projection: Projection, of: TorqueRows | None = None) -> TorqueRows:
-    """Return the projection of other torque rows, by default of the motors' torques."""
+    """Return torque rows that project other ones, by default those of the motors, onto fewer coordinates."""
     return replace(MOTOR if of is None else of, name=name, projection=projection)
 
 

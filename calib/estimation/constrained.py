@@ -56,7 +56,7 @@ class Definite:
 
 @dataclass(frozen=True, eq=False)
 class ConeOptimum:
-    """Optimum b (p,) of a cone program, and multipliers of rows (c,), of matrices (k, n, n), of equalities (e,)."""
+    """Optimum b (p,) of a cone program, with the multipliers of rows (c,), matrices (k, n, n) and equalities (e,)."""
 
     values: np.ndarray
     rows: np.ndarray
@@ -118,7 +118,7 @@ def minimise(
 
 
 def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
-    """Return rows of lower <= A b <= upper that contradict each other; an empty result if some b satisfies all rows.
+    """Return the indices of rows lower <= A b <= upper that contradict each other; empty if all can be satisfied.
 
     A linear program over the excess of each row; the rows are those with a multiplier, Farkas' certificate.
     """
@@ -249,7 +249,7 @@ def within(
 
 
 class _Planes:
-    """Problem A b >= e and E b = d without matrices, in scaled units.
+    """Problem with the linear constraints A b >= e and E b = d only, in scaled units.
 
     Columns of R and rows of A and E of unit norm, ‖z‖ = 1: `upper`, `target`, `scaled` and `edges` in b / `unit`.
     """

@@ -38,7 +38,7 @@ class Estimate(Frozen):
             return np.where(self.values == 0.0, np.inf, 100.0 * self.sigma / np.abs(self.values))
 
     def strong_correlations(self, threshold: float = 0.95) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters with estimates correlated above `threshold` in magnitude, strongest first."""
+        """Return the pairs of parameters with |correlation| above `threshold`, strongest first."""
         sigma = np.where(self.sigma > 0, self.sigma, 1.0)
         correlation = self.covariance / np.outer(sigma, sigma)
         rows, columns = np.triu_indices(len(sigma), 1)

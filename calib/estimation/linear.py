@@ -169,11 +169,11 @@ def _pack(
 
 
 def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return each group's share of the p parameters, h_g = ‖W_g R⁻¹‖² / σ_g² (g,)."""
+    """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; their sum is p."""
     return np.sum((data.factors[:, :, :-1] @ inverse) ** 2, axis=(1, 2)) / std**2
 
 
 def _floored(std: np.ndarray) -> np.ndarray:
-    """Return std with a floor of 1e-9 of the largest, so that exact data do not get infinite weights."""
+    """Return std with a floor of 1e-9 times the largest, which keeps the weights of exact data finite."""
     largest = std.max(initial=0.0)
     return np.maximum(std, 1e-9 * largest) if largest > 0.0 else np.ones_like(std)

@@ -16,11 +16,11 @@ State = TypeVar("State")
 
 
 class Status(Enum):
-    """How an iteration ended, with advice."""
+    """Reason for the end of an iteration, with advice."""
 
     CONVERGED = "converged"
     STALLED = "stalled: no damping gives a better step; the model is at its smallest residual or the Jacobian is wrong"
-    ITERATIONS = "stopped at the iteration limit; start nearer (a better nominal, fewer free parameters)"
+    ITERATIONS = "stopped at the iteration limit; start closer (better nominal values, fewer free parameters)"
 
     @property
     def good(self) -> bool:

@@ -76,7 +76,7 @@ class Condensed:
     blocks: tuple[tuple[np.ndarray, np.ndarray | None], ...]
 
     def columns(self, matrix: np.ndarray) -> np.ndarray:
-        """Return Wᵀ in these coordinates (r, ...) from that in x (p, ...)."""
+        """Return Wᵀ (r, ...) in these coordinates from Wᵀ (p, ...) in the original ones."""
         flat = matrix.reshape(len(matrix), -1)
         parts = [flat[own] if basis is None else basis.T @ flat[own] for own, basis in self.blocks]
         return np.concatenate(parts).reshape(-1, *matrix.shape[1:])

@@ -1,4 +1,4 @@
-"""Weights of robust losses: how much a residual that is too large still counts, of single rows and of whole samples.
+"""Weights of robust losses: of the residuals of single rows, and of whole samples.
 
 For e ~ N(0, S) with n joints the size d = (eᵀ S⁻¹ e)^½ is chi-distributed, so what counts as large grows with n. The
 expectations below are means over 4000 quantiles of d², good to four digits.
