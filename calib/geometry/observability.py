@@ -25,7 +25,7 @@ PLACES = {"station": "the placement of the instrument", "tool": "the mounting of
 
 
 def unidentified(found: GeometricFit) -> list[Finding]:
-    """Return findings on what a fit's poses do not identify: rank, parameters, placements."""
+    """Return findings on the parameters and placements that a fit's poses do not identify, and on the rank."""
     if (split := found.split) is None:
         return _loose(found)
     values, rank = split.singular_values, split.rank

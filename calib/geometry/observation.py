@@ -191,7 +191,7 @@ def _index(names: tuple[str, ...], name: str, what: str) -> int:
 
 
 def predict(cell: Installation, block: Block) -> Seen:
-    """Return the predicted targets of a block in the instrument's frame."""
+    """Return the predicted targets of a block's rows, in the instrument's frame."""
     return see(cell, block.measured.q, block.station, block.tool, block.bases, block.given)
 
 

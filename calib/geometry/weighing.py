@@ -66,7 +66,7 @@ class GeometricFit:
     prior: np.ndarray | None = None
 
     def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
-        """Return (file, row, label, size in robust sigmas, size [m or rad]) of outlier rows, worst first.
+        """Return the outlier rows, worst first: file, row, label, size in robust sigmas, size [m or rad].
 
         Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
         that an optimistic instrument does not make every row an outlier.
@@ -161,7 +161,7 @@ class Settings:
 
 
 class Weigher:
-    """State of the weighing between passes: sigmas and robust weights of every part."""
+    """Sigmas and robust weights of every residual part, updated between passes of a fit."""
 
     def __init__(
         self, settings: Settings, nominal: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
@@ -270,5 +270,5 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
 
 
 def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
-    """Return each row's residual in sigmas (m,), rms over its components, without common noise."""
+    """Return each row's residual in sigmas (m,), rms over its components, without the noise that rows share."""
     return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

@@ -244,7 +244,7 @@ class _Climber:
             unseen = self._statistics(found, ()).error(NONE).rms
             better = unseen < error * (1.0 - MIN_GAIN)
             kept = better if model == "auto" else name == last
-            note = "" if better else "no better on unseen rows"
+            note = "" if better else "no better on held-out rows"
             self.rungs.append(ModelStep(name, len(found.free), 1e3 * unseen, kept, note))
             self.full = found if name == "geometry" else None
             if kept:
@@ -310,7 +310,7 @@ class _Climber:
                 tried[name] = statistics.error(where[name])
             best = min(waiting, key=lambda name: tried[name].rms)
             pays = tried[best].rms < error.rms * (1.0 - MIN_GAIN) and tried[best].wins(error)
-            note = "" if pays else "no better on unseen rows: not used"
+            note = "" if pays else "no better on held-out rows: not used"
             self.rungs += [
                 _rung(statistics, name, where[name], tried[name].rms, note) for name in ([best] if pays else waiting)
             ]
@@ -328,7 +328,7 @@ class _Climber:
             climbed: number of steps tried before them, the geometry last.
         """
         pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - MIN_GAIN)
-        note = "better together with the next effects" if pays else "no better on unseen rows than without the geometry"
+        note = "better together with the next effects" if pays else "no better on held-out rows than without geometry"
         for k in range(climbed - 1, climbed if pays else len(self.rungs)):
             self.rungs[k] = replace(self.rungs[k], kept=pays, note=note)
         return kept if pays else []

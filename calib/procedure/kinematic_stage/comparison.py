@@ -50,7 +50,7 @@ class Intervals:
 
     @property
     def record(self) -> IntervalCoverage:
-        """Coverage of the intervals, their median radius, and the number of extrapolating rows."""
+        """Coverage of the 95 % intervals, their median radius, and the number of rows that extrapolate."""
         return IntervalCoverage(
             coverage_percent=100.0 * self.covered,
             median_mm=1e3 * float(np.median(self.radius)),

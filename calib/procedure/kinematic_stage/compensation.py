@@ -74,7 +74,7 @@ class Fitted:
 
     @property
     def placed(self) -> bool:
-        """Whether the placement of the nominal robot is known."""
+        """Whether the fit states where the nominal robot stands."""
         return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(self.nominal.station_names)
 
     @property
@@ -147,7 +147,7 @@ def read(folder: str | Path) -> Fitted:
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
-    """Return the nominal and the calibrated arm in one frame, each with one station and one tool.
+    """Return the nominal and the calibrated arm in the frame of the targets, each with one station and one tool.
 
     Args:
         fitted: see `read`.
@@ -308,7 +308,7 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 
 
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the nominal robot's joint positions (m, n); of several solutions the one nearest to `start` (max norm)."""
+    """Return the nominal robot's joint positions (m, n): of several solutions, the one nearest to `start`."""
     best, cost = np.tile(start, (len(poses), 1)), np.full(len(poses), np.inf)
     for first in (start, *others):
         q = inverse.reach(goal, poses, np.tile(first, (len(poses), 1)))
@@ -320,7 +320,7 @@ def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, others: np.ndarray
 
 
 def _sizes(difference: np.ndarray) -> np.ndarray:
-    """Return lengths (m, 2) of position and orientation differences; NaN if orientations are not required."""
+    """Return the lengths (m, 2) of position [m] and orientation [rad] differences; NaN without orientations."""
     position = np.linalg.norm(difference[:, :3], axis=1)
     turn = np.linalg.norm(difference[:, 3:], axis=1) if difference.shape[1] > 3 else np.full(len(position), np.nan)
     return np.stack([position, turn], axis=1)

@@ -100,7 +100,7 @@ def run(
     progress: Progress | None = None,
     selection: SelectionPrediction | None = None,
 ) -> Outcome:
-    """Return the outcome of a fit: the model, errors on all rows, and the verdict.
+    """Return the outcome of a fit: the chosen model, errors on all rows, and the verdict.
 
     Args:
         inputs: see `calib.procedure.kinematic_stage.inputs.gather`.

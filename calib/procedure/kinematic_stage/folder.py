@@ -99,7 +99,7 @@ class FitFolder:
 
 @dataclass(frozen=True)
 class ValidationFolder:
-    """Folder of a fit's validation on unseen rows in a session: paths of its files, and their content."""
+    """Folder of a fit's validation in a session: paths of its files, and their content."""
 
     path: Path
 

@@ -256,7 +256,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     held = round(share * count)
     order = np.random.default_rng(seed).permutation(count)
     if held == 0 or held == count:
-        raise MeasurementError(f"holding out a share of {share:g} of {count} poses leaves {held} of them", block.file)
+        raise MeasurementError(f"a hold-out share of {share:g} gives {held} of {count} poses; change it", block.file)
     aside = np.isin(unit, order[count - held :])
     return take(block, np.flatnonzero(~aside)), take(block, np.flatnonzero(aside))
 

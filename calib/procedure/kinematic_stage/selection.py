@@ -249,7 +249,7 @@ def bound_words(found: Selection) -> str:
     climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
     if not climbs:
         return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
-    return f"of all feasible poses, as far as {climbs} searches for better poses show; not tight by at most {gap:.2g} %"
+    return f"of all feasible poses, as found by {climbs} searches; the bound is at most {gap:.2g} % too high"
 
 
 def record(chosen: Chosen) -> dict[str, Any]:

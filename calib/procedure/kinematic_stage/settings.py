@@ -6,7 +6,7 @@ from typing import Annotated
 from calib.arguments import checked
 from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, Seed, Text, Typed, Whole
 from calib.data.poses import MIN_SIGMA, Loss, Model
-from calib.procedure.measuring.run_settings import DEFAULT_RUN, RunSettings
+from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 
 DELIVERABLES = ("urdf", "corrections")  # what a verdict is about: robot.urdf alone, or with joint_corrections.csv
 Place = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity="length")]  # of a target in the tip's frame

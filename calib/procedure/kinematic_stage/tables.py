@@ -120,7 +120,7 @@ COMPONENTS = {
 
 
 def write_residuals(outcome: Outcome, path: Path) -> Path:
-    """Write the residual (measured minus predicted) of every row, fitted (with its robust weight) and unseen.
+    """Write the residual (measured minus predicted) of every row: fitted, held out or validation.
 
     Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
     deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
@@ -180,7 +180,7 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
 
 
 def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
-    """Write the errors of both arms at every unseen row; for measured positions, with position and direction.
+    """Write the errors of both arms at every validation row; of positions, also the error vectors.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
     puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.

@@ -1,0 +1,24 @@
+"""Measuring at selected poses: their limits, run and prediction; settings of a run (speed and dwell time)."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from calib.arguments import checked
+from calib.config_types import Real
+
+
+@checked
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of a run: speed and dwell time.
+
+    Attributes:
+        speed: speed of the run, as a share of the joints' largest speeds.
+        dwell: time at each pose to settle and measure [s].
+    """
+
+    speed: Annotated[float, Real(above=0.0, most=1.0, unit="of the joints' speeds")] = 0.3
+    dwell: Annotated[float, Real(least=0.0, most=3600.0, unit="s")] = 6.0
+
+
+DEFAULT_RUN = RunSettings()

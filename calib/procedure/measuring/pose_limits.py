@@ -290,7 +290,7 @@ def _collision(
     kept += [f"obstacle {one.name}" for one in obstacles if one.name not in idle]
     notes = (*notes, *far)
     if kept:
-        kept[-1] += f", {1e3 * table.margin:g} mm off each"
+        kept[-1] += f", {1e3 * table.margin:g} mm clearance each"
     return model, tuple(kept), notes
 
 

@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from calib import files
 from calib.data.csv_table import read_table
-from calib.procedure.measuring.run_settings import DEFAULT_RUN, RunSettings
+from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
 from poses.by_index import merits
 from poses.indices import Index, observability
@@ -328,13 +328,13 @@ class Exchange:
     index: Index
 
     def value(self, q: np.ndarray) -> tuple[float, float]:
-        """Return the index and log det(WᵀW) / p of poses (m, n), together with earlier ones."""
+        """Return the index, and log det(WᵀW) / p, of poses (m, n) together with the poses measured before."""
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
         return observability(rows, self.index), float(log_det(flat.T @ flat)) / rows.shape[2]
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
-        """Return the candidates' indices (N,), sorted by the index that they give together with poses (m, n)."""
+        """Return the candidates' numbers (N,), best first, by the index that each gives together with poses (m, n)."""
         rows, trials = self._rows(q), self.jacobian(self.candidates)
         flat = rows.reshape(-1, rows.shape[2])
         matrices = flat.T @ flat + trials.transpose(0, 2, 1) @ trials
@@ -406,7 +406,7 @@ def drivable(
 def _rejoined(
     chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: Any, settings: RunSettings, seed: int
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
-    """Return reachable poses (m, n), the replacements (place -> candidate), and all clear paths."""
+    """Return the poses (m, n) with unreachable ones replaced, the replacements (place -> candidate), and all paths."""
     q, found, ways = q.copy(), dict[int, int](), run.found_ways
     joined = [k for k in range(len(q)) if k not in run.cut_off]
     for place in run.cut_off:

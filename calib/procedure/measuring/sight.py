@@ -147,7 +147,7 @@ def sight_of(
 
 
 def _beside(arm: Any, chain: Chain, target: Target) -> np.ndarray:
-    """Return the indices of the links that can block the view: those not next to the target in every posture."""
+    """Return the indices of the links that can block the view: not those next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
     place = target(q)[1]
     distances = arm.beam(q, place, np.zeros((len(q), 3, chain.n)), place + 1e-6)[0]
