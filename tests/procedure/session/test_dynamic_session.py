@@ -175,7 +175,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (scaled("tau_joint4", -1.0), "training.csv: torque of joint4 .* reverse the sign of the column of joint4"),
         (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
         (scaled("tau_joint", 1e-2), "times those of the nominal masses"),
-        (numbers(another), "this is not the motion designed here"),
+        (numbers(another), "does not contain the motion designed in this session"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
@@ -192,7 +192,7 @@ def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], st
 def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_proof(recorded: Session) -> None:
     one, two = recorded.path("7-recorded/training.csv"), recorded.path("7-recorded/validation.csv")
     shutil.copyfile(two, one)
-    with pytest.raises(MeasurementError, match="this is the validation motion"):
+    with pytest.raises(MeasurementError, match="contains the validation motion instead"):
         go_on(recorded)
 
 
