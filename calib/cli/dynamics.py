@@ -29,10 +29,10 @@ def identify_dynamics(
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
 
     Args:
-        recordings: recordings of q and torque or current; log.npz@0:9.4 cuts
+        recordings: recordings of q and torque or current; log.npz@0:9.4 takes seconds 0 to 9.4
         out: folder for the identified model and its report
         validate: recording of other motion; may be repeated
-        method: wls and others: calib study --list-methods
+        method: wls or another one, see `calib study --list-methods`
         friction: auto, standard, or one step: load, presliding, cable, stribeck, ...
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result
@@ -109,7 +109,7 @@ def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = Fa
 
     Args:
         folder: folder written by calib excite
-        log: a recording of it; log.npz@0:90 cuts
+        log: a recording of it; log.npz@0:90 takes seconds 0 to 90
         out: the averaged period: .npz with its variance, or .csv
         skip: whole periods to leave out at the beginning
     """

@@ -34,7 +34,7 @@ def new(
     stands on the certificate.
 
     Args:
-        dynamics_only: measure nothing: the description is taken as calibrated
+        dynamics_only: identify the dynamics only; the geometry is taken from the robot's file
         poses: poses to choose for the fit
         validation: poses to measure for validation only, not fitted; 0 for none
     """

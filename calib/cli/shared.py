@@ -200,7 +200,7 @@ class Common:
         workers: local processes, or the address of a Dask scheduler.
         plots: draw figures, or leave them out.
         verbose: print all details, tables included.
-        overwrite: replace any existing files; without: only those of an earlier run.
+        overwrite: replace all existing files; without it, only those of an earlier run.
     """
 
 

@@ -24,18 +24,18 @@ class Answers:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none.
         tool: x,y,z: approximate position of the target in the tip's frame [m].
-        limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; none: asked for now.
-        mounting: of a camera: in hand (the arm carries it), to hand (the board), or unknown.
-        lens: camera_info YAML of the camera, approximate; or unknown.
-        board: board.toml, of calib board; or unknown.
-        carried: placement of the carried camera or board in the tip's frame [m]: 'x,y,z facing z'; or unknown.
-        stands: placement of the other one in the robot's base frame [m]: '0.5,0,0 facing z'; or unknown.
+        limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; none: asked in questions.
+        mounting: in hand (the arm holds the camera), to hand (the arm holds the board), or unknown.
+        lens: camera_info YAML with approximate values of the camera's lens; or unknown.
+        board: board.toml as `calib board` writes it; or unknown.
+        carried: placement of what the arm holds (camera or board) in the tip's frame [m]: 'x,y,z facing z'; or unknown.
+        stands: placement of the fixed camera or board in the robot's base frame [m]: '0.5,0,0 facing z'; or unknown.
         instrument_at: x,y,z: position of the instrument in the robot's base frame [m]; unknown, or none.
         cone: half angle of the cone in which the target sees the instrument [deg] (a reflector: 30); or unknown.
         facing: direction that the target faces in the tip's frame: z, -x ….
         box: x,x,y,y,z,z: box around all parts of the arm, in its base frame [m]; unknown, or none.
         obstacles: 'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]: shape, size, centre; unknown, or none; repeatable.
-        dynamics: identify the dynamics, too (default).
+        dynamics: identify the dynamics, too (default), or fit the geometry only.
         torques: which torques the log contains.
         payloads: label=kg of a payload for additional recordings; repeatable.
     """

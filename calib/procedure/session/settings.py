@@ -99,8 +99,9 @@ class InstrumentSection:
     """Section ``[instrument]``: the instrument, and its sigmas.
 
     Attributes:
-        measures: pose (with orientation), position or pixels; nothing: the geometry is not fitted
-        sigma_position: of one measurement, per axis; 0: to be estimated
+        measures: pose (position and orientation), position or pixels; nothing: the geometry is not fitted
+        sigma_position: standard deviation of one measurement, per axis [m]; 0: estimated from the residuals
+        sigma_orientation: standard deviation of one measurement, per axis [rad]; 0: estimated from the residuals
         tool: approximate position of the target in the tip's frame; for pose selection only
     """
 
@@ -119,7 +120,9 @@ class PosesSection:
     Attributes:
         fit: number of poses to choose for the fit
         validation: number of additional poses, never fitted; 0: no validation
-        plan: false: measured files contain other poses than those chosen here
+        plan: true: the chosen poses are measured; false: the measured files contain other poses
+        index: observability index that the chosen poses maximise
+        method: search method for the poses
         constraints: a TOML file next to this one; see `calib formats constraints`
     """
 
@@ -140,8 +143,8 @@ class FitSection:
         model: or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
         loss: or none, huber, cauchy; auto: robust if rows are grossly wrong
         options: a TOML file next to this one: column names, units; see `calib formats options`
-        stations: each measured file has its own base placement, or one for all
-        validation_frames: own: base and tool placement are fitted anew on validation files
+        stations: base placements of the robot: each (one per measured file) or one (the same for all files)
+        validation_frames: base and tool placement of validation files: fit (as fitted) or own (fitted anew)
         tolerance_mm: largest accepted rms [mm] on unseen poses, above it the verdict is fail; 0: none, and
             pass only means better than the nominal robot
         deliverable: what the verdict rates: robot.urdf alone, or corrections: with joint_corrections.csv
@@ -164,25 +167,25 @@ class DynamicsSection:
     """Section ``[dynamics]``: identification and validation of the dynamics.
 
     Attributes:
-        wanted: false: geometry only
-        plan: false: recorded files contain other motions than those designed here
-        validation: false: no second motion is designed or requested
+        wanted: true: identify the dynamics, too; false: geometry only
+        plan: true: the designed motions are recorded; false: the recordings contain other motions
+        validation: true: a second motion is recorded for validation; false: none is requested
         period: of the designed motion [s]; the validation motion's is 0.8 of it
-        harmonics: frequencies per joint
+        harmonics: number of frequencies per joint
         rate: of the controller [Hz]
         goals, hard, front: of the training motion, see calib excite --help
         repeats: number of repetitions of each motion
-        starts: random starts of the search for a motion
-        evaluations: largest number per start
+        starts: number of random starts of the search for a motion
+        evaluations: largest number of motions that are evaluated per start
         limits: a TOML file next to this one; see `calib formats limits`
         torques: motor, link (sensors behind the gears), or both
         friction: or standard, or one step of the ladder; see calib identify --friction
-        method: or ols, irls, tls
+        method: or ols, irls, tls, …; see calib study --list-methods
         options: a TOML file next to this one; see `calib formats identify-options`
         holdout: share at the end of each recording that is held out if there is no validation recording; 0:
             none
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none
-        payloads: label = mass [kg] of bodies at the flange: loaded = 3.28
+        payloads: masses [kg] of bodies at the flange by label, as loaded = 3.28
     """
 
     wanted: Flag = True
@@ -222,7 +225,7 @@ class SessionSettings:
     """The content of ``session.toml``, by sections.
 
     Attributes:
-        seed: of pose selection, cross-validation and everything else random
+        seed: of pose selection, cross-validation and all other random choices
     """
 
     name: Text
