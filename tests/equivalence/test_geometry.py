@@ -28,9 +28,8 @@ def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> J
     found = read(out / "metrics.json")
     numbers = {key: found[key] for key in ("fit", "validation", "model", "ladder", "not_identifiable")}
     numbers["outliers"] = named(found["outliers"])
-    return Judgement(
-        found["verdict"], found["reason"], numbers, plainly(found["warnings"], robot.parent, fit.parent, unseen.parent)
-    )
+    notes = plainly(found["warnings"], robot.parent, fit.parent, unseen.parent)
+    return Judgement(found["verdict"], found["reason"], numbers, notes)
 
 
 def named(outliers: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -137,19 +136,17 @@ def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[
 
 
 def test_a_robot_that_comes_with_corrections_keeps_them_as_its_nominal(files: Path, tmp_path: Path) -> None:
-    assert not command(
-        "fit", files / "robot.toml", files / "bent_first.csv", "--model", "harmonics", "--out", tmp_path / "0"
-    )
+    first = files / "bent_first.csv"
+    assert not command("fit", files / "robot.toml", first, "--model", "harmonics", "--out", tmp_path / "0")
     fit, unseen = tmp_path / "measured.csv", tmp_path / "validation.csv"
     for path in (fit, unseen):
         shutil.copyfile(files / f"bent_{path.name}", path)
     one = by_command(tmp_path / "0/robot.toml", tmp_path / "1", "geometry", fit, unseen)
     two = by_session(tmp_path / "0/robot.toml", tmp_path / "cell", "geometry", fit, unseen)
     agree(one, two)
-    rms = {
-        arm: two.numbers["validation"]["validation.csv"][arm]["position_mm"]["rms"] for arm in ("nominal", "calibrated")
-    }
-    assert rms["nominal"] < 1.5 * rms["calibrated"]  # it is calibrated already
+    arms = two.numbers["validation"]["validation.csv"]
+    nominal, calibrated = (arms[arm]["position_mm"]["rms"] for arm in ("nominal", "calibrated"))
+    assert nominal < 1.5 * calibrated  # it is calibrated already
 
 
 def test_a_files_name_may_hold_commas_quotes_and_line_breaks(files: Path, tmp_path: Path) -> None:

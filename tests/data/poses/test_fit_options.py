@@ -35,16 +35,9 @@ def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
 
 
 def test_a_files_table_adds_to_what_holds_for_every_file():
-    text = {
-        "kind": "position",
-        "units": {"joints": "deg", "position": "mm"},
-        "sigma": {"position": 1e-5},
-        "files": {
-            "day2.csv": {"kind": "pose", "units": {"position": "m"}, "station": "B"},
-            "a/day3.csv": {"tool": "T"},
-        },
-    }
-    options = parse_options(text)
+    day2 = {"kind": "pose", "units": {"position": "m"}, "station": "B"}
+    every = {"kind": "position", "units": {"joints": "deg", "position": "mm"}, "sigma": {"position": 1e-5}}
+    options = parse_options({**every, "files": {"day2.csv": day2, "a/day3.csv": {"tool": "T"}}})
     own = options.for_file("/data/day2.csv")
     assert own.kind == "pose" and own.units == {"joints": "deg", "position": "m"} and own.station == "B"
     assert own.sigma.position == (1e-5,) * 3
