@@ -1,4 +1,4 @@
-"""Fit a robot's geometry to measured poses in a CSV file, and judge it on poses it has not seen.
+"""Fit a robot's geometry to measured poses in a CSV file, and validate it on held-out poses.
 
 python examples/01_fit_geometry.py [FOLDER]
 """

@@ -1,4 +1,4 @@
-"""Choose the poses at which a robot's geometry shows best, under its joint limits, and compare with random ones.
+"""Choose the best poses to identify a robot's geometry, within its joint limits; compare with random poses.
 
 python examples/02_choose_poses.py [FOLDER]
 """

@@ -1,4 +1,4 @@
-"""Turn nominal targets into the joint commands that put the real tool there, and see where it really stands.
+"""Compute the joint commands that bring the real tool to nominal targets, and check its true position.
 
 python examples/04_compensate.py [FOLDER]
 """

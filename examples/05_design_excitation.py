@@ -1,4 +1,4 @@
-"""Design a motion that shows a robot's dynamics, within its limits.
+"""Design a motion that excites a robot's dynamics, within its limits.
 
 python examples/05_design_excitation.py [FOLDER]
 """

@@ -1,4 +1,4 @@
-"""Identify a robot's dynamics from a recording, and see how well it predicts another motion.
+"""Identify a robot's dynamics from a recording, and validate the model on another motion.
 
 python examples/06_identify_dynamics.py [FOLDER]
 """

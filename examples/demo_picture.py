@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def run(folder: Path) -> tuple[demo.DemoResult, dict[str, float]]:
-    """Run the demonstration in a new folder; return what it came to, and its figures in README and picture."""
+    """Run the demonstration in a new folder; return its result, and its figures for README and picture."""
     began = time.process_time()
     with one_blas_thread():  # as in the command
         found = demo.run(folder, "lwr4plus", 0, print, lambda words: None)
@@ -63,7 +63,7 @@ def run(folder: Path) -> tuple[demo.DemoResult, dict[str, float]]:
 
 
 def pattern(sentence: str) -> re.Pattern[str]:
-    """Return what finds a sentence in the README, a group for each figure."""
+    """Return the pattern that finds a sentence in the README, with one group per figure."""
     return re.compile(FIELD.sub(r"([\\d.]+)", re.escape(sentence).replace(r"\{", "{").replace(r"\}", "}")))
 
 
@@ -80,13 +80,13 @@ def stated() -> dict[str, list[tuple[float, float]]]:
 
 
 def drawn() -> dict[str, float]:
-    """Return the figures that the picture holds."""
+    """Return the figures shown in the picture."""
     with Image.open(PICTURE) as image:
         return json.loads(image.info["figures"])
 
 
 def draw(session: Session, verdict: str, figures: dict[str, float]) -> None:
-    """Draw the tool's errors on unseen poses, and on the unseen motion the torque of the joint that needs most."""
+    """Draw the tool errors on validation poses, and the largest joint torque on the validation motion."""
     report = _read(session.validation.path / "report.json")
     (rows,) = (one for one in report["sets"] if one["unseen"])
     before, after = (1e3 * np.sort(rows[arm]["position"]) for arm in ("nominal", "calibrated"))

@@ -1,4 +1,4 @@
-"""How well identified dynamics predict other motion, beside plain ridge regressions, over many pairs of recordings.
+"""How well identified dynamics predict other motion, compared with ridge regression, on many pairs of recordings.
 
 CALIB_DATA=... python examples/extrapolation.py [--quick] [--only TEXT ...] [--jobs 2] [--out FOLDER]
     [--beside results.json] [--markdown real_recordings.md]
@@ -41,7 +41,7 @@ CUTOFFS = (6.0, 15.0)  # of the ridges' positions [Hz]
 
 
 def state() -> str:
-    """Return what tells one version of the toolkit and of these scripts from another."""
+    """Return a digest of the code of the toolkit and of these scripts."""
     here = Path(__file__).parent
     files = [*sorted(Path(calib.__file__).parent.rglob("*.py")), *sorted(here.glob("extrapolation*.py"))]
     return hashlib.sha1(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
@@ -62,7 +62,7 @@ def squared_errors(test: list[Path], predicted: list[tuple[np.ndarray, np.ndarra
 
 
 def identified_pair(files: Prepared, folder: Path) -> calib.DynamicsModel:
-    """Return what the toolkit identifies from a pair's training files, judged on its test files."""
+    """Return the identification of a pair's training files, validated on its test files."""
     options = folder / "options.toml"
     options.write_text(files.options)
     train, test = ([str(path) for path in paths] for paths in (files.train, files.test))
@@ -120,7 +120,7 @@ def _percent(left: np.ndarray, size: np.ndarray, apart: tuple[int, ...]) -> dict
 
 
 def ratios(one: dict) -> tuple[float, float]:
-    """Return the toolkit's error over the plain ridge's and over the best ridge's; infinite where it refused."""
+    """Return the toolkit's error divided by the plain ridge's and by the best ridge's; infinite if it refused."""
     if one["ours"] is None:
         return np.inf, np.inf
     plain, best = one["ridges"][f"{CUTOFFS[0]:g} Hz, zero"], min(x["total"] for x in one["ridges"].values())

@@ -43,7 +43,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Pair:
-    """What to learn from and what to predict.
+    """A pair of recordings: training data, and the motion to predict.
 
     Attributes:
         across: the test is of another regime: faster, other ranges, all joints after single ones, with a payload.
@@ -90,7 +90,7 @@ def _parts(robot: str, spans: Sequence[tuple[str, Span]], stem: Path) -> list[Pa
 
 
 def _halves(robot: str, name: str, window: float, by: Callable[..., float]) -> list[list[tuple[str, Span]]]:
-    """Return the windows of a log with the lower and with the higher values of ``by(q, v)``, neighbours joined."""
+    """Return the time windows of a log with the lower and with the higher values of ``by(q, v)``."""
     t, q, _ = _read(robot, name)
     low, high = USED.get(robot, (t[0], t[-1]))
     edges = np.linspace(low, high, round((high - low) / window) + 1)
@@ -223,7 +223,7 @@ class Simulated:
     quick: bool = False
 
     def prepare(self, folder: Path) -> Prepared:
-        """Write description, recordings and options."""
+        """Write the robot description, the recordings and the options of a pair."""
         seed = sum(map(ord, self.name))
         robot = simulated.arm(self.arm)
         given = simulated.write_urdf(robot, robot.inertias if self.masses else None, folder / "robot.urdf")

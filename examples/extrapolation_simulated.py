@@ -47,7 +47,7 @@ def _number(text: str | float) -> float:
 
 
 def arm(name: str) -> Arm:
-    """Return an arm of the library; bodies are rods with some thickness where it has none."""
+    """Return an arm of the library; without known masses its bodies are rods."""
     rows = tomllib.loads((LIBRARY / f"{name}.toml").read_text())["joint"]
     mdh = np.array([[_number(row.get(key, 0.0)) for key in ("alpha", "d", "theta", "r")] for row in rows])
     limits = np.array([[_number(row[key]) for row in rows] for key in ("lower", "upper", "velocity", "effort")])
@@ -67,7 +67,7 @@ def _rods(mdh: np.ndarray) -> list[list[float]]:
 
 
 def wrong(inertias: np.ndarray, seed: int) -> np.ndarray:
-    """Return bodies (n, 10) that are heavier or lighter and shifted against others, each a body that can exist."""
+    """Return bodies (n, 10) with random errors of mass and centre; each stays physically consistent."""
     rng, rows = np.random.default_rng([seed, 5]), []
     for row in inertias:
         mass, first = row[9], row[6:9]
@@ -140,7 +140,7 @@ def fourier(
 
 
 def sine(robot: Arm, seconds: float, seed: int, reach: float = 0.4, frequency: float = 0.08) -> np.ndarray:
-    """Return one slow sinusoid that all joints follow, some a quarter of a period later."""
+    """Return a motion where all joints follow one slow sinusoid, some a quarter of a period later."""
     rng, n = np.random.default_rng([seed, 2]), len(robot.mdh)
     phase = 0.5 * np.pi * rng.integers(0, 2, n)
     size = 0.5 * reach * (robot.upper - robot.lower) * rng.uniform(0.6, 1.0, n) * rng.choice([-1, 1], n)
@@ -163,7 +163,7 @@ def points(robot: Arm, seconds: float, seed: int, reach: float = 0.7, speed: flo
 
 
 def each_alone(robot: Arm, seconds: float, seed: int, reach: float = 0.7, speed: float = 0.5) -> np.ndarray:
-    """Return one joint after the other moving, the others standing at one posture."""
+    """Return a motion where one joint after the other moves and all others stand still."""
     n = len(robot.mdh)
     whole = fourier(robot, seconds, seed, reach, speed, period=seconds / n)
     middle, own = 0.5 * (robot.lower + robot.upper), round(seconds / n * FINE)
@@ -182,7 +182,7 @@ def each_alone(robot: Arm, seconds: float, seed: int, reach: float = 0.7, speed:
 def friction(
     family: str, robot: Arm, t: np.ndarray, q: np.ndarray, v: np.ndarray, rng: np.random.Generator, cold: float
 ) -> np.ndarray:
-    """Return what friction takes (N, n) [N m].
+    """Return the friction torques (N, n) [N m] along a motion.
 
     Args:
         family: one of `FAMILIES`.

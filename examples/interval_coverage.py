@@ -97,7 +97,7 @@ def row(name: str, split: str, fits: list[GeometryFit]) -> str:
 
 
 def regions(robot: Path, file: Path) -> Iterator[GeometryFit]:
-    """Yield a fit per region of the joint space that is left out."""
+    """Yield one fit for each left-out region of the joint space."""
     block = gather(robot, [file], settings=FitSettings()).fit[0]
     folds = region_folds([block], seed=REGION_SEED)
     for fold in range(folds.count):
@@ -107,7 +107,7 @@ def regions(robot: Path, file: Path) -> Iterator[GeometryFit]:
 
 
 def ends(robot: Path, file: Path) -> Iterator[GeometryFit]:
-    """Yield a fit per joint and end of its range that is left out."""
+    """Yield one fit for each left-out end of each joint's range."""
     block = gather(robot, [file], settings=FitSettings()).fit[0]
     for joint in np.flatnonzero(np.ptp(block.q, axis=0) > 1e-3):
         low, high = np.quantile(block.q[:, joint], [END, 1.0 - END])
@@ -142,7 +142,7 @@ def motion_rows() -> Iterator[str]:
 
 
 def regime_rows() -> Iterator[str]:
-    """Yield a row per open pair of recordings whose test is of another regime."""
+    """Yield one row for each open pair of recordings whose test data are of another regime."""
     for pair in OPEN:
         if pair.across:
             with tempfile.TemporaryDirectory() as place:
@@ -150,7 +150,7 @@ def regime_rows() -> Iterator[str]:
 
 
 def position_rows() -> Iterator[tuple[str, str, Callable[[], list[GeometryFit]]]]:
-    """Yield recording and split of each row of the positions' table, and what makes its fits."""
+    """Yield the recording, the split and the fits of each row in the table of positions."""
     for name, (robot, file, share) in RECORDINGS.items():
         settings = FitSettings(holdout=share)
         yield name, f"{100 * share:.0f} % at random", lambda: [calib.fit_geometry(robot, file, settings)]  # noqa: B023
@@ -193,7 +193,7 @@ def identified(arm: MovingArm, seeds: Sequence[int]) -> Identification:
 
 
 def parameters(seeds: int = SEEDS) -> None:
-    """Print the share of identified parameters within 1.96 sigma of the arm's own, over seeds of motion and noise.
+    """Print the share of identified parameters within 1.96 σ of the true values, over seeds of motion and noise.
 
     The arm's own friction is that of steady sliding when it is warm. Prediction and verdict, which take most of the
     time of `calib identify`, are left out: no sigma of a parameter depends on them.

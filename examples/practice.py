@@ -21,14 +21,14 @@ TAUGHT = NEAR + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))
 
 
 def enter(script: str) -> None:
-    """Go into the folder that the command line names, by default one named after the script's number."""
+    """Change to the folder given on the command line; by default one named after the script's number."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else f"example-{Path(script).name[:2]}")
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)
 
 
 def ur5() -> cell.Cell:
-    """Return the cell of the UR5 under an optical CMM."""
+    """Return the simulated cell of a UR5 measured by an optical CMM."""
     return virtual_cells.perturbed_cell(calib.load("ur5").chain, seed=1)
 
 
@@ -39,14 +39,14 @@ def measure(path: str, poses: int = 80) -> None:
 
 
 def teach(path: str) -> None:
-    """Write places for the measured tool in the instrument's frame [m], and joints [rad] near which to reach them."""
+    """Write target positions [m] in the instrument's frame, and joint values [rad] near their solutions."""
     exact = cell.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
     seen = cell.measure(replace(ur5(), instrument=exact), TAUGHT)
     write_measured(replace(seen, sigma=None, sigma_rotation=None), path, degrees=False)
 
 
 def missed(q: np.ndarray) -> float:
-    """Return by how far the real tool misses the taught places at joint values q (50, 6) [rad]: rms [mm]."""
+    """Return the distance of the real tool from the taught places at joint values q (50, 6) [rad]: rms [mm]."""
     off = cell.true_poses(ur5(), q)[:, :3, 3] - cell.true_poses(ur5(), TAUGHT)[:, :3, 3]
     return float(1e3 * np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
@@ -61,5 +61,5 @@ def record(path: str, motion: int) -> None:
 
 
 def bring(session: str) -> None:
-    """Bring what a session waits for: measured poses, or logs of its motions."""
+    """Simulate the files that a session waits for: measured poses, or logs of its motions."""
     demo.simulate_next(Path(session), print)

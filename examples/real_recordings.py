@@ -38,7 +38,7 @@ class Row:
 
 
 def geometry(folder: str, robot: str, measured: str, unseen: str = "", holdout: float = 0.0) -> tuple[float, ...]:
-    """Return rms position errors [mm] of the nominal and the calibrated arm on unseen rows."""
+    """Return rms position errors [mm] of the nominal and the calibrated arm on held-out rows."""
     place = DATA / folder
     wanted = FitSettings(holdout=holdout, refit_frames=bool(unseen))
     others = [place / unseen] if unseen else []
@@ -48,7 +48,7 @@ def geometry(folder: str, robot: str, measured: str, unseen: str = "", holdout: 
 
 
 def dynamics(folder: str, train: str, unseen: str, options: dict | None = None) -> tuple[float, ...]:
-    """Return the share of the torque [%] that stays unexplained on unseen motion."""
+    """Return the relative torque error [%] on a validation motion."""
     place = DATA / folder
     read = parse_options(options or {})
     given = recordings.gather(place / "model.urdf", [place / train], [place / unseen], options=read)

@@ -63,14 +63,14 @@ NOISE = 0.05  # of projected corners [px]
 
 
 def fitted(chain: Any, block: PoseMeasurements) -> GeometricFit:
-    """Return the whole geometry fitted to one block."""
+    """Return the fit of the full geometry to one block of images."""
     start = install(chain, [block])
     table = layout(start)
     return fit(start, [block], table.rigid_index)
 
 
 def tracked(cell: Cell, q: np.ndarray, seed: int) -> PoseMeasurements:
-    """Return what a tracker measures of a reflector beside the camera."""
+    """Return the positions of a reflector next to the camera, measured by a tracker."""
     tracker = SimulatedInstrument("laser tracker", 20e-6, None, encoder_sigma=ENCODER)
     truth = replace(
         cell.truth, stations=pose(None, [2.5, 1.0, 0.5])[None], tools=pose(None, [0.05, 0.0, 0.08])[None]
@@ -79,7 +79,7 @@ def tracked(cell: Cell, q: np.ndarray, seed: int) -> PoseMeasurements:
 
 
 def accuracy(found: CameraCell, images: Pixels, counts: tuple[int, ...], seed: int) -> dict[str, Any]:
-    """Return errors of the tool [mm] by count of images and way of fitting, and what the fit itself says."""
+    """Return the tool errors [mm] by number of images and kind of fit, with the σ stated by the fit."""
     cell, arm = found.cell, found.cell.nominal
 
     def error(result: GeometricFit) -> float:
@@ -106,7 +106,7 @@ def accuracy(found: CameraCell, images: Pixels, counts: tuple[int, ...], seed: i
 
 
 def rendered(found: CameraCell, folder: Path, count: int, seed: int, sought: Views) -> tuple[Pixels, float]:
-    """Return corners found in rendered images, and how many a processor second looks at; images are kept."""
+    """Return the corners found in rendered images, and the number of images per processor second."""
     if not (folder / "joints.csv").exists():
         take_pictures(found, views(found, count, seed, sought), folder, seed=seed)
     (folder / "corners.csv").unlink(missing_ok=True)
@@ -117,7 +117,7 @@ def rendered(found: CameraCell, folder: Path, count: int, seed: int, sought: Vie
 
 
 def speed(found: CameraCell, counts: tuple[int, ...], seed: int) -> dict[str, Any]:
-    """Return seconds and memory of fits of many images, all corners in view."""
+    """Return processor seconds and memory of fits to many images with all corners in view."""
     result: dict[str, Any] = {}
     for count in counts:
         drawn = views(found, min(count, 1000), seed)
@@ -135,7 +135,7 @@ def speed(found: CameraCell, counts: tuple[int, ...], seed: int) -> dict[str, An
 
 
 def repeated(found: CameraCell, seeds: int, images: int = 40) -> dict[str, Any]:
-    """Return how often 95 % intervals hold, and both ways' errors of the tool [mm], over seeds.
+    """Return the coverage of 95 % intervals, and the tool errors [mm] of both kinds of fit, over seeds.
 
     The hidden arm differs from the nominal in what images can tell alone, so that estimates compare with the truth.
     """
@@ -176,7 +176,7 @@ def _memory() -> float:
 
 
 def study(out: Path, seed: int, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
-    """Run everything; return what ``metrics.json`` holds."""
+    """Run the whole study; return the content of ``metrics.json``."""
     counts = (20, 24) if quick else COUNTS
     instrument = SimulatedInstrument("camera", encoder_sigma=ENCODER)
     hidden = virtual_cell("lwr4plus", instrument=instrument)

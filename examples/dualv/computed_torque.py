@@ -29,7 +29,7 @@ FAR = 0.3  # [rad or m] between encoders and reference at which a run is given u
 
 @dataclass(frozen=True, eq=False)
 class ComputedTorque:
-    """A controller and the sensors it sees.
+    """A computed-torque controller and its sensors.
 
     Attributes:
         values: (p,) parameters of its model.
@@ -51,7 +51,7 @@ class ComputedTorque:
 
 @dataclass(frozen=True, eq=False)
 class ParallelRun:
-    """What a run logs, (N, n) each.
+    """Log of a simulated run; each series is (N, n).
 
     Attributes:
         t: (N,) [s].
@@ -69,7 +69,7 @@ def simulate(
     model: ParallelModel, values: np.ndarray, controller: ComputedTorque, x: np.ndarray, v: np.ndarray, a: np.ndarray,
     carried: Collection[str] | None = None, seed: int = 0,
 ) -> ParallelRun:  # fmt: skip
-    """Return the log of a robot that follows a reference.
+    """Return the log of a simulated robot that follows a reference motion.
 
     Args:
         model, values: the robot's, (p,); Ia, Fv, Fc, off are the drive terms it may have.
@@ -111,7 +111,7 @@ def simulate(
 
 
 def _compiled(model: ParallelModel) -> tuple:
-    """Return the robot as `run_kernels.accelerate` reads it."""
+    """Return the arrays that describe the robot to `run_kernels.accelerate`."""
     robot = model.known.robot
     legs = [compiled(leg) for leg in robot.legs]
     kinds = [bodies.links for bodies, _ in legs], [bodies.constants for bodies, _ in legs], [tail for _, tail in legs]
@@ -123,7 +123,7 @@ def _compiled(model: ParallelModel) -> tuple:
 
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
-    """Return arrays one above the other, each filled up with zeros to the largest shape."""
+    """Return arrays stacked along a new first axis, each padded with zeros to the largest shape."""
     result = np.zeros((len(arrays), *np.max([array.shape for array in arrays], axis=0)))
     for k, array in enumerate(arrays):
         result[(k, *map(slice, array.shape))] = array
@@ -131,7 +131,7 @@ def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
 
 
 def _parameters(model: ParallelModel, values: np.ndarray, carried: Collection[str] | None) -> tuple:
-    """Return parameters as `run_kernels.accelerate` reads them."""
+    """Return the arrays that describe the parameters to `run_kernels.accelerate`."""
     drives = np.zeros((int(model.known.robot.starts[-1]), 5))
     drives[:, 4] = 1.0
     for one, value in zip(model.terms, values[model.inertial :]):

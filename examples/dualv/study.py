@@ -153,7 +153,7 @@ class Method:
         return eliminate(pooled, rule, std=fitted.std, inflation=fitted.inflation, **limits).essential.estimate
 
     def predicted(self, estimate: Estimate) -> np.ndarray:
-        """Return the rows that an estimate of base parameters predicts for the other motion."""
+        """Return the torques that estimated base parameters predict for the validation motion."""
         values = np.zeros(self.model.p)
         known = dict(zip(estimate.names, estimate.values))
         if not set(LEGS) <= set(known):  # equal legs: the first stands for all
@@ -163,7 +163,7 @@ class Method:
         return predict(type(self.found.dynamics)(self.model, values), self.unseen)
 
     def errors(self, estimate: Estimate) -> list[float]:
-        """Return ‖ρ‖/‖y‖ by row on the other motion, both sides in the identification band."""
+        """Return the relative error ‖ρ‖/‖y‖ of each joint on the validation motion, in the identification band."""
         y, found = (self.unseen.motion.in_band(x) for x in (self.unseen.target, self.predicted(estimate)))
         return [float(x) for x in np.linalg.norm(y - found, axis=0) / np.linalg.norm(y, axis=0)]
 
@@ -173,7 +173,7 @@ def _others(names: tuple[str, ...]) -> list[str]:
 
 
 class Trial:
-    """Both methods on two motions without and with the payload, held against a third with it."""
+    """Both methods on two motions without and with the payload, validated on a third motion with it."""
 
     def __init__(self, robot: Robot, one: Runs, two: Runs, other: Runs):
         self.idim, self.pim = (Method(robot, name, (one, two), other) for name in ("idim", "pim"))

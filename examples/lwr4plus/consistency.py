@@ -62,7 +62,7 @@ FURTHER = (1, 3, 10)  # CAD, and geometries so many times as far off
 
 @dataclass(frozen=True)
 class Setup:
-    """An instrument and how many poses it measures."""
+    """An instrument and the number of poses it measures."""
 
     name: str
     position: float
@@ -82,7 +82,7 @@ SETUPS = (
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What is true, and what every run shares.
+    """The true robot, and the data shared by all runs.
 
     Attributes:
         cell: the arm and its instrument.
@@ -138,7 +138,7 @@ def reference(seed: int) -> Reference:
 
 
 def drive_values(known: dict[str, Any]) -> dict[str, float]:
-    """Return the true drive parameters by name; what a motor sees as one is the sum of both sides."""
+    """Return the true drive parameters by name; for motors alone they are the sum of motor and link side."""
     own = dict(known["drives"])
     own["off"] = np.add(own["offl"], own["offm"])
     return {f"{name}{joint + 1}": float(x) for name, row in own.items() for joint, x in enumerate(row)}
@@ -176,7 +176,7 @@ def once(given: World, seed: list[int]) -> np.ndarray:
 
 
 def coverage(setup: Setup, kind: str, runs: int, seed: int, where: str | None) -> dict[str, Any]:
-    """Return how often the intervals hold the truth, pooled and by parameter."""
+    """Return how often the intervals contain the true value, pooled and by parameter."""
     given, start = world(setup, kind, seed), time.perf_counter()
     results = {}
     with workers(where) as crew:
@@ -224,7 +224,7 @@ def _mean(values: np.ndarray) -> float | None:
 
 
 def geometries(kind: str, seed: int) -> dict[str, Any]:
-    """Return what identification on one geometry or another costs, in torque and in parameters."""
+    """Return the errors of torque and of parameters by the geometry that identification uses."""
     fine, coarse = (world(setup, kind, seed) for setup in SETUPS)
     true, nominal = fine.cell.truth.chain, fine.cell.nominal
     chains = {"true geometry": true}
@@ -242,7 +242,7 @@ def geometries(kind: str, seed: int) -> dict[str, Any]:
 
 
 def unseen(given: World, seed: int) -> list[Case]:
-    """Return another motion's cases, torques without noise."""
+    """Return the cases of a validation motion with noise-free torques."""
     motion, true = reference(seed + 1001), given.cell.truth.chain
     _, clean = true_torques(true, given.settings, motion)
     return cases_of(motion, clean, given.settings.torque_rows.name, np.zeros(true.n), 0)
@@ -283,7 +283,7 @@ def judged(given: World, found: Identification, chain: Chain, cases: list[Case],
 
 
 def _cut(given: World, cases: list[Case]) -> list[np.ndarray]:
-    """Return the noise-free torques at the samples that the filters left of each case."""
+    """Return the noise-free torques at the samples kept by the filters, for each case."""
     result = []
     for tau, case in zip(given.clean, cases):
         first = round((case.motion.t[0] - given.motion.t[0]) * RATE)

@@ -177,7 +177,7 @@ def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -
 
 
 def controller(plant: Plant, reference: Reference) -> Controller:
-    """Return PD gains for 8 Hz, damped by 0.8, on the mean inertia, with gravity and friction fed forward (chosen)."""
+    """Return a PD controller (8 Hz, damping 0.8, our choice) with feed-forward of gravity and friction."""
     omega, inertia = 2 * np.pi * 8.0, plant.inertia_diagonal(reference.q[::500])
     slow = replace(reference, a=0.0 * reference.a)
     return pd(omega**2 * inertia, 2 * 0.8 * omega * inertia).with_feedforward(feed_forward(plant, slow))
@@ -225,7 +225,7 @@ def collected(own: IdentificationModel, base: Base, data: Data) -> Triangles:
 
 
 def values_of(found: Fit) -> np.ndarray:
-    """Return all base parameters with the essential estimate, the others zero."""
+    """Return all base parameters: the essential estimate, and zero for the others."""
     values = np.zeros(found.base.b)
     values[found.elimination.kept] = found.elimination.essential.estimate.values
     return values
@@ -253,7 +253,7 @@ def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
 
 
 def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[str, list[float]]:
-    """Return rms tracking errors [mrad] of the true loaded arm, fed forward by nothing and by each estimate."""
+    """Return rms tracking errors [mrad] of the true loaded arm without and with feed-forward by each estimate."""
     whole = model(chain, MOTOR)
     robot = Plant(whole.bodies, whole.terms, true_parameters(chain))
     bare = replace(controller(robot, reference), ahead=None)
@@ -265,7 +265,7 @@ def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[s
 
 
 def essential(found: Fit) -> dict[str, Any]:
-    """Return the essential set beside Table 4, with RSDs [%]."""
+    """Return the essential parameters with RSDs [%], next to those of Table 4."""
     estimate = found.elimination.essential.estimate
     names = set(estimate.names)
     return {
@@ -296,7 +296,7 @@ def side_by_side(cad: Fit, calibrated: Fit) -> dict[str, float]:
 
 
 def published(found: Fit) -> dict[str, dict[str, float]]:
-    """Return our simulated arm's estimates beside those of another unit."""
+    """Return the simulated arm's estimates next to those published for another unit."""
     values = dict(zip(found.base.names, found.fit.estimate.values))
     values["ZZ2R + Ia2"] = values["ZZ2R"] + values["Ia2"]
     return {

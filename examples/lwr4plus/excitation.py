@@ -125,7 +125,7 @@ def estimate(seed: int) -> Arm:
 
 
 def table_4(base: Base) -> np.ndarray:
-    """Return where the 44 essential parameters stand among the base columns."""
+    """Return the positions of the 44 essential parameters among the base columns."""
     return np.array([base.names.index(name) for name in TABLE_4])
 
 
@@ -162,7 +162,7 @@ def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
 
 
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
-    """Return whole periods, as many as fit into a log."""
+    """Return as many whole periods of a motion as fit into a log."""
     times = max(1, round(seconds / (len(period.t) / RATE)))
     q, v, a = (np.tile(x, (times, 1)) for x in (period.q, period.v, period.a))
     return Reference(np.arange(len(q)) / RATE, q, v, a)
@@ -184,7 +184,7 @@ def exact(motion: Reference) -> dict[str, Any]:
 
 
 def logged(motion: Reference, seed: list[int]) -> dynamics.Data:
-    """Let the true arm follow a motion for 50 s, empty and loaded."""
+    """Return the logs of the true arm on a motion of 50 s, without and with payload."""
     return dynamics.record(truth().chain, motion, seed)
 
 
@@ -228,7 +228,7 @@ class Task:
 
 
 def done(task: Task) -> tuple[Reference, dict[str, Any]]:
-    """Make a motion and judge it."""
+    """Return the result of one task: motion, logs, identification and errors."""
     arm, plan = task.arm, task.what
     if isinstance(plan, Plan):
         effort = task.evaluations * (2 if plan.which == "D" else 1)

@@ -18,7 +18,7 @@ Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def trapezoidal(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return place, speed and bend over s = 0 … 1, a third each of acceleration, cruise (1.5) and deceleration."""
+    """Return position, speed and acceleration over s = 0 … 1 of a trapezoidal profile in three equal parts."""
     place = np.where(s < 1 / 3, 2.25 * s**2, np.where(s < 2 / 3, 1.5 * s - 0.25, 1 - 2.25 * (1 - s) ** 2))
     bend = np.where(s < 1 / 3, 4.5, np.where(s < 2 / 3, 0.0, -4.5))
     return place, np.minimum(1.5, np.minimum(4.5 * s, 4.5 * (1 - s))), bend
@@ -86,7 +86,7 @@ def _pose(chain: Chain, rng: np.random.Generator) -> np.ndarray:
 
 
 def _clear(chain: Chain, q: np.ndarray) -> bool:
-    """Say whether the tool stays 0.3 m from axis 1 and above -0.2 m."""
+    """Return whether the tool stays 0.3 m from axis 1 and above -0.2 m."""
     place = forward(chain, q)[:, :3, 3]
     return bool((np.hypot(place[:, 0], place[:, 1]) >= 0.3).all() and (place[:, 2] >= -0.2).all())
 

@@ -102,7 +102,7 @@ def searched(
     spot: ExcitationProblem, method: Method, stages: tuple[Stage, ...], evaluator: Callable[..., Evaluation],
     seconds: float, seed: int,
 ) -> tuple[Curve, SearchResult | None]:  # fmt: skip
-    """Search start after start until the time is up; the best motion of all."""
+    """Return the best motion of repeated searches from random starts within the time limit."""
     began, curve, best, start = time.process_time(), Curve(), None, 0
     ended = list[float]()
 
@@ -124,7 +124,7 @@ def searched(
 
 
 def differenced(spot: ExcitationProblem, basis: Any, y: np.ndarray, sharpness: tuple[float, float]) -> Any:
-    """Return what `evaluate` returns, its gradients by forward differences over all variables."""
+    """Return the result of `evaluate` with gradients by forward differences over all variables."""
     bare = blind(spot)
     here = evaluate(bare, basis, y, sharpness)
     slopes, rows = np.empty((1, len(y))), np.empty((len(here.constraints), len(y)))
@@ -179,7 +179,7 @@ PEERS: dict[str, Callable[..., tuple[Curve, SearchResult | None]]] = {
 
 
 def falling(curve: Curve) -> Curve:
-    """Return the best so far over time."""
+    """Return the best value reached so far, over time."""
     result, least = Curve(), np.inf
     for point in sorted(curve):
         if point[1] < least:
@@ -223,7 +223,7 @@ def picture(curves: dict[str, Curve], seconds: float) -> Figure:
 
 
 def compared(chain: Chain, name: str, seconds: float, seed: int) -> dict[str, Any]:
-    """Return what a peer comes to."""
+    """Return the condition numbers and the time of a peer method."""
     spot = problem(chain, 20.0)
     curve, found = PEERS[name](spot=spot, seconds=seconds, seed=seed)
     return {"curve": curve, "reached": None if found is None else reached(chain, spot, found)}
@@ -253,7 +253,7 @@ def _timed(curve: Curve, began: float, call: Callable, tasks: Any) -> Iterator[A
 
 
 def elsewhere(name: str, seconds: float, seed: int) -> dict[str, Any]:
-    """Return what the default peer comes to on another robot of the library."""
+    """Return the result of the default peer method on another robot of the library."""
     chain = load(name)
     spot = problem(chain, 20.0, None, None, 0.0)
     _, found = PEERS["slsqp"](spot=spot, seconds=seconds, seed=seed)

@@ -98,7 +98,7 @@ class TableOne:
 
 
 def search_space(nominal: np.ndarray, index: str) -> SearchSpace:
-    """Return where poses may lie, and what they tell: metres and radians for cond, as the paper's, else sigmas."""
+    """Return the search space of poses; Jacobian in metres and radians for cond (as in the paper), else in sigmas."""
     scale = np.ones(6) if index == "cond" else SIGMAS
     jacobian_ = BaseJacobian(study_chain(nominal), scale)
     table = TableOne(lwr4plus.nominal_chain(), lwr4plus.station(nominal), lwr4plus.tool(nominal))
@@ -170,7 +170,7 @@ def comparison(
 
 
 def ceiling(nominal: np.ndarray, candidates: np.ndarray, chosen: list[Selection], quick: bool) -> dict[str, float]:
-    """Return the largest O1 that any 17 poses under Table 1 can have, and what share of it the best chosen set has."""
+    """Return the upper bound of O1 over all sets of 17 poses under Table 1, and the share that the best set reaches."""
     poses = np.concatenate([candidates, *(run.q for run in chosen if run.q is not None)])
     bound = bound_over_space(search_space(nominal, "O1"), poses, lwr4plus.POSES, climbs=0 if quick else 32, rounds=40)
     most = float(np.sqrt(bound.upper / lwr4plus.POSES))
@@ -196,7 +196,7 @@ def calibration(seed: int) -> tuple[Selection, Positions, GeometricFit]:
 
 
 def fitted_arm(seed: int) -> Chain:
-    """Return the arm that `calibration` finds: the library's, with frames 2 to 7 as fitted."""
+    """Return the arm fitted by `calibration`: the library's, with frames 2 to 7 as fitted."""
     found = calibration(seed)[2].cell.chain
     values = dict(zip(found.names, found.values))
     return lwr4plus.arm(np.array([[values[f"{name}{row}"] for name in lwr4plus.COLUMNS] for row in range(9)]))
@@ -219,7 +219,7 @@ def nominal_readings(nominal: np.ndarray, found: GeometricFit, fitted: Any) -> d
 
 
 def parameter_rows(found: GeometricFit, nominal: np.ndarray, truth: np.ndarray) -> list[dict[str, Any]]:
-    """Return the 32 estimates beside both columns of Table 2."""
+    """Return the 32 estimates next to both columns of Table 2."""
     start, true = (study_chain(table) for table in (nominal, truth))
     first, last = dict(zip(start.names, start.values)), dict(zip(true.names, true.values))
     return [
@@ -239,12 +239,12 @@ def parameter_rows(found: GeometricFit, nominal: np.ndarray, truth: np.ndarray) 
 
 
 def within(rows: list[dict[str, Any]]) -> int:
-    """Return how many estimates are within two sigmas of Table 2."""
+    """Return the number of estimates within two σ of Table 2."""
     return sum(abs(row["off_by_sigmas"]) <= 2.0 for row in rows)
 
 
 def run(seed: int, quick: bool, seeds: int = 3, seconds: float = 3.0, workers: int = 2) -> dict[str, Any]:
-    """Do the study and return everything that ``metrics.json`` holds."""
+    """Run the study; return the content of ``metrics.json``."""
     nominal, truth = lwr4plus.table_2()
     best, measured, found = calibration(seed)
     poses = np.asarray(best.q)

@@ -50,7 +50,7 @@ def nominal() -> Chain:
 
 
 def true_chain() -> Chain:
-    """Return the library's arm on the calibrated geometry, which is taken as known here."""
+    """Return the library's arm with the calibrated geometry, assumed to be known here."""
     columns = truth("lwr4plus")["dynamic_geometry"]
     names = {f"{key}{row + 1}": value for key, values in columns.items() for row, value in enumerate(values)}
     chain = nominal()
@@ -67,7 +67,7 @@ def true_robot(chain: Chain) -> tuple[IdentificationModel, np.ndarray]:
 
 
 def identified(model: IdentificationModel, values: np.ndarray, seed: int) -> tuple[PathDynamics, BaseModel, np.ndarray]:
-    """Return the path dynamics of base parameters fitted to a noisy simulated motion, its model and covariance."""
+    """Return the path dynamics identified from a noisy simulated motion, with model and covariance."""
     rng, n = np.random.default_rng(seed), model.bodies.n
     times = np.arange(0, SECONDS, 1 / RATE)[:, None, None]
     pace = 2 * np.pi / SECONDS * np.arange(1, SINES + 1)
@@ -89,7 +89,7 @@ def identified(model: IdentificationModel, values: np.ndarray, seed: int) -> tup
 def guarded(
     path: JointPath, law: PathDynamics, model: BaseModel, covariance: np.ndarray, bounds: TimingLimits
 ) -> Timing:
-    """Return the timing that keeps `SIGMAS` of each joint's predicted torque free, its largest along the first one."""
+    """Return the timing with a torque margin of `SIGMAS` σ per joint, the largest along the first timing."""
     sampled = time_optimal(path, bounds, law).sampled
     W = model.regressor(sampled.q, sampled.v, sampled.a)
     sigma = np.sqrt(np.einsum("Nib,bc,Nic->Ni", W, covariance, W, optimize=True)).max(axis=0)
@@ -111,7 +111,7 @@ def judged(timing: Timing, robot: PathDynamics, efforts: np.ndarray) -> dict[str
 
 
 def run(paths: int, seed: int) -> dict[str, Any]:
-    """Plan each path on every model and judge the plans by the truth."""
+    """Plan each path with every model, and check the plans on the true robot."""
     chain = true_chain()
     model, values = true_robot(chain)
     robot = of_standard(model, values)

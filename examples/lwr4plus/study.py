@@ -47,13 +47,13 @@ def code_of(name: str, quick: bool) -> str:
 
 
 def is_made(name: str, out: Path, quick: bool) -> bool:
-    """Tell whether a part was run by this code, to its end."""
+    """Return whether a part was run to its end by this code."""
     mark = out / MARK
     return (out / METRICS).exists() and mark.exists() and mark.read_text() == code_of(name, quick)
 
 
 def run(name: str, out: Path, quick: bool) -> None:
-    """Run one part; what code before this one left of it goes."""
+    """Run one part of the study; results of older code are removed."""
     started, code, mark = time.perf_counter(), code_of(name, quick), out / MARK
     if not mark.exists() or mark.read_text() != code:
         for left in (METRICS, ROWS):
@@ -66,12 +66,12 @@ def run(name: str, out: Path, quick: bool) -> None:
 
 
 def tables_of(name: str, out: Path) -> study_tables.Tables:
-    """Return the tables of a part that was run."""
+    """Return the tables of a finished part."""
     return study_tables.SHOW[name](json.loads((out / METRICS).read_text(encoding="utf-8")))
 
 
 def main() -> None:
-    """Run what is asked for, print the tables and write them."""
+    """Run the requested parts; print and write their tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--all", action="store_true", help="run every part, whatever is there already")

@@ -8,7 +8,7 @@ from typing import Any
 
 
 def read(document: str | None, **options: str | tuple[Any, str]) -> argparse.Namespace:
-    """Return what the command line says; the folder ``--out`` is there then.
+    """Return the options of the command line; create the folder ``--out``.
 
     Args:
         document: the script's docstring, whose first line is its help.

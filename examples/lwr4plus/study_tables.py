@@ -13,7 +13,7 @@ _BLOCK = re.compile(r"(<!-- table ([\w-]+) -->\n\n)(.*?)(\n\n<!-- end -->)", re.
 
 
 def table(head: str, rows: Iterable[Sequence[Any]]) -> str:
-    """Return a Markdown table; the head's columns are parted by bars."""
+    """Return a Markdown table; the columns of its head are separated by bars."""
     lines = [f"| {head} |", "|" + "---|" * (head.count("|") + 1)]
     return "\n".join([*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows)])
 
@@ -24,7 +24,7 @@ def show(tables: Tables) -> None:
 
 
 def geometry(found: dict[str, Any]) -> Tables:
-    """Return Table 3, what stands beside it, and the comparison of ways to choose poses."""
+    """Return Table 3, its supplements, and the comparison of methods that choose poses."""
     three = found["table_3"]
     rows = {"paper, nominal": three["paper"]["nominal"]}
     rows |= {f"nominal: {name}": row for name, row in three["nominal"].items()}
@@ -156,7 +156,7 @@ def _covered(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def planning(found: dict[str, Any]) -> Tables:
-    """Return the plans of section 5, judged by the true robot."""
+    """Return the plans of section 5, checked on the true robot."""
     rows = [
         (name, f"{one['seconds']:.3f}", f"{one['peak']:.1%}", f"{one['worst_peak']:.1%}", f"{one['beyond']:.1%}",
          f"{one['active']:.1%}")
@@ -214,7 +214,7 @@ def excitation(found: dict[str, Any]) -> Tables:
 
 
 def excitation_peers(found: dict[str, Any]) -> Tables:
-    """Return the default search over seeds, and every search in equal processor time."""
+    """Return tables of the default search over seeds, and of all searches in equal processor time."""
     spread = lambda x, form: f"{np.median(x):{form}} ({min(x):{form}}–{max(x):{form}})"  # noqa: E731
     seeds, peers = dict[str, list[Any]](), dict[str, list[Any]]()
     for name, one in found.items():
@@ -245,7 +245,7 @@ def excitation_peers(found: dict[str, Any]) -> Tables:
 
 
 def _at(curve: list[list[float]], seconds: float) -> float | None:
-    """Return √(raw · normalised) of the best motion after so many seconds; None where there was none."""
+    """Return √(raw · normalised) of the best motion after some seconds; None without a motion."""
     reached = [merit for when, merit in curve if when <= seconds]
     return float(np.exp(min(reached))) if reached else None
 
@@ -261,10 +261,10 @@ SHOW = {
 
 
 def blocks(text: str) -> Tables:
-    """Return the tables that stand in a document between their marks."""
+    """Return the tables of a document, found between their marks."""
     return {found[2]: found[3] for found in _BLOCK.finditer(text)}
 
 
 def renewed(text: str, tables: Tables) -> str:
-    """Return the document with these tables in place of those that stood there."""
+    """Return the document with its tables replaced by these."""
     return _BLOCK.sub(lambda found: found[1] + tables.get(found[2], found[3]) + found[4], text)

@@ -24,13 +24,13 @@ from calib.rooms.studies.experiment import Experiment, make_experiment, set_up
 
 
 def with_case(data: Experiment, case: Case) -> Experiment:
-    """Return the data set with another recording."""
+    """Return the data set with its recording replaced by another."""
     rows = observe(data.model, data.problem.base.kept, case, data.problem.decimator)
     return replace(data, problem=replace(data.problem, cases=(case,), rows=(rows,)))
 
 
 def variants(condition: Condition, seed: int) -> dict[str, Experiment]:
-    """Return one data set as it is logged, with the mean torque, and with encoder noise that the loop did not feel."""
+    """Return three variants of a data set: as logged, with mean torque, and with encoder noise outside the loop."""
     data, setup = make_experiment(condition, seed), set_up(condition.robot, condition.duration)
     case, every = data.problem.cases[0], int(setup.every)
     sensing = Sensing(condition.sigma_q, sigma_tau=condition.sigma_tau)

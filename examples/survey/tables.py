@@ -1,4 +1,4 @@
-"""The tables of `README.md`, from the rows and the tables of recordings that are kept beside it.
+"""The tables of `README.md`, made from the rows and the tables of recordings in this folder.
 
     calib study 'MCS-*' --out examples/survey/rows        # runs what is missing; more runs: --runs 300
     python examples/survey/tables.py --readme             # writes the tables into the README; without: prints them
@@ -26,7 +26,7 @@ STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs")
 
 
 def number(value: float) -> str:
-    """Return three digits; a dash for nothing."""
+    """Return a number with three digits; a dash for NaN."""
     if math.isnan(value):
         return "–"
     return "∞" if math.isinf(value) else f"{value:.3g}" if value < 1e4 else f"{value:.0e}"
@@ -60,7 +60,7 @@ def _runs(one: ConditionSummary) -> str:
 
 
 def merit_table(one: ConditionSummary) -> Iterator[str]:
-    """Yield all figures of one condition, a line per method."""
+    """Yield a table of all figures of one condition, one line per method."""
     header = ("runs", "failed", "torque [%]", "β [%]", "in σ", "covered [%]", "d_τ [%]", "d_q [%]", "rounds", "sims")
     yield f"| method | {' | '.join(header)} | CPU [s] |"
     yield f"|---|{'---:|' * (len(header) + 1)}"
@@ -132,7 +132,7 @@ def _recorded(row: dict[str, str]) -> str:
 
 
 def sections(rows: Sequence[TrialRow], recordings: Path) -> dict[str, list[str]]:
-    """Return the lines of each table by the name that its place in the README has."""
+    """Return the lines of each table, by the name of its place in the README."""
     made: dict[str, list[str]] = {}
     for name in STUDIES:
         conditions = summarise(read_study([name]), rows)

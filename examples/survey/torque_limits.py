@@ -1,4 +1,4 @@
-"""How much of the time encoder noise, fed back, drives a condition's robot to its torque limits.
+"""Share of time in which fed-back encoder noise drives a condition's robot to its torque limits.
 
     python examples/survey/torque_limits.py [MCS-RV2SQ-1-3 …]
 

@@ -80,7 +80,7 @@ class Log:
 
 @dataclass(frozen=True)
 class Study:
-    """What all parts share."""
+    """Data shared by all parts of the study."""
 
     plant: Plant
     model: IdentificationModel
@@ -94,7 +94,7 @@ class Study:
 
 
 def references(quick: bool, seed: int) -> tuple[Reference, list[Reference]]:
-    """Return the training motion, the best of a few random ones by condition number, and three others."""
+    """Return the training motion (best condition number of some random motions) and three other motions."""
     model = known_robots.model(known_robots.plant("tx40", coupled=True, offset=OFFSETS))
     kept = bases.find(model).kept
     duration = 8.0 if quick else 10.0
@@ -161,7 +161,7 @@ def torque_error(study: Study, reference: Reference, values: np.ndarray) -> list
 def judge(
     study: Study, training: Log, others: list[Log], results: dict[str, Instrumental], controller: Controller
 ) -> dict[str, Any]:
-    """Return the errors of least squares and of instrumental methods, direct and cross, and what the tests say."""
+    """Return the errors of least squares and of instrumental methods (direct and cross), and the test results."""
     first = next(iter(results.values()))
     values = {"LS": first.ordinary.estimate.values, "PC-LS": consistent(study, first).estimate.values}
     values |= {name: result.fit.estimate.values for name, result in results.items()}
@@ -190,7 +190,7 @@ def judge(
 
 
 def consistent(study: Study, result: Instrumental) -> LinearFit:
-    """Return least squares of the same rows under the signs of PC-IV (PC-IDIM-LS)."""
+    """Return the least-squares estimate of the same rows with the sign constraints of PC-IV (PC-IDIM-LS)."""
     data, std = result.problem.least_squares(), result.ordinary.group_std
     bounds = dict.fromkeys(signs(result.names), (0.0, np.inf))
     settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
@@ -199,12 +199,12 @@ def consistent(study: Study, result: Instrumental) -> LinearFit:
 
 
 def finite(result: Instrumental) -> list[Round]:
-    """Return the rounds, the first without a change."""
+    """Return the rounds of an iteration; a change that is not finite (first round) becomes 1."""
     return [one if np.isfinite(one.change) else replace(one, change=1.0) for one in result.rounds]
 
 
 def verdict(result: Instrumental) -> dict[str, Any]:
-    """Return the test of least squares, and by how many standard deviations the two estimates differ at most."""
+    """Return the test of least squares, and the largest difference of both estimates in standard deviations."""
     return {
         "F": result.verdict.statistic, "p": result.verdict.p, "least_squares_biased": result.verdict.biased(),
         "largest_shift_in_sigma": float(result.shift.max()), "cragg_donald": result.strength.cragg_donald,
@@ -213,7 +213,7 @@ def verdict(result: Instrumental) -> dict[str, Any]:
 
 
 def estimate(study: Study, log: Log, controller: Controller, method: str) -> Instrumental:
-    """Return what IV, PC-IV or DIDIM makes of a log under the belief that this was the controller.
+    """Return the estimate of IV, PC-IV or DIDIM from a log, with an assumed controller.
 
     The regular robot they start from has the motors' inertia, as on a data sheet.
     """
@@ -226,7 +226,7 @@ def estimate(study: Study, log: Log, controller: Controller, method: str) -> Ins
 
 
 def essential_count(study: Study, training: Log) -> dict[str, Any]:
-    """Return how many of the base parameters an F-test keeps on clean data (the slides: 27 of 60)."""
+    """Return the number of base parameters that an F-test keeps on clean data (the slides: 27 of 60)."""
     rows = observe(study.model, study.base.kept, training.case, training.case.motion.decimator)
     samples, joints, p = rows.matrix.shape
     group = np.repeat(np.arange(joints), samples)
@@ -287,7 +287,7 @@ def signs(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def show(metrics: dict[str, Any]) -> None:
-    """Print the tables beside the slides'."""
+    """Print the tables next to those of the slides."""
     count = metrics["parameters"]
     print(
         f"{count['standard']} standard, {count['base']} base parameters; F-test keeps {count['essential']} (slides: 27)"

@@ -27,7 +27,7 @@ DRIVES = {"Ia": 0.05, "Fv": 2.0, "Fc": 3.0}  # of joint 1; a tenth of them at jo
 
 
 def main(seed: int = 0) -> dict[str, dict[str, float]]:
-    """Return and print the median σ [%] of parameters that inverse dynamics know to 10 %, drives and bodies apart."""
+    """Print and return the median σ [%] of well-known parameters (10 % by inverse dynamics), drives and bodies."""
     everything, again = recorded(seed, ()), recorded(seed + 1, ())
     wrist = [recorded(seed + 2 + k, (0, 1, 2), SECONDS / 2) for k in range(2)]
     found = {
