@@ -57,7 +57,7 @@ class Board:
                 f"marker = {self.marker:g}: the {what} must be between {least:g} and {most:g} of "
                 f"square = {self.square:g}"
             )
-        words = f"{self.columns} x {self.rows} squares look the same upside down; an even and an odd number do not"
+        words = f"{self.columns} x {self.rows} squares look the same upside down: take an even and an odd number"
         require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, words, ValueError)
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")

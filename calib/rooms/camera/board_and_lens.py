@@ -158,8 +158,8 @@ def estimate_lens(
     if len(good) < min_images:
         refuse_data(
             file,
-            f"{counted(len(good), 'image')} with a board: a lens takes {min_images} at least, tilted "
-            "differently, and a good one 15; take more, or give the lens (camera.yaml)",
+            f"{counted(len(good), 'image')} with a board, a lens needs at least {min_images} with different tilts "
+            "(15 for a good one): take more, or give the lens (camera.yaml)",
         )
     max_images = 30  # images that a first lens is found from (our choice)
     good = good[np.unique(np.linspace(0, len(good) - 1, max_images).astype(int))]
@@ -168,24 +168,23 @@ def estimate_lens(
     if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:
         refuse_data(
             file,
-            f"a fisheye lens explains these images to {other:.2f} px, a pinhole's to {rms:.2f} px only: state "
-            "[camera] model = 'fisheye' in the options, or give the lens (camera.yaml)",
+            f"reprojection error {other:.2f} px with a fisheye lens, {rms:.2f} px with a pinhole: state [camera] "
+            "model = 'fisheye' in the options, or give the lens (camera.yaml)",
         )
     if not rms < WRONG:
         refuse_data(
             file,
-            f"no {model} lens explains these images: {rms:.1f} px remain with the best one. Were they all taken with "
-            "one camera, at one focus, of this board?",
+            f"reprojection error {rms:.1f} px with the best {model} lens, so no lens explains these images. Were all "
+            "taken by one camera, at one focus, of this board?",
         )
     loose = _focal_sigma(found, matrix, rms)
     max_focal_sigma = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
     if not loose < max_focal_sigma:
-        told = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
+        known = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
         refuse_data(
             file,
-            f"the focal length is identified {told}: the images see the board from too few "
-            "directions; tilt it (or the camera) by 20 to 45° both ways in a dozen images, or give the lens "
-            "(camera.yaml)",
+            f"the focal length is identified {known}: the images show the board from too few directions; tilt it (or "
+            "the camera) by 20 to 45° both ways in a dozen images, or give the lens (camera.yaml)",
         )
     return found
 

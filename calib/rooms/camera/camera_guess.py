@@ -263,7 +263,7 @@ def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement, max_sc
     if rank == 7 and abs(factor - 1.0) > max(max_scale_error, 6.0 * sigma) and sigma < 0.1:
         stated = 1e3 * block.board.square
         raise MeasurementError(
-            f"a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}) by the robot's motion, "
+            f"a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}) by the arm's motion, "
             f"{stated:.2f} in board.toml: measure the print and correct board.toml (was it printed at 100 %?)",
             block.file,
         )

@@ -31,7 +31,7 @@ from poses.space import PoseConstraint
 
 CORNER, DISPLACEMENT, TURN = 0.05, 2e-5, 2e-5  # noise that a pose is judged by [px], [m], [rad]; our choice
 ASSUMED = (
-    f"σ is predicted for corners of {CORNER:g} px and an arm that repeats to {1e3 * DISPLACEMENT:g} mm and "
+    f"predicted σ: for corner noise of {CORNER:g} px and a repeatability of {1e3 * DISPLACEMENT:g} mm and "
     f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
 )
 TRIES = 60
@@ -105,7 +105,7 @@ class CameraView:
         q = self.draw(100, lambda each: np.all(self(each) <= 1e-8, axis=1), lower, upper, seed)
         if len(q) < 20:
             raise UsageError(
-                f"the camera sees the board at hardly any posture ({len(q)} of 100 were found): check [camera], "
+                f"the camera sees the board at hardly any posture ({len(q)} of 100 found): check [camera], "
                 "carried, stands, tilt and range"
             )
         split = base_columns(self.cell, self.block(q), columns)
@@ -193,7 +193,7 @@ def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> 
         UsageError, MeasurementError, RobotError: for a file that is missing, or a place that cannot be.
     """
     for name in (stated.lens, stated.board):
-        require((folder / name).is_file(), f"{where}: camera: no file '{name}' beside it", UsageError)
+        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)
     if not stated.range[0] < stated.range[1]:
         raise UsageError(f"{where}: camera.range: {stated.range[0]:g} is not below {stated.range[1]:g}")
     lens, board = read_lens(folder / stated.lens), read_board(folder / stated.board)

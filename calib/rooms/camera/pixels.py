@@ -96,7 +96,7 @@ class Detection:
     Attributes:
         pixel: (K, 2) of each corner of the board; NaN where it was not seen.
         sigma: (K,) standard deviation of each coordinate [px].
-        problem: why the image is of no use; empty where it is of use.
+        problem: why the image is not usable; empty if it is.
         edge: median width of the edges [px]; NaN without a board.
     """
 

@@ -187,7 +187,7 @@ def simulate_next(folder: Path, say: Say) -> None:
             _compare_with_truth(session, _cells_of(session)[0], say)
             return
         if waiting.kind != steps.WAITING:
-            raise UsageError(f"{folder} waits for nothing; next: {command_line('next', folder)}")
+            raise UsageError(f"{folder} waits for no files; next: {command_line('next', folder)}")
         _bring_for(session, waiting.step.name, say)
     say(f"next: {command_line('next', folder)}")
 

@@ -59,9 +59,7 @@ TRIAL = 1
 Where one method changes, its `calib.identification.methods.method.Method.version` is raised."""
 
 _Few = Spread(words="a value, or a list of them")
-Robots = Annotated[
-    tuple[Annotated[str, OneOf(ROBOTS, "a study needs the truth; methods on recordings: calib compare")], ...], _Few
-]
+Robots = Annotated[tuple[Annotated[str, OneOf(ROBOTS, "known robots only; for recordings: calib compare")], ...], _Few]
 Wholes = Annotated[tuple[Annotated[int, Whole(1, 100)], ...], _Few]
 Cutoffs = Annotated[tuple[Annotated[float, Real(least=0, words="0 or more, Hz without a unit")], ...], _Few]
 Mismatches = Annotated[tuple[Annotated[str, OneOf(MISMATCHES)], ...], _Few]

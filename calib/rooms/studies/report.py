@@ -70,20 +70,20 @@ def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
 
 
 RULE = (
-    f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
-    "whose torque error on unseen motion, noise-free, cannot be distinguished from the best one's on the same data "
-    f"sets (sign test, {LEVEL:.0%}), or, in the median data set, larger by at most {SLACK:.0%}.",
-    f"Of these one is taken that is cheap, at most {ALIKE:g} times the processor time of the cheapest: the best such.",
+    f"A method counts as good if it gives an estimate in at least {RELIABLE:.0%} of the trials, and if its noise-free "
+    "torque error on unseen motion cannot be distinguished from that of the best method on the same data sets (sign "
+    f"test, {LEVEL:.0%}) or is larger by at most {SLACK:.0%} in the median data set.",
+    f"Recommended is the best good method with at most {ALIKE:g} times the processor time of the cheapest good one.",
     "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
-    f"A method with fewer than {MIN_DATA_SETS} runs is listed, and neither the best nor as good: too few to compare.",
+    f"A method with fewer than {MIN_DATA_SETS} runs is listed, but not compared.",
 )
 MEANING = (
-    "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
-    "β: 100 ‖β̂ - β‖ / ‖β‖ of the base parameters; in σ: rms of their errors in stated standard deviations (1 if "
-    "these are right); covered: share within 1.96 σ (95 % if they are right).",
-    "d_τ, d_q: the survey's figures, on the data set itself. d_τ compares with noisy torque, and has a floor that no "
-    "method goes below: it cannot rank.",
-    "All are medians over trials; CPU is processor time of the method alone; p is the sign test's against the best.",
+    "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ on unseen motion, with the noise-free torques τ of the true robot.",
+    "β: 100 ‖β̂ - β‖ / ‖β‖ of the base parameters; in σ: rms of their errors divided by their stated σ (ideally 1); "
+    "covered: share of errors within 1.96 σ (ideally 95 %).",
+    "d_τ, d_q: the survey's figures, on the training data. d_τ compares with noisy torques; the noise limits it for "
+    "all methods, so it cannot rank them.",
+    "All are medians over trials; CPU: processor time of the method alone; p: sign test against the best method.",
 )
 
 
@@ -315,7 +315,7 @@ def run_study(
     else:
         with opened(out) as store:
             if store.dropped:
-                notes.append(f"{store.dropped} half-written line was removed: its trial is run again")
+                notes.append(f"{store.dropped} incomplete line was removed; its trial is run again")
             say(f"{len(store.rows)} rows are there")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda found: say(str(found)))

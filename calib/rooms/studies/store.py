@@ -80,8 +80,8 @@ class RowStore:
         self._journal = open(path, "r+b", buffering=0)  # noqa: SIM115 (held as long as the store)
         self._journal.seek(size)
         return CalibError(
-            f"cannot write {path}: {error.strerror or error}; {len(self.rows)} rows are kept: make room, and the same "
-            "command goes on from there"
+            f"cannot write {path}: {error.strerror or error}; {len(self.rows)} rows are kept: free disk space, then "
+            "run the same command again"
         )
 
     def settle(self) -> Path:

@@ -83,7 +83,7 @@ def test_useless_images_are_left_out_and_said_to_be(folder):
 def test_too_few_usable_images_are_refused_with_the_reasons(folder):
     for name in ("0001", "0002", "0003", "0004", "0005"):
         (folder / f"{name}.png").write_bytes(b"")
-    with pytest.raises(MeasurementError, match=r"2 usable images: .*5 images are of no use .*the file is empty"):
+    with pytest.raises(MeasurementError, match=r"2 usable images: .*5 images are not usable .*the file is empty"):
         read(folder)
 
 
@@ -165,6 +165,6 @@ def test_one_sentence_per_reason_tells_the_range_of_its_numbers():
     }
     other = {"3.png": "no markers of 4x4_50, but some of 5x5_100: state it"}
     assert problem_words({**blurred, "4.png": "", **other}) == [
-        "2 images are of no use (no board found; the image's sharpest edges are 9 to 12 px wide): 1.png, 2.png",
-        "1 image is of no use (no markers of 4x4_50, but some of 5x5_100: state it): 3.png",
+        "2 images are not usable (no board found; the image's sharpest edges are 9 to 12 px wide): 1.png, 2.png",
+        "1 image is not usable (no markers of 4x4_50, but some of 5x5_100: state it): 3.png",
     ]

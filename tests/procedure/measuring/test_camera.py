@@ -78,7 +78,7 @@ def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
         with pytest.raises(UsageError, match="sees the board at hardly any posture"):
             selection.choose("lwr4plus", 15, SelectionSettings(candidates=60), constraints=path)
         path.write_text(path.read_text().replace("camera.yaml", "lens.yaml"))
-        with pytest.raises(UsageError, match=r"camera: no file 'lens.yaml' beside it"):
+        with pytest.raises(UsageError, match=r"camera: no file 'lens.yaml' next to it"):
             read_limits(path, targets_of(load("lwr4plus")))
 
 
@@ -130,7 +130,7 @@ def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):
         (["--paper", "a4"], "squares of 25 mm would fit"),
         (["--paper", "b5"], "--paper b5: expected one of a4"),
         (["--dictionary", "5x5"], "dictionary: expected one of"),
-        (["--square", "0.03"], "--square counts in mm"),
+        (["--square", "0.03"], "--square is in mm"),
         (["--columns", "3", "--rows", "3"], "has 4 corners, an image needs 8"),
     ):
         assert run(["board", "--out", str(tmp_path), *wrong]) == 2
@@ -166,7 +166,7 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
         shots(cell, q, seed, session.path(f"3-measured/{name}"))
     stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
     told = " ".join(said)
-    assert "of no use (blurred: still moving): 0003.png" in told and "the arm carries the camera" in told
+    assert "not usable (blurred: still moving): 0003.png" in told and "the arm carries the camera" in told
     assert "the board sets the scale (30 mm per square)" in told
     assert stop.verdict == "pass"
     found = json.loads(session.path("5-validation/metrics.json").read_text())

@@ -211,7 +211,7 @@ def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, ca
     assert not list((tmp_path / "cell/3-measured").iterdir())
     assert cli.run(["demo", "--bring", out]) == 0
     assert (tmp_path / "cell/3-measured/validation.csv").exists()
-    assert cli.run(["demo", "--bring", out]) == 2 and "waits for nothing" in capsys.readouterr().err
+    assert cli.run(["demo", "--bring", out]) == 2 and "waits for no files" in capsys.readouterr().err
 
 
 def test_a_robot_without_masses_is_calibrated_without_dynamics(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -186,7 +186,7 @@ def make(
         raise UsageError(f"--paper {paper}: expected one of {', '.join(PAPERS)}")
     min_square = 1.0  # side of a square [mm]
     if square < min_square:
-        raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
+        raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square is in mm")
     usual, share, across = USUAL[kind]
     between = (share * square if marker is None else marker) / 1e3
     stated = {"kind": kind, "columns": columns or across, "rows": rows, "square": square / 1e3, "marker": between}

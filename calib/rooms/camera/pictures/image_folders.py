@@ -162,7 +162,7 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
         for each in zip(*(MEASURED.findall(problems[name]) for name in own)):
             low, high = min(each, key=float), max(each, key=float)
             reason = reason.replace("#", low if low == high else f"{low} to {high}", 1)
-        result.append(f"{len(own)} image{'s are' if len(own) > 1 else ' is'} of no use ({reason}): {listing(own, 5)}")
+        result.append(f"{len(own)} image{'s are' if len(own) > 1 else ' is'} not usable ({reason}): {listing(own, 5)}")
     return result
 
 
@@ -226,7 +226,7 @@ def detection_summary(found: Found, board: Board, names: Iterable[str]) -> list[
     sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
     edge = float(np.nanmedian([one.edge for one in kept]))
     lines = [
-        f"{len(kept)} of {len(list(names))} images are of use ({board.words})",
+        f"{len(kept)} of {len(list(names))} images are usable ({board.words})",
         f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide",
     ]
     if found.size[0]:
