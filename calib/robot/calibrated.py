@@ -308,17 +308,14 @@ def write(
         record: more entries of its provenance.
         comment: where the numbers come from.
     """
+    rigid = None if robot.corrections is None else robot.chain.values
+    known = {"robot": robot.source, "nominal": robot.nominal and robot.nominal.values, "rigid": rigid}
     extra: dict[str, Any] = dict(tables or {})
     if robot.corrections is not None:
         extra["deflection"] = _deflection_table(robot.corrections)
-    known: dict[str, Any] = dict(record or {}) | {"robot": robot.source}
-    if robot.nominal is not None:
-        known["nominal"] = robot.nominal.values.tolist()
-    if robot.corrections is not None:
-        known["rigid"] = robot.chain.values.tolist()
-    description.write(folder / ROBOT, robot.complete, {**extra, "provenance": known}, source=comment)
-    own = np.flatnonzero(np.diag(robot.covariance) > 0.0) if robot.covariance is not None else []
-    if robot.covariance is not None and len(own):
+    extra["provenance"] = {**(record or {}), **known}
+    description.write(folder / ROBOT, robot.complete, extra, source=comment)
+    if robot.covariance is not None and len(own := np.flatnonzero(np.diag(robot.covariance) > 0.0)):
         names = [robot.chain.names[k] for k in own]
         write_covariance(folder / COVARIANCE, names, robot.covariance[np.ix_(own, own)])
 

@@ -153,20 +153,13 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict
             "calib fit, excite, identify or plan"
         )
     robot = {key: value for key, value in table.items() if key not in EXTRA}
-    if "element" not in robot:
-        chain = mdh.from_table(robot, str(path), propose_beta)
-    else:
-        chain = _from_elements(robot, str(path))
-    return chain, _extra_tables(table)
+    where, extra = str(path), {key: value for key, value in table.items() if key in EXTRA}
+    return _from_elements(robot, where) if "element" in robot else mdh.from_table(robot, where, propose_beta), extra
 
 
 def read_extra(path: str | Path) -> dict[str, Any]:
     """Return the extra tables of a robot file (`EXTRA`) as plain dictionaries."""
-    return _extra_tables(tables.load(path))
-
-
-def _extra_tables(table: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in table.items() if key in EXTRA}
+    return {key: value for key, value in tables.load(path).items() if key in EXTRA}
 
 
 def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> Path:
