@@ -42,17 +42,9 @@ from calib import files
 from calib.errors import UsageError
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.export import geometry
+from calib.procedure.export import geometry, identified
 from calib.procedure.export.geometry import results
-from calib.procedure.export.identified import (
-    ExportedPrediction,
-    IdentifiedRobot,
-    exported_prediction,
-    notes_of,
-    parameters,
-    read,
-)
-from calib.procedure.export.masses import as_mjcf, as_urdf
+from calib.procedure.export.identified import ExportedPrediction, IdentifiedRobot
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import (
     CORRECTED_URDF,
@@ -103,11 +95,11 @@ class Export:
 
     @cached_property
     def dynamics(self) -> IdentifiedRobot:
-        return read(self.identified or Path(), self.prior)
+        return identified.read(self.identified or Path(), self.prior)
 
     @cached_property
     def prediction(self) -> ExportedPrediction | None:
-        return exported_prediction(self.dynamics, self.identified or Path())
+        return identified.exported_prediction(self.dynamics, self.identified or Path())
 
     @property
     def urdf(self) -> Path | None:
@@ -119,8 +111,8 @@ class Export:
         """URDF with identified masses and friction, and remarks."""
         found = self.dynamics
         if self.urdf is None:
-            return as_urdf(found, urdf_write.write_new(found.chain), "the chain's own URDF", found.chain)
-        return as_urdf(found, text(self.urdf)[0], str(self.urdf), nominal_of(found.robot))
+            return identified.as_urdf(found, urdf_write.write_new(found.chain), "the chain's own URDF", found.chain)
+        return identified.as_urdf(found, text(self.urdf)[0], str(self.urdf), nominal_of(found.robot))
 
     @property
     def files(self) -> list["ExportFile"]:
@@ -135,7 +127,12 @@ def _urdf(export: Export, path: Path) -> list[str]:
     edited, notes = export.with_masses
     files.write(path, edited.encode("utf-8" if export.urdf is None else text(export.urdf)[1]))
     made = f"{URDF}: joint origins, masses and friction; {READ_BACK}"
-    return [*([str(export.prediction)] if export.prediction else []), made, *notes_of(export.dynamics), *notes]
+    return [
+        *([str(export.prediction)] if export.prediction else []),
+        made,
+        *identified.notes_of(export.dynamics),
+        *notes,
+    ]
 
 
 def _corrected_urdf(export: Export, path: Path) -> list[str]:
@@ -175,7 +172,7 @@ def _ur_kinematics(export: Export, path: Path) -> list[str]:
 
 
 def _mjcf(export: Export, path: Path) -> list[str]:
-    files.write(path, as_mjcf(export.dynamics, path.name))
+    files.write(path, identified.as_mjcf(export.dynamics, path.name))
     return [f"{path.name}: MJCF with armature, damping and frictionloss; {READ_BACK}"]
 
 
@@ -200,7 +197,7 @@ def _joint_origins(export: Export, path: Path) -> list[str]:
 
 
 def _parameters(export: Export, path: Path) -> list[str]:
-    files.write_json(path, parameters(export.dynamics) | {"prediction": export.prediction})
+    files.write_json(path, identified.parameters(export.dynamics) | {"prediction": export.prediction})
     return []
 
 
@@ -295,11 +292,11 @@ def verdicts(folder: Path) -> Verdicts:
 
     Empty where the folder is of an earlier version and does not say it, or where its session has yet to judge it.
     """
-    identified = IdentificationFolder(folder)
+    dynamics = IdentificationFolder(folder)
     validated = ValidationFolder(folder.absolute().parent / VALIDATED)
     try:
-        if identified.model.is_file():
-            found = identified.unseen.read() if identified.unseen.report.is_file() else identified.metrics()
+        if dynamics.model.is_file():
+            found = dynamics.unseen.read() if dynamics.unseen.report.is_file() else dynamics.metrics()
             return Verdicts({"dynamics": Verdict(found.verdict, found.reason)} if found.verdict else {})
         own = folder.absolute().name == IN_SESSION and validated.judged.is_file()
         judged = validated.metrics() if own else FitFolder(folder).metrics()

@@ -25,8 +25,8 @@ from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.formats import urdf, urdf_write
 from calib.robot.formats.simulators import link_poses, tip_poses
+from calib.robot.formats.urdf_tree import UrdfTree, text
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.formats.urdf_tree import text
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert, to_xyz_rpy
 
@@ -74,6 +74,12 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
     return edited.encode(encoding), check_readback(edited, str(source), chain)
 
 
+def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
+    """Return the chain of a URDF with the joints and the tip of another chain, as far as the URDF has their names."""
+    named = chain.joint_names if chain.joint_names[0] in tree.joints else None
+    return urdf.build(tree, *urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
+
+
 def check_readback(edited: str, where: str, chain: Chain) -> str:
     """Refuse a URDF text with other poses in Pinocchio or yourdfpy than in this toolkit (`MAX_DIFFERENCE`).
 
@@ -81,9 +87,7 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
         The programs that have read it. A text that yourdfpy cannot read is accepted, and the reason is stated.
     """
     tree = read_tree(edited, where)
-    named = chain.joint_names if chain.joint_names[0] in tree.joints else None
-    tip = chain.tip if chain.tip in tree.bodies else None
-    own = urdf.build(tree, *urdf.ends(tree, None, tip, named))
+    own = chain_in(tree, chain)
     q = random_joints(own, 20, 0)
     error = float(np.abs(tip_poses(edited, own, q) - forward(own, q)).max())
     if error > MAX_DIFFERENCE:

@@ -1,15 +1,19 @@
-"""Preparation of an identification for export: estimate, physically consistent parameters, and remarks."""
+"""Identification for export: physically consistent parameters, their files (URDF, MJCF, JSON), and remarks.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+URDF and MJCF are verified by reading them with Pinocchio.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib.dynamics import pseudo_inertia, rigid_body
 from calib.dynamics.bodies import Bodies, bodies_of
 from calib.dynamics.drives import DriveTerm
-from calib.errors import finding
+from calib.errors import RobotError, finding
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_information
@@ -17,10 +21,17 @@ from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_torques
 from calib.procedure.export import geometry
+from calib.procedure.export.geometry import MAX_DIFFERENCE
 from calib.procedure.findings import lines_of
 from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, random_joints
 from calib.robot.description import impossible_bodies
+from calib.robot.formats import urdf, urdf_write
+from calib.robot.formats.simulators import mjcf_text, motion_torques
+from calib.robot.formats.urdf_tree import UrdfTree, transform_body
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.kinematics import moving_frames
+from calib.transforms import invert
 
 MAX_MASS_RATIO = 3.0  # times a body's mass in the description from which on it is named (our choice)
 
@@ -154,45 +165,127 @@ def parameters(given: IdentifiedRobot) -> dict[str, Any]:
     """Return the content of ``parameters.json``."""
     estimate, found, chain = given.information, given.found, given.chain
     model = found.dynamics.model
-    covariance = given.robot.covariance
+    same = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
+    consistency = {name: getattr(found, name) for name in same} | {
+        "margins_m": dict(zip(model.bodies.labels, found.margins)), "sigmas_widened_by": found.doubt,
+        "drawn_to": found.source, "blamed": dict(found.blamed),
+    }  # fmt: skip
+    geometric = {"nominal": nominal_of(given.robot).values, "covariance": given.robot.covariance}
+    frames = "about the chain's frame behind each joint (robot.toml), payloads about the tip"
+    standard = {"names": model.names, "units": model.units, "values": found.dynamics.values}
     return {
         "robot": chain.name,
-        "geometry": {
-            **_columns(chain.names, chain.units, chain.values),
-            "nominal": nominal_of(given.robot).values.tolist(),
-            "covariance": None if covariance is None else np.asarray(covariance).tolist(),
-        },
+        "geometry": _columns(chain) | geometric,
         "dynamics": {
-            "gravity": model.bodies.gravity.tolist(),
+            "gravity": model.bodies.gravity,
             "rows": model.torque_rows.name,
-            "base": {
-                **_columns(estimate.names, estimate.units, estimate.values),
-                "covariance": estimate.covariance.tolist(),
-            },
-            "standard": {
-                **_columns(model.names, model.units, found.dynamics.values),
-                "covariance": found.covariance.tolist(),
-                "frames": "about the chain's frame behind each joint (robot.toml), payloads about the tip",
-            },
-            "consistency": {
-                "possible": found.possible,
-                "nearest": found.nearest,
-                "distance": found.distance,
-                "allowed": found.allowed,
-                "margins_m": dict(zip(model.bodies.labels, found.margins.tolist())),
-                "weight": found.weight,
-                "prior": found.prior,
-                "sigmas_widened_by": found.doubt,
-                "drawn_to": found.source,
-                "blamed": dict(found.blamed),
-                "notes": list(found.notes),
-            },
+            "base": _columns(estimate) | {"covariance": estimate.covariance},
+            "standard": standard | {"covariance": found.covariance, "frames": frames},
+            "consistency": consistency,
         },
     }
 
 
-def _columns(names: Sequence[str], units: Sequence[str], values: np.ndarray) -> dict[str, Any]:
-    return {"names": list(names), "units": list(units), "values": np.asarray(values).tolist()}
+def _columns(of: Chain | Information) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in ("names", "units", "values")}
+
+
+def as_mjcf(given: IdentifiedRobot, where: str) -> str:
+    """Return the MJCF of an identified robot.
+
+    Raises:
+        RobotError: where Pinocchio reads other poses, torques or drives.
+    """
+    model = mjcf_text(given.chain, given.bodies, *given.drives.values.T[:3])
+    _check(given, model, given.chain, where, mjcf=True)
+    return model
+
+
+def as_urdf(given: IdentifiedRobot, content: str, where: str, nominal: Chain) -> tuple[str, list[str]]:
+    """Return a URDF text with calibrated origins, masses and friction, and notes.
+
+    Args:
+        given: the identified robot.
+        content: the URDF of the nominal robot.
+        where: names it in messages.
+        nominal: the arm that `content` describes.
+
+    Raises:
+        RobotError: where Pinocchio reads other poses, torques or drives.
+    """
+    chain = given.chain
+    calibrated_text = urdf_write.edit(content, nominal, chain, where)
+    tree = read_tree(calibrated_text, where)
+    own = geometry.chain_in(tree, chain, chain.base if chain.base in tree.bodies else None)
+    own = replace(own, gravity=chain.gravity)
+    links, notes = _link_bodies(given, tree, own)
+    names = own.joint_names
+    friction = {name: (float(row[1]), float(row[2])) for name, row in zip(names, given.drives.values)}
+    edited = urdf_write.put(calibrated_text, where, links, friction)
+    geometry.check_readback(edited, where, chain)
+    _check(given, edited, own, where)
+    return edited, notes
+
+
+def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the inertials to write by link, about the links' frames, and notes."""
+    path = [joint for joint in tree.path(own.base, own.tip) if joint.moves]
+    zero = np.zeros((1, own.n))
+    between = invert(moving_frames(own, zero)[:, 0]) @ moving_frames(given.chain, zero)[:, 0]
+    links: dict[str, np.ndarray] = {}
+    notes: list[str] = []
+    for joint, turn, body in zip(path, between, given.bodies):
+        if not body.any():
+            continue
+        whole = transform_body(body, urdf.align(joint.axis) @ turn)
+        fixed, loose = urdf_write.hanging(tree, tree.path(own.base, own.tip), joint.child)
+        others = {
+            name: placed for name, placed in fixed.items() if name != joint.child and tree.bodies[name] is not None
+        }
+        rest = whole - _sum(tree, loose)
+        links[joint.child] = rest - _sum(tree, others)
+        if others and not pseudo_inertia.margin(links[joint.child]) > 0.0:
+            links |= {joint.child: rest, **{name: np.zeros(10) for name in others}}
+            notes.append(
+                f"link {joint.child}: it has the whole mass, and {', '.join(others)} have mass zero: with their masses "
+                "in the URDF the remaining body is not physically consistent"
+            )
+        if not pseudo_inertia.margin(links[joint.child]) > 0.0:
+            raise RobotError(
+                f"{tree.where}: link '{joint.child}' is not physically consistent, since the attached links "
+                f"({', '.join(loose)}) are heavier than the identified mass: are the drive gains "
+                "right? Correct those masses, or omit --urdf to write all other files"
+            )
+    return links, notes
+
+
+def _sum(tree: UrdfTree, placed: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the summed standard parameters (10,) of links in the URDF."""
+    found = [(tree.bodies[name], pose) for name, pose in placed.items()]
+    return sum((transform_body(body, pose) for body, pose in found if body is not None), np.zeros(10))
+
+
+def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
+    """Refuse a file if Pinocchio reads other frames, torques, motor inertias or friction, on random motion."""
+    rng = np.random.default_rng(0)
+    q = random_joints(given.chain, 20, 0)
+    v, a = rng.uniform(-1.0, 1.0, (2, *q.shape))
+    torques, frames, damping, friction = motion_torques(source, chain, q, v, a, mjcf)
+    wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a)
+    if mjcf:
+        wanted = wanted + given.drives.values[:, 0] * a
+        away = float(np.abs(frames - moving_frames(given.chain, q)).max())
+        if away > MAX_DIFFERENCE:
+            raise RobotError(f"{where}: poses differ by {away:.2g} when Pinocchio reads the file; nothing was written")
+    off = float(np.abs(torques - wanted).max()) / max(1.0, float(np.abs(wanted).max()))
+    if off > MAX_DIFFERENCE:
+        raise RobotError(
+            f"{where}: torques differ by {off:.2g} of the largest when Pinocchio reads the file; nothing was written. "
+            "Do other joints of the file have masses that were not part of the identification?"
+        )
+    for what, read_back, own in (("damping", damping, 1), ("friction", friction, 2)):
+        if not np.allclose(read_back, given.drives.values[:, own], rtol=MAX_DIFFERENCE, atol=1e-12):
+            raise RobotError(f"{where}: Pinocchio reads another {what} than was written")
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:

@@ -13,7 +13,7 @@ from sessions import begin, go_on
 from without_figures import run
 
 from calib.errors import NotConverged
-from calib.procedure.export import delivery as export
+from calib.procedure.export import identified
 from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.session import steps
 from calib.procedure.session.folder import Session
@@ -85,7 +85,7 @@ def test_no_file_says_another_verdict_than_that_of_what_is_delivered(session: Se
         path.write_text(re.sub("tolerance_percent = [^ ]+", f"tolerance_percent = {tolerance}", path.read_text()))
         with pytest.MonkeyPatch.context() as patch:
             if not exports:
-                patch.setattr(export, "read", refuse)
+                patch.setattr(identified, "read", refuse)
             assert go_on(session) is None
         whole = json.loads(session.path("verdict.json").read_text())["dynamics"]
         report = json.loads(session.path("8-dynamics/unseen/report.json").read_text())
