@@ -9,19 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calib import files
+from calib import files, folders
 from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
-from calib.folders import (
-    COVARIANCE,
-    ESTIMATE,
-    METRICS,
-    REPORT,
-    check_target,
-    read_estimate,
-    write_covariance,
-    write_staged,
-)
 from calib.identification.gains import GainRecord
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
@@ -40,8 +30,8 @@ from calib.units import per_ampere
 
 INSTRUMENTAL = "instrumental.csv"
 OURS = (
-    calibrated.ROBOT, MODEL, ESTIMATE, COVARIANCE, information.INFORMATION, INSTRUMENTAL,
-    METRICS, "drive_gains.csv",
+    calibrated.ROBOT, MODEL, folders.ESTIMATE, folders.COVARIANCE, information.INFORMATION, INSTRUMENTAL,
+    folders.METRICS, "drive_gains.csv",
     "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES, "plot_torque_[0-9]*.png",
     *(f"plot_{name}.png" for name in ("residuals", "friction", "geometries", "geometry_effects")),
@@ -63,25 +53,14 @@ class IdentificationFolder:
 
     path: Path
 
-    @property
-    def robot(self) -> Path:
-        """Path of the identified robot."""
-        return self.path / calibrated.ROBOT
-
-    @property
-    def model(self) -> Path:
-        """Path of the model."""
-        return self.path / MODEL
-
-    @property
-    def numbers(self) -> Path:
-        """Path of the metrics: numbers, verdict and findings."""
-        return self.path / METRICS
+    robot = folders.InFolder(calibrated.ROBOT)
+    model = folders.InFolder(MODEL)
+    numbers = folders.InFolder(folders.METRICS)  # with verdict and findings
 
     @property
     def tables(self) -> tuple[Path, Path]:
         """Paths of the estimate and of its covariance."""
-        return self.path / ESTIMATE, self.path / COVARIANCE
+        return self.path / folders.ESTIMATE, self.path / folders.COVARIANCE
 
     @property
     def torques(self) -> list[Path]:
@@ -108,7 +87,7 @@ class IdentificationFolder:
 
     def essential(self) -> tuple[str, ...]:
         """Read the names of the essential parameters."""
-        return tuple(row.name for row in read_estimate(self.path, _Essential) if row.essential is not None)
+        return tuple(row.name for row in folders.read_estimate(self.path, _Essential) if row.essential is not None)
 
     def errors(self) -> TorqueErrorModel | None:
         """Read the model's expected torque errors; None if they are unknown."""
@@ -123,10 +102,7 @@ class UnseenFolder:
 
     path: Path
 
-    @property
-    def report(self) -> Path:
-        """Scores, verdict, and curves for the certificate."""
-        return self.path / REPORT
+    report = folders.InFolder(folders.REPORT)  # scores, verdict, and curves for the certificate
 
     def write(self, inputs: IdentificationInputs, found: Assessment) -> None:
         """Write a table of torques per unseen recording, and the report."""
@@ -142,7 +118,7 @@ class UnseenFolder:
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
     """Refuse, before any work is done, a folder not for an identification, or one that contains an input."""
-    check_target(out, OURS, (METRICS, MODEL), "identification", inputs)
+    folders.check_target(out, OURS, (folders.METRICS, MODEL), "identification", inputs)
 
 
 def write_folder(
@@ -161,7 +137,7 @@ def write_folder(
         if plots is not None:
             plots(outcome, folder)
 
-    return write_staged(out, OURS, write)
+    return folders.write_staged(out, OURS, write)
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
@@ -171,10 +147,10 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     else:
         robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
         calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
-    files.write_table(folder / ESTIMATE, HEADER, _estimate_rows(outcome))
+    files.write_table(folder / folders.ESTIMATE, HEADER, _estimate_rows(outcome))
     estimate = found.fitted.estimate
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
-    write_covariance(folder / COVARIANCE, found.names, covariance)
+    folders.write_covariance(folder / folders.COVARIANCE, found.names, covariance)
     geometry_tables.write(outcome, folder)
     if found.loop.table:
         files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, found.loop.table)
@@ -192,7 +168,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         header = ("joint", f"gain [{gains.unit}]", "sigma", "told")
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
         files.write_table(folder / "drive_gains.csv", header, rows)
-    files.write_json(folder / METRICS, metrics(outcome))
+    files.write_json(folder / folders.METRICS, metrics(outcome))
 
 
 def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path) -> Path:
@@ -226,7 +202,7 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
     switched off, and parameters that a constraint holds, have no σ: nobody measured them.
     """
-    found = outcome.found
+    found, carried = outcome.found, outcome.carried
     estimate = found.fitted.estimate
     words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
     held = on_bounds(found)
@@ -235,28 +211,16 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
         f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.friction.terms
     ]
     words = [f"{own}, on its bound: no sigma" if name in held else own for name, own in zip(found.names, words)]
-    carried = outcome.carried
     sigmas = estimate.sigma if carried is None else carried.sigma
-    parts = [None] * len(sigmas) if carried is None or carried.geometry is None else carried.sigma_geometry.tolist()
+    part = np.full(len(sigmas), np.nan) if carried is None or carried.geometry is None else carried.sigma_geometry
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.where(estimate.values == 0.0, np.inf, 100.0 * sigmas / np.abs(estimate.values))
+        relative = 100.0 * sigmas / np.abs(estimate.values)
+    relative = np.where(np.isfinite(relative), relative, np.nan)
+    unmeasured = np.isin(found.names, off)
+    sigma, rsd, noise, part = (np.where(unmeasured, np.nan, own) for own in (sigmas, relative, estimate.sigma, part))
     essential = {}
     if found.elimination is not None:
-        kept = found.elimination.essential.estimate
-        essential = dict(zip(kept.names, kept.values))
-    return [
-        (
-            name,
-            expression,
-            per_ampere(unit, outcome.inputs.unit),
-            float(value),
-            None if name in off else float(sigma),
-            None if name in off else plain(float(rsd), null=True),
-            plain(essential.get(own)),
-            None if name in off else float(noise),
-            None if name in off else part,
-        )
-        for name, own, expression, unit, value, sigma, rsd, noise, part in zip(
-            found.names, estimate.names, words, estimate.units, estimate.values, sigmas, relative, estimate.sigma, parts
-        )
-    ]
+        essential = dict(zip(found.elimination.essential.estimate.names, found.elimination.essential.estimate.values))
+    units = (per_ampere(unit, outcome.inputs.unit) for unit in estimate.units)
+    kept = map(essential.get, estimate.names)
+    return list(zip(found.names, words, units, estimate.values, sigma, rsd, kept, noise, part))

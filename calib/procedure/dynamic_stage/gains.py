@@ -10,6 +10,7 @@ from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.motion import Motion, make_motion
+from calib.dynamics.bodies import STANDARD
 from calib.errors import UsageError
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base
@@ -98,12 +99,7 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     ]
     found = _identify(chain, cases, settings, known, None)
     values = dict(zip(found.names, found.values))
-    loads = {
-        label: tuple(
-            float(values.get(name + label, 0.0)) for name in ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
-        )
-        for label in settings.payloads
-    }
+    loads = {label: tuple(float(values.get(name + label, 0.0)) for name in STANDARD) for label in settings.payloads}
     told = ", ".join(f"{gain:.4g} ± {sigma:.2g}" for gain, sigma in zip(found.gains, found.sigma))
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = [

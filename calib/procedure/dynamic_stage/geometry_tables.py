@@ -14,7 +14,7 @@ Files in addition to those of every identification (``calib identify --out``)::
     chain_covariance.csv  that of the fit, for whoever goes on from this folder
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -104,7 +104,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     carried = outcome.carried
     if carried is None:
         return
-    rows = ([name, *map(float, row)] for name, row in zip(carried.names, carried.sensitivity))
+    rows = ([name, *row] for name, row in zip(carried.names, carried.sensitivity))
     header = [f"{name} [{unit}]" for name, unit in zip(carried.elements, carried.units)]
     files.write_table(folder / SENSITIVITY, ("name", *header), rows)
     files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
@@ -131,34 +131,28 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     """
     found, units = [], _per_sigma(carried)
     for rank, k in enumerate(_ranking(carried), start=1):
-        per_unit = units[:, k]
-        worst, sigma = int(np.argmax(per_unit)), carried.deviations[k]
+        per_unit, sigma = units[:, k], carried.deviations[k]
+        worst, shifts = int(np.argmax(per_unit)), per_unit * sigma
         known = bool(np.isfinite(sigma))
-        shifts = per_unit * sigma
         found.append(
             GeometricEffect(
-                rank, carried.elements[k], carried.units[k], float(sigma) if known else None,
+                rank, carried.elements[k], carried.units[k], sigma,
                 ("yes" if shifts.max() > MIN_SHIFT else "no") if known else "",
                 carried.names[worst] if per_unit[worst] > 0.0 else "",
-                float(shifts[worst]) if known else None, int((shifts > MIN_SHIFT).sum()) if known else None,
-                float(carried.felt[k] * sigma) if known else None, float(carried.left[k] * sigma) if known else None,
-                float(1e-3 * per_unit[worst]),
+                shifts[worst], int((shifts > MIN_SHIFT).sum()) if known else None, carried.felt[k] * sigma,
+                carried.left[k] * sigma, 1e-3 * per_unit[worst],
             )
         )  # fmt: skip
     return found
 
 
-def _geometries(found: GeometryComparison, essential: Sequence[str]) -> list[TwoGeometries]:
-    """Return the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
-    return [
-        TwoGeometries(
-            name, unit, float(first), float(s_first), float(second), float(s_second),
-            float(relative) if np.isfinite(relative) else None, float(apart), "yes" if name in essential else "no",
-        )
-        for name, unit, first, second, s_first, s_second, relative, apart in zip(
-            found.names, found.units, *found.values, *found.sigma, found.relative, found.difference
-        )
-    ]  # fmt: skip
+def _geometries(found: GeometryComparison, essential: Sequence[str]) -> Iterator[TwoGeometries]:
+    """Yield the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
+    (nominal, calibrated), (s_nominal, s_calibrated) = found.values, found.sigma
+    relative = np.where(np.isfinite(found.relative), found.relative, np.nan)
+    kept = ("yes" if name in essential else "no" for name in found.names)
+    columns = nominal, s_nominal, calibrated, s_calibrated, relative, found.difference, kept
+    return (TwoGeometries(*row) for row in zip(found.names, found.units, *columns))
 
 
 def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:

@@ -14,36 +14,16 @@ import numpy as np
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.errors import Finding, finding
 from calib.extensions import offered
+from calib.identification import geometry_uncertainty, torque_errors
 from calib.identification.friction.passivity import driven
-from calib.identification.geometry_uncertainty import GeometryComparison, GeometryUncertainty, compare, propagate
 from calib.identification.identify import Identification, identify
 from calib.identification.loop import Controller, LoopDisagreement, Replay
 from calib.identification.possible.solve import Contradiction, contradiction
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
-from calib.identification.torque_errors import (
-    TorqueDiscrepancy,
-    TorqueErrorModel,
-    TorqueIntervals,
-    intervals,
-    learn_torque_errors,
-)
 from calib.procedure.dynamic_stage import plausibility
+from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
-from calib.procedure.dynamic_stage.verdict import (
-    Resting,
-    beyond,
-    excitation_notes,
-    extrapolates,
-    friction_drives,
-    judge,
-    model_findings,
-    motion_findings,
-    resting_parameters,
-    too_narrow,
-    with_duration,
-    with_prior,
-)
 from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
 from calib.units import TORQUE, without_gains
@@ -65,11 +45,11 @@ class ModelFindings:
         unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
     """
 
-    rests: Resting
+    rests: judging.Resting
     notes: tuple[str, ...] = ()
     noticed: tuple[Finding, ...] = ()
     controller: Controller | None = None
-    errors: TorqueDiscrepancy | None = None
+    errors: torque_errors.TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
     unlike: LoopDisagreement | None = None
 
@@ -91,7 +71,7 @@ class Errors:
     predictions: Mapping[str, np.ndarray]
     repeated: Mapping[str, float]
     excitation: Mapping[str, ExcitationReport]
-    intervals: Mapping[str, TorqueIntervals]
+    intervals: Mapping[str, torque_errors.TorqueIntervals]
 
     @property
     def proofs(self) -> dict[str, Score]:
@@ -137,7 +117,7 @@ def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
 def errors_of(
     inputs: IdentificationInputs,
     dynamics: Dynamics[Any],
-    errors: TorqueErrorModel | None = None,
+    errors: torque_errors.TorqueErrorModel | None = None,
     say: Progress = lambda words: None,
 ) -> Errors:
     """Return the predictions of every recording by a model, and their errors.
@@ -150,11 +130,11 @@ def errors_of(
         say(f"predicting {case.name}")
         predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
-    expected: dict[str, TorqueIntervals] = {}
+    expected: dict[str, torque_errors.TorqueIntervals] = {}
     if errors is not None:
         for case in inputs.unseen or inputs.cases[:1]:
             say(f"errors to expect of {case.name}")
-            expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
+            expected[case.name] = torque_errors.intervals(errors, dynamics, case, predictions[case.name])
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     stated = {name: one.coverage() for name, one in expected.items()}
     validation = {
@@ -170,7 +150,7 @@ def assess(
     inputs: IdentificationInputs,
     dynamics: Dynamics,
     findings: ModelFindings,
-    errors: TorqueErrorModel | None = None,
+    errors: torque_errors.TorqueErrorModel | None = None,
     wrong: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Assessment:
@@ -189,11 +169,15 @@ def assess(
     say("judging")
     labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
     odd = plausibility.implausible(inputs, findings.contradiction, findings.unlike)
-    figures, rules = judge(found.fit, found.proofs, found.repeated, found.excitation, labels)
-    if drives := friction_drives(joint + 1 for joint in wrong):
+    figures, rules = judging.judge(found.fit, found.proofs, found.repeated, found.excitation, labels)
+    if drives := judging.friction_drives(joint + 1 for joint in wrong):
         figures, rules = "", drives
-    rules += too_narrow({name: found.intervals[name] for name in found.proofs if name in found.intervals}, labels)
-    verdict = with_duration(with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), found.excitation)
+    rules += judging.too_narrow(
+        {name: found.intervals[name] for name in found.proofs if name in found.intervals}, labels
+    )
+    verdict = judging.with_duration(
+        judging.with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), found.excitation
+    )
     say("tracking with the model fed forward")
     relative = inputs.unit != TORQUE
     amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
@@ -207,12 +191,12 @@ def assess(
         verdict, failure = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}"), lines_of(amperes)[0]
     noticed = (
         *amperes, *odd, *rules, *overlaps(inputs.cases, inputs.unseen),
-        *(one for case in (*inputs.cases, *inputs.unseen) for one in beyond(case, inputs.chain)),
-        *motion_findings(found.validation, found.repeated),
-        *(one for case in inputs.unseen for one in extrapolates(case.name, found.intervals.get(case.name))),
+        *(one for case in (*inputs.cases, *inputs.unseen) for one in judging.beyond(case, inputs.chain)),
+        *judging.motion_findings(found.validation, found.repeated),
+        *(one for case in inputs.unseen for one in judging.extrapolates(case.name, found.intervals.get(case.name))),
         *findings.noticed,
     )  # fmt: skip
-    said = dict.fromkeys((*lines_of(noticed), *excitation_notes(found.excitation), *findings.notes))
+    said = dict.fromkeys((*lines_of(noticed), *judging.excitation_notes(found.excitation), *findings.notes))
     return Assessment(
         **vars(found), verdict=verdict, warnings=tuple(said), noticed=noticed, tracking=replays,
         tracking_failure=failure,
@@ -236,9 +220,9 @@ class IdentificationOutcome(Assessment):
     inputs: IdentificationInputs
     found: Identification
     findings: ModelFindings
-    carried: GeometryUncertainty | None = None
-    geometries: GeometryComparison | None = None
-    errors: TorqueErrorModel | None = None
+    carried: geometry_uncertainty.GeometryUncertainty | None = None
+    geometries: geometry_uncertainty.GeometryComparison | None = None
+    errors: torque_errors.TorqueErrorModel | None = None
     seed: int = 0
 
 
@@ -262,9 +246,9 @@ def judged(
     wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
     carried, geometries = _carry(inputs, found, say)
     say("errors on held-out time")
-    errors = learn_torque_errors(found, inputs.cases, carried.covariance)
+    errors = torque_errors.learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
-        resting_parameters(found), (), model_findings(inputs.cases, found),
+        judging.resting_parameters(found), (), judging.model_findings(inputs.cases, found),
         found.loop.controller, errors and errors.discrepancy,
         contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.loop.disagreement,
     )  # fmt: skip
@@ -286,10 +270,10 @@ def assessed(outcome: T, inputs: IdentificationInputs) -> T:
 
 def _carry(
     inputs: IdentificationInputs, found: Identification, say: Progress
-) -> tuple[GeometryUncertainty, GeometryComparison | None]:
+) -> tuple[geometry_uncertainty.GeometryUncertainty, geometry_uncertainty.GeometryComparison | None]:
     """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry."""
-    carried = propagate(found, inputs.robot, inputs.cases, say)
+    carried = geometry_uncertainty.propagate(found, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:
         return carried, None
     say("the same on the nominal geometry")
-    return carried, compare(found, carried, inputs.robot.nominal, inputs.cases)
+    return carried, geometry_uncertainty.compare(found, carried, inputs.robot.nominal, inputs.cases)

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Recording, earlier
+from calib.data.recordings.recording import Recording, earlier, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
+from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
+from calib.identification.methods.registry import METHODS
 from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
@@ -182,17 +184,12 @@ def _path(each: str | Path | Recording) -> str:
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options updated by the command's choices, and check the names in them."""
-    from calib.identification.friction.friction_ladder import NAMES
-    from calib.identification.methods.registry import METHODS
-
-    settings: IdentificationSettings = replace(options.settings, seed=seed)
-    for value, allowed, key in ((method, METHODS, "method"), (friction, NAMES, "friction")):
-        if value is None:
-            continue
+    given = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
+    for key, value in given.items():
+        allowed = tuple(METHODS) if key == "method" else NAMES
         if value not in allowed:
             raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}{suggestion(value, allowed)}")
-        settings = replace(settings, **{key: value})
-    return replace(options, settings=settings)
+    return replace(options, settings=replace(options.settings, seed=seed, **given))
 
 
 def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
@@ -277,9 +274,6 @@ def _referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions)
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
     """Refuse a [files] table that names none of the recordings."""
-
-    from calib.data.recordings.recording import parse_cut
-
     plain = [Path(parse_cut(str(path))[0]) for path in paths]
     for name in options.files:
         wanted = Path(name).parts

@@ -246,38 +246,21 @@ def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
 
 
 def _slow_bias(cases: Sequence[Case], found: Identification) -> list[Finding]:
-    """Return the finding that rows near standstill, where friction can have any value, are in the fit."""
-    total = np.zeros(cases[0].motion.n)
-    size = 0
-    for case in cases:
-        used = np.asarray(case.present)[:, : case.motion.n]
-        total += (~moving(case.motion) & used).sum(axis=0)
-        size += len(case.motion)
-    share = total / max(size, 1)
-    coulomb = _coulomb(found)
-    slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if j in coulomb]
-    if not slow:
-        return _coulomb_shift(cases, found)
-    return [finding("slow-samples", joints=[f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow])]
+    """Return the finding that rows near standstill, where friction can have any value, bias Coulomb friction.
 
-
-def _coulomb(found: Identification) -> dict[int, int]:
-    """Return the index of each joint's Coulomb friction in the estimate, for models of motor torques."""
-    if not found.settings.torque_rows.motors_alone:
-        return {}
-    return {one.joint: k for k, one in enumerate(found.terms) if one and one.shape == "sign" and one.joint is not None}
-
-
-def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[Finding]:
-    """Return the finding that few rows near standstill change Coulomb friction by more than its sigma.
-
-    Where a joint's friction is richer, they are modelled, not cut.
+    Few such rows are remarked upon where they change it by more than its sigma. Where a joint's friction is richer,
+    they are modelled, not cut.
     """
-    coulomb = _coulomb(found)
+    motors, estimate = found.settings.torque_rows.motors_alone, found.fitted.estimate
+    signs = ((one.joint, k) for k, one in enumerate(found.terms) if one and one.shape == "sign" and motors)
+    coulomb = {joint: k for joint, k in signs if joint is not None}
     if not coulomb:
         return []
+    still = [(~moving(one.motion) & np.asarray(one.present)[:, : one.motion.n]).sum(axis=0) for one in cases]
+    share = np.sum(still, axis=0) / max(1, sum(len(one.motion) for one in cases))
+    if slow := [j for j in np.flatnonzero(share > SLOW_SHARE) if j in coulomb]:
+        return [finding("slow-samples", joints=[f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow])]
     richer = {joint for one in found.friction.terms for joint, _ in one.acts}
-    estimate = found.fitted.estimate
     shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)
     moved = [
         f"{found.names[k]} {shift[k] / percent[k]:+.1f} % (sigma {sigma[k] / percent[k]:.1f} %)"

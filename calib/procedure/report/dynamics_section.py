@@ -301,7 +301,7 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
             f"a tilt of the base is not included: 1 mrad against gravity would change {tilt.parameter} by "
             f"{tilt.sigmas:.2g} of its sigma of torque noise"
         )
-    known = [one for one in effects if one.matters == "yes" and None not in (one.sigma, one.shift_sigma)]
+    known = [one for one in effects if one.matters == "yes"]
     blocks: list[page.Block] = [page.Text("Geometry and dynamics", lines)]
     if found.changed and known:
         blocks.append(page.table("Which geometric errors matter for the dynamics", EFFECTS, known[:SHOWN]))
