@@ -127,12 +127,8 @@ def _urdf(export: Export, path: Path) -> list[str]:
     edited, notes = export.with_masses
     files.write(path, edited.encode("utf-8" if export.urdf is None else text(export.urdf)[1]))
     made = f"{URDF}: joint origins, masses and friction; {READ_BACK}"
-    return [
-        *([str(export.prediction)] if export.prediction else []),
-        made,
-        *identified.notes_of(export.dynamics),
-        *notes,
-    ]
+    known = [str(export.prediction)] if export.prediction else []
+    return [*known, made, *identified.notes_of(export.dynamics), *notes]
 
 
 def _corrected_urdf(export: Export, path: Path) -> list[str]:

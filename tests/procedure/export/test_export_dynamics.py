@@ -67,8 +67,8 @@ def write_identification(folder: Path, source: str, seed: int = 0, factor: float
     found = np.linalg.lstsq(kept, torques, rcond=None)[0]
     covariance = 4e-4 * np.linalg.inv(kept.T @ kept)
     description.write(folder / "robot.toml", chain, {"provenance": {"nominal": nominal.values.tolist()}})
-    rows = [(name, unit, float(value)) for name, unit, value in zip(base.names, base.units, found)]
-    files.write_table(folder / "estimate.csv", ("name", "unit", "value"), rows)
+    rows = zip(base.names, base.units, found, np.sqrt(np.diag(covariance)))
+    files.write_table(folder / "estimate.csv", ("name", "unit", "value", "sigma"), rows)
     lines = [[name, *map(float, row)] for name, row in zip(base.names, covariance)]
     files.write_table(folder / "covariance.csv", ("name", *base.names), lines)
     files.write_json(folder / "dynamics.json", to_table(Dynamics(model, base.to_standard(found)), base))
