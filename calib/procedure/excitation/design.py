@@ -286,7 +286,9 @@ def search_motion(
     condition = _condition_objective(given, settings)
     named_goals = read_goals(settings, given, condition)
     report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
-    search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
+    search = partial(
+        design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
+    )
     found, problem = _searched(problem, named_goals, settings.starts, search, say)
     say("verifying")
     found, problem = _whole(found, problem, settings.rate)

@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from calib.arguments import checked
 from calib.config_types import Checked, Flag, OneOf, Real, Seed, Text, Typed, Whole
@@ -10,6 +10,7 @@ from calib.errors import UsageError
 
 HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
 GOALS = ("raw", "normalised", "duration", "coverage", "wrist")  # and joint1, joint2, …
+Solver = Literal["slsqp", "mma", "ccsaq", "auglag"]
 AIMS: tuple[Literal["logdet", "smallest"], ...] = ("logdet", "smallest")
 COARSE = 5  # harmonics that a search begins with (our choice)
 
@@ -72,6 +73,7 @@ class ExcitationSettings:
         samples: instants over the period at which the search evaluates
         starts: random starts of the search
         evaluations: most evaluations per start
+        solver: slsqp (SciPy); mma, ccsaq or auglag (NLopt)
         seed: reproduces everything random
         front: number of trade-offs between normalised condition number and first torque goal; 0: none
         start: joint values with commas [rad or m]; adds an approach from there
@@ -96,6 +98,7 @@ class ExcitationSettings:
     samples: Annotated[int, Whole(10, 100_000)] = 200
     starts: Starts = 4
     evaluations: Evaluations = 1500
+    solver: Annotated[Solver, OneOf(get_args(Solver))] = "slsqp"
     seed: Seed = 0
     front: Annotated[int, Whole(0, 1000)] = 0
     start: Start | None = None

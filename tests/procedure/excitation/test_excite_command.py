@@ -420,6 +420,12 @@ def test_the_design_is_for_the_model_that_will_be_identified():
     assert "rows = 'power'" in notes and "NOT checked: torques with payload 'load'" in notes
 
 
+@pytest.mark.parametrize("solver", ["mma", "ccsaq", "auglag"])
+def test_other_solvers_end_within_the_limits_too(solver):
+    found = design.excite("ur10e", replace(SHORT, solver=solver, evaluations=30))
+    assert found.proof.feasible and np.isfinite(found.condition.raw)
+
+
 def test_a_goal_out_of_reach_is_named():
     found = design.excite("lwr4plus", replace(SHORT, goals=("raw=300", "joint7=0.5")))
     said = " ".join(found.notes)
