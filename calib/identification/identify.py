@@ -135,7 +135,7 @@ def identify_model(
     require(cases, "no recording to identify the model from", UsageError)
     method = method_named(settings.method)
     if method.needs_simulation:
-        settings = require_simulable(settings, method.needs_controller)
+        settings = require_simulable(settings, method.needs_controller, method.takes_models)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)

@@ -152,11 +152,14 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
             raise UsageError(f"coupling: joint {coupling.joints[0] + 1} is coupled with itself; name two joints")
 
 
-def require_simulable(settings: IdentificationSettings, with_loop: bool) -> IdentificationSettings:
-    """Return the settings for a method that simulates: with standard friction only.
+def require_simulable(
+    settings: IdentificationSettings, with_loop: bool, with_models: bool = False
+) -> IdentificationSettings:
+    """Return the settings for a method that simulates: with standard friction, unless a step is stated and taken.
 
     Args:
         with_loop: whether it simulates the closed loop, or the robot alone.
+        with_models: whether it takes joint torque sensors and stated richer friction, too.
 
     Raises:
         UsageError: for a missing loop, torques other than the motors', or richer friction.
@@ -168,10 +171,12 @@ def require_simulable(settings: IdentificationSettings, with_loop: bool) -> Iden
             "identify-options), and log or state the reference; from q and torque alone use wls or irls"
         )
         refuse_option(place, words)
-    if not settings.torque_rows.motors_alone:
-        refuse_option(
-            place, f"supports motor torques only; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
-        )
+    rows = settings.torque_rows
+    if not (rows.has_bodies and rows.projection is None if with_models else rows.motors_alone):
+        kinds = "rows = 'motor', 'link' or 'both'" if with_models else "motor torques only"
+        refuse_option(place, f"supports {kinds}; rows = '{rows.name}' needs ols, wls, irls or tls")
+    if with_models and settings.friction != "auto":
+        return settings
     if settings.friction not in ("auto", "standard"):
         words = f"simulates standard friction only, not friction = '{settings.friction}'"
         refuse_option(place, f"{words}; use wls (with a [loop], it is tested for bias)")

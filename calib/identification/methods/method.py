@@ -207,6 +207,7 @@ class Method(ABC):
         takes_prior: whether it uses a prior, ridges of richer friction, and a stated noise of the rows.
         needs_controller: whether it simulates the closed loop of a recording.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
+        takes_models: if it simulates: whether it takes joint torque sensors and stated richer friction, too.
         takes_constraints: whether its estimate satisfies the options' [constraints].
     """
 
@@ -219,6 +220,7 @@ class Method(ABC):
     takes_prior: bool = field(default=False, kw_only=True)
     needs_controller: bool = field(default=False, kw_only=True)
     needs_simulation: bool = field(default=False, kw_only=True)
+    takes_models: bool = field(default=False, kw_only=True)
     takes_constraints: bool = field(default=False, kw_only=True)
 
     @abstractmethod

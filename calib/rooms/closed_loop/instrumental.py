@@ -22,7 +22,7 @@ import numpy as np
 
 from calib.data.signals.filtering import Decimator, low_pass, slope
 from calib.dynamics.base import Base
-from calib.dynamics.drives import standard
+from calib.dynamics.drives import DriveTerm, standard
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
 from calib.estimation.linear import LinearFit, settled_std, wls
@@ -36,7 +36,7 @@ from calib.identification.methods.parameter_constraints import (
     hold,
     make_constraints,
 )
-from calib.identification.rows import Case, ObservationRows, observe, pool, triangulate
+from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate
 from calib.records import frozen
 from calib.rooms.closed_loop import instrumental_variables
 from calib.rooms.closed_loop.instrumental_variables import Instruments, InstrumentStrength
@@ -146,7 +146,7 @@ class Instrumental:
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
         away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
-        return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
+        return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure[-len(away) :])  # rows of the motors
 
     @property
     def explains(self) -> bool:
@@ -180,12 +180,14 @@ def identify_instrumental(
     inertia: np.ndarray | None = None,
     positive: Sequence[str] = (),
     constraints: Constraints | None = None,
+    terms: Sequence[DriveTerm] = (),
     limit: int = MAX_ROUNDS,
 ) -> Instrumental:
     """Return the estimate of the base parameters with instruments from simulation.
 
     Args:
-        model: of motor torques.
+        model: of motor torques, joint torque sensors, or both. With sensors alone no torque tells the motor side: the
+            simulated robot keeps the inertia that it starts with there, and has no friction.
         base: its base columns.
         cases: recordings, each with the loop it came from.
         decimator: the parallel filter of W, Z and y.
@@ -194,6 +196,7 @@ def identify_instrumental(
             would be damped by 0.7.
         positive: names of base parameters that must not be negative (PC-IDIM-IV).
         constraints: on the base parameters that are estimated; None: those of `positive`.
+        terms: richer friction, estimated after the base parameters; loads that it feels are those by least squares.
         limit: most iterations.
 
     Raises:
@@ -202,16 +205,24 @@ def identify_instrumental(
         CannotSimulate: where the loop is unstable with the robot it starts from, or with an estimate and all near it.
     """
     one_of(method, ROUNDS, "method", UsageError)
-    if not model.torque_rows.motors_alone or not cases:
-        raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
-    observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
+    rows = model.torque_rows
+    if not rows.has_bodies or rows.projection is not None or not cases:
+        raise UsageError(
+            f"instruments from simulation need a recording with its reference, and rows motor, link or both; found "
+            f"'{rows.name}'"
+        )
+    plain = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
+    first = pool(triangulate(plain), model.rows)
+    loads = base.to_standard(wls(first, settled_std(first, 1e-3)).estimate.values) if terms else None
+    friction = Friction(tuple(terms), model, decimator, loads)
+    observed = [friction.added(part, case) for part, (case, _) in zip(plain, cases)]
     if constraints is None and positive:
         settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
-    task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints)
+    task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints, friction)
     data = pool(triangulate(observed), model.rows)
     ordinary = wls(data, settled_std(data, 1e-3))
-    plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
+    plant, std = _regular(model, friction.terms, cases[0][1], inertia), ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
     try:
@@ -235,6 +246,24 @@ def identify_instrumental(
 
 
 @dataclass(frozen=True, eq=False)
+class Friction:
+    """Richer friction of a model: terms, and the standard parameters (p,) by which loads are known; None: no terms."""
+
+    terms: tuple[DriveTerm, ...]
+    model: IdentificationModel
+    decimator: Decimator
+    loads: np.ndarray | None
+
+    def added(self, rows: ObservationRows, case: Case) -> ObservationRows:
+        """Return the rows of a case with a column for each term."""
+        if self.loads is None:
+            return rows
+        motion = case.motion
+        load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
+        return rows.extend(self.terms, observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows))
+
+
+@dataclass(frozen=True, eq=False)
 class _Fixed:
     """Data and settings that are the same in all iterations."""
 
@@ -245,6 +274,7 @@ class _Fixed:
     observed: Sequence[ObservationRows]
     estimator: _RoundEstimator
     constraints: Constraints | None
+    friction: Friction
 
     def after(self, found: _Found) -> _Fixed:
         """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
@@ -253,9 +283,11 @@ class _Fixed:
         return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
 
     def plant(self, old: Plant, found: _Found) -> Plant:
-        """Return the simulated robot with the estimate of an iteration."""
-        values = self.base.to_standard(found.fit.estimate.values)
-        return old.with_parameters(np.concatenate([values, np.zeros(len(old.parameters) - len(values))]))
+        """Return the simulated robot with an estimate; without motor torques it keeps the J that it starts with."""
+        own, b = found.fit.estimate.values, self.base.b
+        values = np.concatenate([self.base.to_standard(own[:b]), own[b:]])
+        regular = old.parameters[len(values) :] * (not self.model.torque_rows.with_motors)
+        return old.with_parameters(np.concatenate([values, regular]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +306,7 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
     """Return the estimate with instruments from simulated runs; `tau`: variance inflation, from the last round."""
     columns = task.base.kept
     moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
-    simulated = [observe(task.model, columns, case, task.decimator).matrix for case in moved]
+    simulated = [task.friction.added(observe(task.model, columns, case, task.decimator), case).matrix for case in moved]
     observed = [
         _with_signs(task, columns, *one) for one in zip(task.observed, simulated, (c for c, _ in task.cases), moved)
     ]
@@ -291,7 +323,8 @@ def _with_signs(
     Args:
         simulated: (M, rows, p) of `moved`, the case as it was simulated.
     """
-    drowned = _drowned_signs(task.model, columns, case)
+    signs = _drowned_signs(task.model, columns, case)
+    drowned = np.append(signs, np.zeros(len(task.friction.terms), dtype=bool))
     if not drowned.any():
         return rows
     motion, band = case.motion, 0.5 * case.motion.band
@@ -300,7 +333,7 @@ def _with_signs(
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
     if not followed.all():
         speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
-        seen = observe(task.model, columns[drowned], replace(case, motion=replace(motion, v=speed)), task.decimator)
+        seen = observe(task.model, columns[signs], replace(case, motion=replace(motion, v=speed)), task.decimator)
         simulated = simulated.copy()
         simulated[:, :, drowned] = seen.matrix
     return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
@@ -332,7 +365,7 @@ def _result(
     )  # fmt: skip
 
 
-def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
+def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None) -> Plant:
     """Return the robot of the first simulation: joint inertias J only, no gravity; J are its last n parameters."""
     if inertia is None:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -341,7 +374,8 @@ def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None)
             raise UsageError("no regular inertia follows from these gains; state the inertia (n,) [kg m²]")
     n = model.bodies.n
     extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
-    return Plant(model.bodies, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
+    values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
+    return Plant(model.bodies, (*model.columns, *terms, *extra), values)
 
 
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:

@@ -213,9 +213,11 @@ def _controller(
     if loop.controller != "identify":
         return stated_controller(loop, n), None, ()
     motion = case.motion
+    if not case.torque_rows.with_motors:
+        raise UsageError(f"[loop] controller = 'identify' needs motor torques, found rows = '{case.torque_rows.name}'")
     band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
     found = identify_controller(
-        reference, motion.q, case.target, motion.rate, band, (1, 2) if loop.integral else (0, 1), loop.integral
+        reference, motion.q, case.target[:, -n:], motion.rate, band, (1, 2) if loop.integral else (0, 1), loop.integral
     )  # fmt: skip
     kp, kd = found.controller.kp, found.controller.kd
     bad = np.flatnonzero((kp <= 0.0) | (kd <= 0.0))

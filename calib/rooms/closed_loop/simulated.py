@@ -1,11 +1,12 @@
 """Methods that simulate the closed loop of a recording: instrumental variables, and DIDIM."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
@@ -54,6 +55,7 @@ class _Simulated(Method):
 
     needs_controller: bool = field(default=True, kw_only=True)
     needs_simulation: bool = field(default=True, kw_only=True)
+    takes_models: bool = field(default=True, kw_only=True)
     tunes: tuple[str, ...] = field(default=("tolerance 2.5 %", "10 rounds"), kw_only=True)
     instruments: str = ""
 
@@ -68,21 +70,24 @@ class _Simulated(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        found = self.beside(problem, plain)
+        richer = [one for one in problem.terms[problem.base.b :] if one is not None]
+        found = self.beside(problem, plain, richer)
         return replace(found, seconds=plain.seconds + found.seconds)
 
-    def beside(self, problem: IdentificationProblem, plain: MethodEstimate) -> LoopEstimate:
-        """Return the estimate, starting from the least-squares estimate `plain`."""
+    def beside(
+        self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
+    ) -> LoopEstimate:
+        """Return the estimate, starting from the least-squares estimate `plain`, with the richer friction `terms`."""
         model, loop = problem.model, problem.loop
-        if loop is None or not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-            raise UsageError("instruments from simulation support motor torques only")
+        if loop is None or not isinstance(model, IdentificationModel):
+            raise UsageError("instruments from simulation need a [loop], and a robot that can be simulated")
         loops = close_loops(model.bodies, problem.cases, problem.decimator, loop, problem.cad)
         inertia = loop.per_joint("inertia", model.n) if loop.inertia else None
 
         def estimate() -> LoopEstimate:
             found = identify_instrumental(
                 model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
-                inertia=inertia, positive=loop.positive,
+                inertia=inertia, positive=loop.positive, terms=terms,
                 constraints=problem.constrained if self.takes_constraints else None,
             )  # fmt: skip
             result = replace(
