@@ -1,7 +1,9 @@
 """Settings of the closed loop in which recordings were made: table [loop] of the options file.
 
 Instrumental variables (method iv) simulate that loop; with another method and a [loop], the same simulation tests
-whether least squares is biased. Gains are what the joints feel, torque per position error on the joint side::
+whether least squares is biased. iv and didim take joint torque sensors (rows link, both) and stated friction steps
+(friction = "stribeck"), too; friction = "auto" is standard friction there. Gains are what the joints feel, torque per
+position error on the joint side::
 
     [loop]
     controller = "pd"                # pd, cascade, or identify: gains read from the logs (ARX, see below)
