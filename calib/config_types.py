@@ -193,7 +193,8 @@ class Real(_Read):
             return ""
         hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
         low = "" if self.least is None else f"at least {self.least:g} and "
-        return f"{self.unit or 'a number'}, {low}at most {math.inf if self.most is None else self.most:g}{hint}"
+        most = math.inf if self.most is None else self.most
+        return f"a number{self.unit and f' [{self.unit}]'}, {low}at most {most:g}{hint}"
 
     @property
     def json(self) -> Mapping[str, Any]:

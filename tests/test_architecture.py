@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -149,6 +150,11 @@ def test_the_rooms_can_be_shut(monkeypatch):
     code += "sys.exit(run(['formats', 'mdh']))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_folder_holds_at_most_14_modules():
+    counted = Counter(path.parent for path in SOURCES if path.name != "__init__.py")
+    assert {folder.name: count for folder, count in counted.items() if count > 14} == {}
 
 
 def test_every_folder_with_modules_is_a_package():

@@ -32,8 +32,9 @@ def identify_dynamics(
         recordings: recordings of q and torque or current; log.npz@0:9.4 takes seconds 0 to 9.4
         out: folder for the identified model and its report
         validate: recording of other motion; may be repeated
-        method: wls or another one, see `calib study --list-methods`
-        friction: auto, standard, or one step: load, presliding, cable, stribeck, ...
+        method: wls or another one of calib formats identify-options
+        friction: auto, standard, or one step: coupling, load, presliding, stribeck, asymmetric, root, cubic, ripple,
+            cable
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result
     """

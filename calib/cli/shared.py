@@ -17,7 +17,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
-from typer.models import ParameterInfo
+from typer.models import OptionInfo, ParameterInfo
 
 from calib.config import described, parse
 from calib.config_types import OneOf, Typed
@@ -232,9 +232,13 @@ def command(app: typer.Typer, name: str | None = None, listing: bool = False) ->
 
         @wraps(function)
         def call(**given: Any) -> Any:
-            built = {key: _built(kind, given) for key, kind in settings.items()}
-            with printing(given.get("verbose", True)):
-                return function(**built, **{key: value for key, value in given.items() if key in own})
+            try:
+                built = {key: _built(kind, given) for key, kind in settings.items()}
+                with printing(given.get("verbose", True)):
+                    return function(**built, **{key: value for key, value in given.items() if key in own})
+            except UsageError as wrong:
+                wrong.args = (_as_typed(str(wrong), made),)
+                raise
 
         call.__signature__ = signature(function).replace(parameters=made)  # type: ignore[attr-defined]
         call.__annotations__ = {}
@@ -276,6 +280,18 @@ def _options(kind: Any) -> Iterator[Parameter]:
         yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
+def _as_typed(message: str, options: Sequence[Parameter]) -> str:
+    """Return an error message in which the option it begins with (``sigmas: …``, ``lock joint9: …``) has dashes."""
+    begin = re.match(r"(\w+)(?=:| \S+: )", message)
+    for one in options if begin else ():
+        option = one.annotation.__metadata__[0]
+        names = [name for name in (option.default, *(option.param_decls or ())) if str(name).startswith("--")]
+        typed = names[0].partition("/")[0] if names else f"--{one.name.replace('_', '-')}"
+        if isinstance(option, OptionInfo) and begin[0] in (one.name, typed[2:]):
+            return f"{typed}{message[begin.end() :]}"
+    return message
+
+
 def _plain(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Return a type without None, and its metadata."""
     if get_origin(hint) is Annotated:
@@ -295,7 +311,11 @@ def _is_repeated(plain: Any) -> bool:
 def _built(kind: Any, given: dict[str, Any]) -> Any:
     """Return settings from the values of the command line; missing values take the defaults."""
     chosen = _chosen(kind, given)
-    return parse(kind, chosen, "") if chosen else kind()
+    try:
+        return parse(kind, chosen, "") if chosen else kind()
+    except UsageError as wrong:
+        wrong.args = (re.sub(r"^(\w+\.)+", "", str(wrong)),)  # nested settings are options like the others
+        raise
 
 
 def _chosen(kind: Any, given: dict[str, Any]) -> dict[str, Any]:

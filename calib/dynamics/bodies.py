@@ -196,10 +196,10 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
     )
 
 
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
 _PERMUTED = tuple(
-    [_PAIRS.index((min(turn[r], turn[s]), max(turn[r], turn[s]))) for r, s in _PAIRS] + [6 + r for r in turn] + [9]
+    [PAIRS.index((min(turn[r], turn[s]), max(turn[r], turn[s]))) for r, s in PAIRS] + [6 + r for r in turn] + [9]
     for turn in _TURNS
 )
 

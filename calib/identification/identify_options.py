@@ -2,12 +2,12 @@
 
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
-    friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic,
-                                     # ripple; with rows = "both" also cable
+    friction = "auto"                # auto, standard, or a rung: coupling, load, presliding, stribeck, asymmetric,
+                                     # root, cubic, ripple; with rows = "both" also cable
     method = "wls"                   # ols, wls, irls, tls, ml, adaline, hopfield; ekf, ukf, cdkf and their square-root
                                      # forms srekf …; iv, didim (called CLIE elsewhere), cloe, clie (the survey's)
                                      # simulate the closed loop, see [loop]; pc-ols, pc-wls, pc-irls, pc-iv, pc-didim:
-                                     # under [constraints]; with sources: calib study --list-methods
+                                     # under [constraints]; all names: below
     weights = "residuals"            # of the joints' rows in wls: from their residuals; repeats: from the variance over
                                      # the periods that `calib recall` averaged, relative between joints
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link
@@ -29,8 +29,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     prior = "auto"                   # auto, none, cad: regularise what is not identified towards CAD values;
                                      # auto: where there are none, to rods between the joints
     folds = 6                        # time blocks of the cross-validation
-    accept = []                      # findings that are meant so: masses, speed, lag, clock, sign, order, zero, limit,
-                                     # jump, bodies, loop, description
+    accept = []                      # findings that are meant so, by the name that their line prints
 
     [filter]                         # default: from the data
     cutoff = 20.0                    # f_q of the positions' filter [Hz], or one per joint
@@ -39,6 +38,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     order = 4
     band = 10.0                      # f_p, the identification band [Hz]
     dynamics = 2.0                   # f_dyn, where it is known [Hz]
+    width = 4                        # half-width of the central differences [samples]
     borders = 0.1                    # left out at both ends [s]
     clock = "auto"                   # auto, stamps, even, counted
     gap = 0.05                       # the longest gap that is bridged [s]
@@ -117,9 +117,10 @@ def _no_zero(value: Any) -> Any:
 
 
 FINDINGS = (
-    "masses", "speed", "lag", "clock", "sign", "order", "zero", "limit", "jump", "bodies", "loop", "description",
+    "masses", "limit", "speed", "lag", "clock", "order", "zero", "coupling", "sign", "jump", "bodies", "description",
+    "loop",
 )  # fmt: skip
-"""Names in ``accept``, see chapters 9 and 10 of the catalogue of findings."""
+"""Names in ``accept``: those of chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]
 Gains = Annotated[tuple[float, ...], Expect("a list of finite numbers other than zero"), Checked(_no_zero)]
 

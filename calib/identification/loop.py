@@ -9,6 +9,7 @@ position error on the joint side::
     controller = "pd"                # pd, cascade, or identify: gains read from the logs (ARX, see below)
     kp = [12000.0, 4500.0]           # pd: [N m/rad], one per joint or one for all; kd [N m s/rad], ki [N m/(rad s)]
     kd = [90.0, 28.0]
+    ki = 0.0
     position = [40.0, 40.0]          # cascade P-PI: P [1/s], velocity K [N m s/rad], reset Ti [s] (none: P-P)
     velocity = [90.0, 28.0]
     reset = 0.05

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -219,7 +220,7 @@ def test_gains_of_another_length_are_refused_whatever_the_method(robot, tmp_path
 
 def test_every_key_of_the_loop_is_documented_and_read():
     for key in (field.name for field in fields(loop_settings.LoopSettings)):
-        assert f"{key} =" in loop_settings.__doc__ or f" {key} " in loop_settings.__doc__, key
+        assert re.search(rf"^    {key} = ", loop_settings.__doc__, re.M), key
     found = identify_options.parse_options(
         {"loop": {"controller": "cascade", "position": 40, "velocity": [9.0, 5.0, 1.0], "reset": 0.1, "delay": 2}}
     ).settings.loop

@@ -9,7 +9,9 @@ from string import Formatter
 import produced
 import pytest
 
+from calib.data.poses import fit_options
 from calib.errors import finding
+from calib.identification import identify_options
 from calib.procedure import findings
 from calib.procedure.findings import RANKS, Verdict, catalogue, level_of, lines_of, sentence, settle
 
@@ -28,6 +30,14 @@ def test_an_entry_is_short_plain_and_complete(code):
             r"\{[^} ]*( [^}°]+)?\}", lambda value: "x x" if value[1] else "x", re.sub("<[^<>]*>", "", entry.says)
         )
         assert len(words.split()) <= 13, "a verdict has 25 words, figures included"
+
+
+def test_the_names_in_accept_are_those_of_the_catalogue():
+    """Each printed ``accept`` is taken by the options of the command that prints it, and these take no other."""
+    text = Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    chapters = [set(re.findall('^accept = "(.+)"$', one, re.M)) for one in text.split("\n# ---- ")]
+    assert chapters[1] == set(fit_options.FINDINGS) and chapters[9] | chapters[10] == set(identify_options.FINDINGS)
+    assert set().union(*chapters) == chapters[1] | chapters[9] | chapters[10]
 
 
 def test_every_entry_is_used():

@@ -19,7 +19,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     beta = true                      # a sixth element for nearly parallel axes of an MDH table
     fix = ["theta1"]                 # parameters that stay at their nominal value
     free = ["d3"]                    # if given, only these move
-    accept = []                      # findings that are meant so: unexplained, reflection, sign, moved, scale
+    accept = []                      # findings that are meant so, by the name that their line prints
 
     [columns]                        # our name = the file's; y and z go with x
     x = "X_leica"
@@ -67,7 +67,8 @@ RadiansOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="
 Each = Spread(3, "a number or three")
 
 
-FINDINGS = ("unexplained", "reflection", "sign", "moved", "scale")  # that the verdict may call a fit odd for
+FINDINGS = ("unexplained", "sign", "coupling", "order", "reflection", "moved", "scale", "commanded")
+"""Names in ``accept``: those of chapter 1 of the catalogue of findings."""
 
 
 @strict
@@ -136,7 +137,6 @@ class FitOptions(FileOptions):
 
     Attributes:
         files: file name → options for reading that file.
-        model, loss, loss_scale, beta, fix, free, accept, prior: as in the options file.
         source: the options file, for messages.
     """
 

@@ -33,7 +33,7 @@ from calib.identification.prediction import Dynamics
 from calib.identification.torque_errors import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to
-from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
+from calib.procedure.excitation.settings import DEFAULT_PLAN, DRIVES, PlanSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
@@ -117,7 +117,6 @@ def _reached(
     return inverse.nearest(goal, target, near[None], chosen)[0]
 
 
-DRIVES = ("Ia", "Fv", "Fc", "off")
 PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint")]
 
 

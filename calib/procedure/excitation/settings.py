@@ -9,6 +9,7 @@ from calib.config_types import Checked, Flag, OneOf, Real, Seed, Text, Typed, Wh
 from calib.errors import UsageError
 
 HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
+DRIVES = ("Ia", "Fv", "Fc", "off")  # terms that a description may state
 GOALS = ("raw", "normalised", "duration", "coverage", "wrist")  # and joint1, joint2, …
 Solver = Literal["slsqp", "mma", "ccsaq", "auglag"]
 AIMS: tuple[Literal["logdet", "smallest"], ...] = ("logdet", "smallest")
@@ -27,7 +28,8 @@ def split_goal(text: str) -> tuple[str, float]:
     except ValueError:
         raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
     if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
-        raise UsageError(f"goal '{text}': '{name}' is unknown; use {', '.join(GOALS)}, joint1 …")
+        words = f"use {', '.join(GOALS)}, joint1 …, each with its number, or {' or '.join(AIMS)}"
+        raise UsageError(f"goal '{text}': '{name}' is unknown; {words}")
     return name, value
 
 
@@ -122,7 +124,7 @@ class PlanSettings:
         payloads: label of an attached, identified payload; repeatable
         lines: the tool moves straight from waypoint to waypoint, and stops at each
         rate: of the controller [Hz]
-        shorten: number of timings to search for a faster path between waypoints (`trajectories.timing.shape`); 0: none
+        shorten: number of timings to search for a faster path between waypoints; 0: none
         stray: largest deviation of that path from the spline, per joint [rad or m]
         start: joint values with commas [rad or m]; adds an approach from there
         slower: factor of a slow rehearsal, written next to the motion; 1: none

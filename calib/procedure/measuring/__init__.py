@@ -17,7 +17,7 @@ class RunSettings:
         dwell: time at each pose to settle and measure [s].
     """
 
-    speed: Annotated[float, Real(above=0.0, most=1.0, unit="of the joints' speeds")] = 0.3
+    speed: Annotated[float, Real(above=0.0, most=1.0)] = 0.3
     dwell: Annotated[float, Real(least=0.0, most=3600.0, unit="s")] = 6.0
 
 

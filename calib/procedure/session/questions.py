@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calib.config import described, parse
 from calib.config_types import OneOf, Real
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
-from calib.errors import UsageError, one_of, require
+from calib.errors import UsageError, one_of, refused_as, require
 from calib.extensions import needed
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.answers import CAMERA, CELL, Answers
@@ -174,6 +174,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
     if absent := [ABSENT[name] for name, text in texts.items() if name in ABSENT and _plain(text) == NONE]:
         found["without"] = absent
     known = {name: text.strip() for name, text in texts.items() if _plain(text) not in (*UNSAID, NONE)}
+    require("cone" not in known or "instrument_at" in known, "--cone needs --instrument-at, too", UsageError)
     for name, text in known.items():
         place, read = _KEYS[name]
         table, _, key = place.partition(".")
@@ -200,7 +201,8 @@ def _lengths(text: str, count: int, most: float, expected: str = "x,y,z in metre
 
 
 def _direction(text: str) -> Any:
-    return text.lower() if text.lower() in AXES else [Real(quantity="1").read(part) for part in text.split(",")]
+    with refused_as(ValueError, ValueError, f"expected {', '.join(AXES)}, or three numbers"):
+        return text.lower() if text.lower() in AXES else [Real(quantity="1").read(part) for part in text.split(",")]
 
 
 def _box(text: str) -> list[list[float]]:

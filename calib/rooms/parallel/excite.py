@@ -20,7 +20,7 @@ from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.design import GUARD, INSTANTS, search_motion
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, IdentifiableColumns
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits
-from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
+from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, DRIVES, ExcitationSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Joint
@@ -36,7 +36,6 @@ from trajectories.design.verify import dense_motion
 from trajectories.setpoints import Setpoints
 
 SAMPLES = 100  # instants over the period while searching
-DRIVES = ("Ia", "Fv", "Fc", "off")
 READ = ("period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook")  # of the settings
 FIGURES = "plot_*.png"
 MOTION = (ROBOT, METRICS, PLANNED, coefficients.NAME, FIGURES)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
-from calib.errors import UsageError, require
+from calib.errors import UsageError, one_of, require
 
 app = typer.Typer()
 
@@ -120,12 +120,12 @@ def compare(
 
 def _names(text: str | None) -> list[str] | None:
     """Return the methods of a comma-separated list after a check of their names; None for all."""
-    from calib.identification.methods.registry import method_named
+    from calib.identification.methods.registry import METHODS
 
     if text is None:
         return None
     found = [name.strip() for name in text.split(",") if name.strip()]
     for name in found:
-        method_named(name)
+        one_of(name, METHODS, "--methods:", UsageError)
     require(found, "--methods is empty; see calib study --list-methods", UsageError)
     return found

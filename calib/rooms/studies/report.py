@@ -338,7 +338,11 @@ def run_study(
         there = f"{len(kept)} rows; {notes[-1]}" if changed else there
         raise UsageError(
             f"nothing to report: {out} holds {there}; "
-            + ("run the study first, or name its folder (--out)" if report_only else "ask for runs (--runs, runs)")
+            + (
+                "run the study first, or name its folder (--out)"
+                if report_only
+                else "ask for 1 run or more (--runs, runs)"
+            )
         )
     if len(versions := sorted({row.toolkit for row in own})) > 1:
         notes.append(f"rows were made by several versions: {', '.join(versions)}")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.shared import command, say
-from calib.errors import UsageError, command_line
+from calib.errors import UsageError, command_line, require
 
 app = typer.Typer()
 
@@ -31,6 +31,7 @@ def view(
     from calib.procedure.robot_kinds import stage_of
     from calib.rooms.viewer import viewer
 
+    require(folder.exists(), f"{folder}: no such folder or CSV", UsageError)
     stage_of(folder, "calib view")
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or omit --no-spawn")

@@ -157,7 +157,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     """
     folder = Path(folder)
     one = folder.is_file() and folder.suffix == ".csv"
-    require(one or folder.is_dir(), f"{folder} is not a folder; give that of a fit, session or motion", UsageError)
+    require(one or folder.is_dir(), f"{folder} is neither folder nor CSV; give a fit, session or motion", UsageError)
     if one and robot is None:
         refuse_option(folder, "robot of these poses unknown; give --robot")
     chain, source = _arm(folder, robot)

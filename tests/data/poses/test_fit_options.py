@@ -63,7 +63,7 @@ def test_a_files_table_adds_to_what_holds_for_every_file():
         ({"sigma": {"position": 20}}, "at most 0.1 .are these mm"),
         ({"sigma": {"position": -1e-5}}, "a number above 0"),
         ({"sigma": 1e-5}, "sigma: expected a table"),
-        ({"socket_distance": 50}, "socket_distance: expected m, at most 10 .are these mm"),
+        ({"socket_distance": 50}, "socket_distance: expected a number .m., at most 10 .are these mm"),
         ({"socket_pairs": ["0", "1"]}, "pairs of socket labels"),
         ({"check_limits": 0}, "check_limits: expected true or false, found 0"),
         ({"fix": "theta1"}, "fix: expected a list of names"),
@@ -91,7 +91,7 @@ def test_files_that_are_no_toml(tmp_path):
 
 @pytest.mark.parametrize("sigma", [1e-300, 1e-11, 0.2, 1e300])
 def test_a_sigma_that_no_instrument_has_is_refused_in_options_and_session_alike(sigma):
-    words = r"expected m, at least 1e-10 and at most 0.1 \(are these mm, or degrees\?\), found "
+    words = r"expected a number \[m\], at least 1e-10 and at most 0.1 \(are these mm, or degrees\?\), found "
     with pytest.raises(UsageError, match="sigma.position: " + words):
         parse_options({"sigma": {"position": sigma}})
     section = {"name": "tracker", "measures": "position"}

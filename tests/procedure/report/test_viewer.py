@@ -171,7 +171,7 @@ def test_a_recording_that_fails_stops_nothing(fitted, monkeypatch):
 def test_folders_that_show_nothing_are_refused(tmp_path):
     with pytest.raises(UsageError, match="nothing to show"):
         viewing.read(tmp_path)
-    with pytest.raises(UsageError, match="not a folder"):
+    with pytest.raises(UsageError, match="neither folder nor CSV"):
         viewing.read(tmp_path / "none")
     assert cli.run(["view", str(tmp_path), "--no-spawn"]) == 2
 

@@ -17,7 +17,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.bodies import PRISMATIC, STANDARD, UNITS, Bodies, bodies_of
+from calib.dynamics.bodies import PAIRS, PRISMATIC, STANDARD, UNITS, Bodies, bodies_of
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import KEPT_LAST
 from calib.dynamics.regressor_model import Loads, States
@@ -27,8 +27,6 @@ from calib.errors import CalibError, UsageError, require
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, cross, loop_jacobians, of_platform, of_readings
-
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gravity: np.ndarray) -> np.ndarray:
@@ -72,7 +70,7 @@ def _skew(x: np.ndarray) -> np.ndarray:
 def _inertia_columns(w: np.ndarray) -> np.ndarray:
     """Return I w as columns (N, 3, 6) of XX XY XZ YY YZ ZZ."""
     result = np.zeros((len(w), 3, 6))
-    for k, (i, j) in enumerate(_PAIRS):
+    for k, (i, j) in enumerate(PAIRS):
         result[:, i, k] += w[:, j]
         if i != j:
             result[:, j, k] += w[:, i]
