@@ -282,13 +282,13 @@ def _options(kind: Any) -> Iterator[Parameter]:
 
 def _as_typed(message: str, options: Sequence[Parameter]) -> str:
     """Return an error message in which the option it begins with (``sigmas: …``, ``lock joint9: …``) has dashes."""
-    begin = re.match(r"(\w+)(?=:| \S+: )", message)
-    for one in options if begin else ():
+    name, rest = re.fullmatch(r"((?:\w+(?=:| \S+: ))?)(.*)", message, re.S).groups()  # type: ignore[union-attr]
+    for one in options:
         option = one.annotation.__metadata__[0]
         names = [name for name in (option.default, *(option.param_decls or ())) if str(name).startswith("--")]
         typed = names[0].partition("/")[0] if names else f"--{one.name.replace('_', '-')}"
-        if isinstance(option, OptionInfo) and begin[0] in (one.name, typed[2:]):
-            return f"{typed}{message[begin.end() :]}"
+        if isinstance(option, OptionInfo) and name in (one.name, typed[2:]):
+            return f"{typed}{rest}"
     return message
 
 
