@@ -28,8 +28,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calib.dynamics.bodies import standard_parameters
-from calib.dynamics.drives import DriveTerm, added_inertia, standard
-from calib.dynamics.rigid_body import mass_matrix
+from calib.dynamics.drives import DriveTerm, standard
 from calib.errors import CalibError, require
 from calib.identification.loop import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Controller, Replay
 from calib.identification.prediction import Dynamics
@@ -123,9 +122,7 @@ def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) 
 
     `min_eigenvalue`: least eigenvalue of a possible robot's inertia, scaled by its diagonal.
     """
-    bodies, first = robot.bodies, robot.inertial
-    inertia = mass_matrix(bodies, robot.parameters[:first], np.ascontiguousarray(reference.q[::50]))
-    inertia = inertia + added_inertia(robot.terms, robot.parameters[first:], bodies.n)
+    bodies, first, inertia = robot.bodies, robot.inertial, robot.inertia(reference.q[::50])
     min_inertia = 1e-3  # [kg m² or kg] least inertia of a joint
     size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), min_inertia)
     least = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())

@@ -22,8 +22,9 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 from calib.dynamics.bodies import Bodies, upright_turn
-from calib.dynamics.drives import DriveTerm
+from calib.dynamics.drives import DriveTerm, added_inertia
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.rigid_body import mass_matrix
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
 from calib.identification.loop import Controller
 from calib.records import frozen, shaped
@@ -67,15 +68,15 @@ class Plant:
         """Return the robot model with other parameters."""
         return replace(self, parameters=parameters)
 
+    def inertia(self, q: np.ndarray) -> np.ndarray:
+        """Return the inertia matrices (N, n, n), motor inertia included, at configurations q (N, n)."""
+        rigid, drives = np.split(self.parameters, [self.inertial])
+        matrices = mass_matrix(self.bodies, rigid, np.ascontiguousarray(q, dtype=float))
+        return matrices + added_inertia(self.terms, drives, self.bodies.n)
+
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
         """Return the mean diagonal (n,) of the inertia matrix, motor inertia included, over configurations (N, n)."""
-        from calib.dynamics import rigid_body
-        from calib.dynamics.drives import added_inertia
-
-        bodies = self.inertial
-        inertia = rigid_body.mass_matrix(self.bodies, self.parameters[:bodies], np.asarray(q, dtype=float))
-        added = added_inertia(self.terms, self.parameters[bodies:], self.bodies.n)
-        return np.einsum("kii->i", inertia) / len(inertia) + np.diag(added)
+        return np.einsum("kii->i", self.inertia(q)) / len(q)
 
 
 @dataclass(frozen=True, eq=False)
