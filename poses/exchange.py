@@ -51,7 +51,7 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
 
 
 def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40) -> Design:
-    """Return a design with larger det M, found by excursions to larger and smaller designs.
+    """Return a design with larger det M, searched by temporarily adding and removing poses (DETMAX).
 
     DETMAX (Mitchell 1974, section 3): an excursion leaves the design of m poses upwards (add the best candidate) or
     downwards (remove the member that costs least) and comes back; designs seen on an excursion that failed form the

@@ -345,7 +345,7 @@ def _movable(task: _Request) -> tuple[SearchSpace, np.ndarray]:
 
 def _tabu(task: _Request) -> _Chosen:
     if task.space is None:
-        raise BadInput("tabu generates its own poses: give space")
+        raise BadInput("tabu generates poses itself: the argument space is needed")
 
     def report(chosen: int, _: float) -> None:
         task.progress(chosen, task.m, "poses constructed")

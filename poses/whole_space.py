@@ -110,7 +110,7 @@ def bound_over_space(
 
 
 def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² found from start poses, and the evaluations."""
+    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² from start poses, and the number of evaluations."""
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
         spread = np.asarray(space.jacobian(q), dtype=float) @ root

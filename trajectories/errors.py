@@ -16,7 +16,7 @@ class NotExciting(ValueError):
 
 
 class NothingFeasible(ValueError):
-    """No motion was found that keeps all constraints.
+    """Raised where the search finds no motion within all constraints.
 
     Attributes:
         constraint: the one that was broken most where the least was broken.

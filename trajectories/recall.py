@@ -93,7 +93,7 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
 
 
 def average(values: np.ndarray, found: Recalled) -> Averaged:
-    """Average signals (N, k) of the recording over the whole periods found (at least two)."""
+    """Return mean and variance of signals (N, k) over the complete periods of a recording (at least two)."""
     require(found.periods >= 2, "one period has no variance: record two or more")
     parts = np.asarray(values, dtype=float)[found.rows].reshape(found.periods, found.period, -1)
     return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), found.periods)
@@ -116,7 +116,7 @@ def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:
-    """Return the unbroken sequence of offsets, one period apart, that includes the best one."""
+    """Return the sequence of offsets, one period apart without a gap, that includes the best one."""
     k = places.index(best)
     first = last = k
     while first and places[first - 1] == places[first] - period:

@@ -1,4 +1,4 @@
-"""Common part of local processes and a cluster: starting tasks, collecting answers, repeating lost tasks."""
+"""Execution of tasks by local processes or a cluster: start tasks, collect results, repeat lost tasks."""
 
 import pickle
 import traceback

@@ -12,7 +12,7 @@ from poses.space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
-    """Return `count` random sets of m candidates q (N, n), each by its own child of the seed."""
+    """Return `count` random sets of m poses out of candidates q (N, n); each set has a separate child of the seed."""
     return [q[g.choice(len(q), m, replace=False)] for g in np.random.default_rng(seed).spawn(count)]
 
 

@@ -277,7 +277,7 @@ class StartSearch:
         return found
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
-        """Return a point that keeps the constraints, or the nearest found: min Σ max(0, c + 0.01)² by L-BFGS."""
+        """Return a point that meets the constraints, or the nearest point found: min Σ max(0, c + 0.01)² by L-BFGS."""
         if not self.problem.constraints or self.at(y).constraints.max() <= 0:
             return y
 

@@ -70,7 +70,7 @@ class Verification:
 
 
 def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float = 1.0) -> SampledMotion:
-    """Return the stretched motion at times [s], by the family's own formula."""
+    """Return the time-scaled motion sampled at times [s], evaluated by the family's formula."""
     orders = [family.evaluate(x, times / factor, order) / factor**order for order in range(4)]
     return SampledMotion(times, *orders)
 

@@ -66,7 +66,7 @@ def shorten(
     stray: float = 0.0,
     progress: Callable[[int, float], None] | None = None,
 ) -> Shaped:
-    """Return the path through the waypoints with the shortest time found within the given evaluations.
+    """Return the fastest path through the waypoints after at most the given number of evaluations.
 
     Args:
         timer: duration [s] of a path; raises `NothingFeasible` or `BadInput` where it has none.

@@ -359,7 +359,7 @@ def _stretch(settings: ExcitationSettings) -> tuple[float, float]:
 
 
 def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tuple[SearchResult, ExcitationProblem]:
-    """Return the motion, its period rounded to whole controller samples, and the problem with that period."""
+    """Return (motion, problem), both with the period rounded to whole controller samples."""
     if not problem.free_period:
         return found, problem
     whole = problem.family.period * rate
@@ -442,7 +442,7 @@ def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fami
 def _constraints(
     dynamics: ExcitedModel, limits: MotionLimits
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the constraints of the search, and those to verify (torque with the model's own Coulomb sign)."""
+    """Return the constraints for the search, those for the verification (Coulomb sign not smoothed), and notes."""
     if dynamics.values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()

@@ -406,7 +406,7 @@ def _per_joint(
     stated: Mapping[str, Any], where: str, chain: Chain, default: np.ndarray | None = None,
     quantities: tuple[str, str] = ("", ""),
 ) -> np.ndarray:  # fmt: skip
-    """Return limits (n,) from a table with joint names, q1 …, ``all`` and ``share``; infinite if not stated.
+    """Return limits (n,) from a table with the keys joint name, q1 …, ``all``, ``share``; infinite if not stated.
 
     Args:
         quantities: of a revolute joint's limit, and of a prismatic one's.

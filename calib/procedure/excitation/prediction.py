@@ -139,7 +139,7 @@ def _errors_known(given: ExcitationInputs) -> bool:
 
 
 def _known(given: ExcitationInputs) -> np.ndarray:
-    """Return a triangle (c, c) of what earlier motions tell of the columns."""
+    """Return a triangular root (c, c) of the information that earlier motions contain on the columns."""
     assert given.prior is not None
     columns = slice(None) if given.columns.columns is None else given.columns.columns
     values, V = np.linalg.eigh(given.prior.information[columns][:, columns])

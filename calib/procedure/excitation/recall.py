@@ -55,7 +55,7 @@ def inputs(folder: Path, log: str) -> list[str | Path]:
 
 
 def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
-    """Return the designed motion of `folder` as found in a log, averaged over its periods.
+    """Return the motion designed in `folder`, located in a log and averaged over its periods.
 
     Args:
         log: a recording, with a cut if wanted (``log.npz@0:90``).

@@ -209,7 +209,9 @@ def excite_parallel(
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
     if limits is not None:
-        raise UsageError("a limits file is for serial arms; a parallel robot's own file states effort, lower, upper")
+        raise UsageError(
+            "a limits file is for serial arms only; state effort, lower and upper in the parallel robot's file"
+        )
     made, values = read_model(robot, model, settings.drives)
     return design_parallel(robot, made, values, settings, map=map, progress=progress)
 

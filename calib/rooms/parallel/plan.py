@@ -131,7 +131,7 @@ def plan_parallel(
     refuse_unread(settings, DEFAULT_PLAN, READ)
     if limits is not None or drives is not None:
         raise UsageError(
-            "limits and drives files are for serial arms; a parallel robot's own file states velocity and effort"
+            "limits and drives files are for serial arms only; state velocity and effort in the parallel robot's file"
         )
     law = _law(robot, model, settings.payloads)
     bounds = actuator_bounds(known)

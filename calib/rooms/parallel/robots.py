@@ -1,4 +1,4 @@
-"""Parallel robots for the commands, found by name or file (`calib.procedure.robot_kinds.Mechanism`)."""
+"""Parallel robots for the commands, loaded by name or from a file (`calib.procedure.robot_kinds.Mechanism`)."""
 
 from __future__ import annotations
 

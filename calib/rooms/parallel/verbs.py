@@ -1,4 +1,4 @@
-"""Commands for parallel robots, found by `calib.procedure.robot_kinds.stage_of`, and their output files.
+"""Commands of parallel robots, for `calib.procedure.robot_kinds.stage_of`, and their output files.
 
 ``robot.toml`` comes first: each folder is a robot to the next command. identify: ``dynamics.json`` (values of all
 parameters, base expressions); the others are those of a serial arm (``calib formats identified``). fit:

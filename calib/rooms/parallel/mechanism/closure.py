@@ -61,7 +61,7 @@ class ClosedRobot:
         return _reached(self, readings, self.home.q[0, self.robot.actuated], _from_readings, near)
 
     def place(self, coordinates: np.ndarray, near: Posture | None = None) -> Posture:
-        """Return the postures at platform coordinates (N, r) [m, rad], counted from home; arguments as of `locate`."""
+        """Return the postures at platform coordinates (N, r) [m, rad] relative to home; arguments: see `locate`."""
         coordinates = shaped(coordinates, (None, self.robot.r), f"platform coordinates of '{self.robot.name}'")
         return _reached(self, coordinates, np.zeros(self.robot.r), _from_coordinates, near)
 
@@ -160,8 +160,7 @@ def twists(
 def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     """Return J_p^inv (N, n, r): readings' rates by the twist's independent parts (A_p with B_p = -1, eqs 5, 15)."""
     D, _ = twists(known, links)
-    rows = [one.inverse[:, list(leg.actuated)] @ (one.carried @ D) for leg, one in zip(known.robot.legs, links)]
-    return np.concatenate(rows, axis=1)
+    return np.concatenate([one.inverse @ (one.carried @ D) for one in links], axis=1)[:, known.robot.actuated]
 
 
 def _check_postures(known: ClosedRobot, posture: Posture) -> None:
@@ -197,7 +196,7 @@ def _where(known: ClosedRobot, posture: Posture) -> str:
 
 
 def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim, near: Posture | None) -> Posture:
-    """Return postures at targets (N, k), by Newton's method along the straight line from home's values `own`."""
+    """Return the postures at targets (N, k), found by Newton's method on a straight line from the values at home."""
     if not len(wanted):
         return known.home[:0]
     if near is not None:
@@ -263,21 +262,17 @@ def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rc
 def _from_readings(
     known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
 ) -> np.ndarray:
-    """Return the twist's independent parts (N, r) that bring the readings closest to `wanted`."""
-    rows, right = [], wanted - posture.q[:, known.robot.actuated]
-    for leg, one in zip(known.robot.legs, links):
-        rows.append(
-            (one.inverse[:, list(leg.actuated)] @ one.carried, times(one.inverse, one.gap)[:, list(leg.actuated)])
-        )
-    A = np.concatenate([row for row, _ in rows], axis=1)
-    right = right + np.concatenate([own for _, own in rows], axis=1) - times(A, t)
-    return times(pseudo_inverse(A @ D), right)
+    """Return the independent twist components (N, r) that bring the encoder readings closest to their targets."""
+    A = np.concatenate([one.inverse @ one.carried for one in links], axis=1)
+    steps = np.concatenate([times(one.inverse, one.gap) for one in links], axis=1) - times(A, t)
+    own = known.robot.actuated
+    return times(pseudo_inverse(A[:, own] @ D), wanted - posture.q[:, own] + steps[:, own])
 
 
 def _from_coordinates(
     known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
 ) -> np.ndarray:
-    """Return the twist's independent parts (N, r) that bring the platform to coordinates (N, r)."""
+    """Return the independent twist components (N, r) that move the platform to target coordinates (N, r)."""
     target = _pose_of(known, wanted)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]

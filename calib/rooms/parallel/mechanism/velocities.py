@@ -69,29 +69,7 @@ def of_platform(
         rate, change: (N, r) independent parts of its twist, and their derivatives.
         jacobians: of the postures, where they are known already.
     """
-    return _moving(known, posture, loop_jacobians(known, posture) if jacobians is None else jacobians, rate, change)
-
-
-def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
-    """Return the motion of postures from the encoders' motion, for redundant encoders by least squares (eqs 16, 18).
-
-    Args:
-        v, a: (N, n) of the actuated joints.
-    """
-    found = loop_jacobians(known, posture)
-    back = np.linalg.pinv(found.readings) if known.robot.redundant else np.linalg.inv(found.readings)
-    rate = (back @ v[:, :, None])[:, :, 0]
-    still = _moving(known, posture, found, rate, np.zeros_like(rate))
-    change = (back @ (a - still.a[:, known.robot.actuated])[:, :, None])[:, :, 0]
-    return LoopMotion(
-        posture, found, still.v, still.a + np.einsum("ntr,nr->nt", found.joints, change), still.twist,
-        still.change + np.einsum("nkr,nr->nk", found.platform, change), rate,
-    )  # fmt: skip
-
-
-def _moving(
-    known: ClosedRobot, posture: Posture, found: LoopJacobians, rate: np.ndarray, change: np.ndarray
-) -> LoopMotion:
+    found = loop_jacobians(known, posture) if jacobians is None else jacobians
     v = np.einsum("ntr,nr->nt", found.joints, rate)
     twist = np.einsum("nkr,nr->nk", found.platform, rate)
     shifts, starts = [], known.robot.starts
@@ -104,6 +82,23 @@ def _moving(
         for one, shift in zip(found.links, shifts)
     ]
     return LoopMotion(posture, found, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
+
+
+def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+    """Return the motion of postures from the encoders' motion, for redundant encoders by least squares (eqs 16, 18).
+
+    Args:
+        v, a: (N, n) of the actuated joints.
+    """
+    found = loop_jacobians(known, posture)
+    back = np.linalg.pinv(found.readings) if known.robot.redundant else np.linalg.inv(found.readings)
+    rate = (back @ v[:, :, None])[:, :, 0]
+    still = of_platform(known, posture, rate, np.zeros_like(rate), found)
+    change = (back @ (a - still.a[:, known.robot.actuated])[:, :, None])[:, :, 0]
+    return LoopMotion(
+        posture, found, still.v, still.a + np.einsum("ntr,nr->nt", found.joints, change), still.twist,
+        still.change + np.einsum("nkr,nr->nk", found.platform, change), rate,
+    )  # fmt: skip
 
 
 def _attachment_bias(one: LegLinks, twist: np.ndarray) -> np.ndarray:
