@@ -219,9 +219,8 @@ def _range(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: En
     if not 0 <= first < end <= len(t):
         archive.fail(f"is {first} to {end}, the file has {len(t)} samples", "use_range")
     whole = first == 0 and end == len(t)
-    return slice(first, end), [] if whole else [
-        f"rows {first + 1} to {end} of {len(t)} are used, as its use_range states"
-    ]
+    note = f"rows {first + 1} to {end} of {len(t)} are used, as its use_range states"
+    return slice(first, end), [] if whole else [note]
 
 
 def _names(archive: _Archive) -> list[str]:

@@ -165,11 +165,7 @@ def _check_time(recording: Recording) -> None:
         likely = next(
             (unit for unit, factor in units.items() if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate), ""
         )
-        hint = (
-            f"stamps look like {likely}; if so, state the unit (units: t = '{likely}')"
-            if likely
-            else "check the stamps"
-        )
+        hint = f"stamps look like {likely}; if so, state units: t = '{likely}'" if likely else "check the stamps"
         refuse_data(recording.file, f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", "t")
 
 
@@ -182,8 +178,7 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
         most = np.where(np.isfinite(reach), np.maximum(most, reach), most)
     check_travel(
         recording.q, most, recording, _columns(recording, "q"), recording.joint_names, kinds,
-        lambda j, other: f"looks like {other}; if so, state the unit (header 'q{j + 1} [{other}]', or "
-        f"units: q = '{other}')",
+        lambda j, other: f"looks like {other}; if so, state the unit (header 'q{j + 1} [{other}]', or units)",
     )  # fmt: skip
 
 
@@ -199,9 +194,8 @@ def _check_speed(recording: Recording) -> None:
     for j in np.flatnonzero(proportional & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
         for factor, wrong in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
-                found = f"v is {ratio[j]:.3g} times the slope of q: {wrong}"
-                words = f"{found}; if so, state the unit in the header or in units"
-                refuse_data(recording.file, words, _columns(recording, "v")[j])
+                message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, state the unit in the header"
+                refuse_data(recording.file, message, _columns(recording, "v")[j])
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
