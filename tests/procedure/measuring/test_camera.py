@@ -213,7 +213,9 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     from calib.rooms.cells.cell import measure, true_poses
 
     arm, reflector = cell.cell.nominal, pose(None, [0.1, 0.0, 0.1])
-    images = replace(camera.photograph(cell, camera.views(cell, 30, 5), 0.05, 5), tool_names=("tool",))
+    images = replace(
+        camera.photograph(cell, camera.views(cell, 30, 5, camera.Views((0.5, 0.8))), 0.05, 5), tool_names=("tool",)
+    )
     truth = replace(
         cell.cell.truth, stations=pose(None, [2.0, 1.0, 0.5])[None], tools=reflector[None], tool_names=("tool",)
     )
