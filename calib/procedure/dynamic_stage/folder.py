@@ -117,7 +117,7 @@ class UnseenFolder:
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work is done, a folder not for an identification, or one that contains an input."""
+    """Refuse an output folder that contains other files than those of an identification, or an input file."""
     folders.check_target(out, OURS, (folders.METRICS, MODEL), "identification", inputs)
 
 
@@ -125,7 +125,7 @@ def write_folder(
     outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None,
     *, owned: bool = False,
 ) -> Path:  # fmt: skip
-    """Write all files of an identification, or none on an error; see `calib.folders`.
+    """Write the result folder `out` of an identification, or nothing on an error, and return its path.
 
     An `owned` folder is ours, whatever is left in it.
     """
@@ -197,7 +197,7 @@ def read_torques(path: Path) -> dict[str, np.ndarray]:
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
-    """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter, then σ's two parts.
+    """Return a row of ``estimate.csv`` for each parameter, with the columns `HEADER`; RSD in percent.
 
     σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
     switched off, and parameters that a constraint holds, have no σ: nobody measured them.

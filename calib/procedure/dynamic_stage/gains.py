@@ -104,7 +104,7 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = [
         f"drive gains from {files} ({found.scale}): {told}",
-        f"gains and the payload's parameters rest on {files}: predictions of these files are not wholly unseen",
+        f"gains and payload are estimated from {files}: these files are not independent validation data",
     ]
     notes += _unsure(found)
     chosen = replace(options, settings=replace(settings, payload_values=loads))
@@ -112,7 +112,7 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
 
 
 def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
-    """Return gains relative to the joint with the largest current, so that all torques are in its amperes."""
+    """Return the drive gains relative to the joint with the largest current; all torques are then in its amperes."""
     if not currents:
         return FoundGains(options, None, None, "A", ("drive gains are unknown: torques are currents [A]",))
     cases = [make_case(path, motion, carried=options.file_settings(path).payload) for path, motion in currents]

@@ -99,7 +99,7 @@ class Assessment(Errors):
 
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
-    """Return the unseen recordings that repeat training motion: name → share of their states in the training."""
+    """Return, for each unseen recording that repeats training motion, the share of its states found in the training."""
     shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
     return {name: share for name, share in shares.items() if share >= REPEAT}
 
@@ -237,7 +237,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
 def judged(
     inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
 ) -> IdentificationOutcome:
-    """Return the outcome of an identification `found`: its prediction of every recording, and the verdict.
+    """Return the outcome of a finished identification: predictions of every recording, errors, and the verdict.
 
     Raises:
         MeasurementError: where friction would drive most joints.

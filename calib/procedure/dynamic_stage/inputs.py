@@ -183,7 +183,7 @@ def _path(each: str | Path | Recording) -> str:
 
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
-    """Return the options updated by the command's choices, and check the names in them."""
+    """Return the options with the command's method, friction model and seed; refuse unknown names."""
     given = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
     for key, value in given.items():
         allowed = tuple(METHODS) if key == "method" else NAMES
@@ -258,12 +258,12 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
     same = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders)
     sharper = make_motion(recording, replace(same, cutoff=f), sampled)
-    note = f"f_q = {f:.3g} Hz instead: the positions are quiet enough"
+    note = f"f_q = {f:.3g} Hz instead: the position noise is low enough"
     return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
 
 
 def _referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
-    """Return the motion with its reference from a separate file, if the options name one."""
+    """Return the motion with the reference trajectory of a separate file, if the options name one."""
     own, loop = options.file_settings(path), options.settings.loop
     named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
     if not named or loop is None:

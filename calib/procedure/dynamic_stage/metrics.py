@@ -246,7 +246,7 @@ _STEP = ("ratio", "f", "p", "p_total")
 
 
 def with_current_keys(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what an earlier version's ``metrics.json`` or ``unseen/report.json`` holds, under today's keys."""
+    """Return the content of an earlier version's ``metrics.json`` or ``unseen/report.json`` with today's keys."""
     if content.get("schema", UNSEEN_SCHEMA - 1) >= UNSEEN_SCHEMA:
         return dict(content)
     found = dict(content)

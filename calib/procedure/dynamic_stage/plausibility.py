@@ -25,7 +25,7 @@ from calib.units import TORQUE
 def implausible(
     inputs: IdentificationInputs, impossible_by: Contradiction | None, loop: LoopDisagreement | None
 ) -> tuple[Finding, ...]:
-    """Return all findings on the recordings, the robot's description and the estimate, those accepted marked.
+    """Return all findings on implausible recordings, descriptions and estimates, with the accepted ones marked.
 
     Args:
         impossible_by: distance of the estimate from every physically consistent robot.
@@ -90,7 +90,7 @@ def described(chain: Chain) -> list[Finding]:
 
 
 def another_loop(found: LoopDisagreement | None) -> list[Finding]:
-    """Return the finding that recorded torques contradict an estimate that relies on the stated loop."""
+    """Return the finding that recorded torques contradict an estimate based on the stated control loop."""
     if found is None:
         return []
 
@@ -174,7 +174,7 @@ def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 
 
 def _against(clock: ClockRatio | None, usual: float) -> str:
-    """Return which is wrong by the ratio of inertias to masses, stamps or velocities; empty if undecided."""
+    """Return ``stamps`` or ``velocities``: whichever disagrees with the ratio of inertias to masses; or nothing."""
     if clock is None:
         return ""
     rods_sigma = 0.17  # relative, of a robot's inertias over masses from its lengths (our choice)

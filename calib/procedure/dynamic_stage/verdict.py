@@ -49,7 +49,7 @@ class Resting:
     @property
     def origin(self) -> str:
         """Source of their values, as text."""
-        return "CAD values" if self.source == "cad" else "the usual sizes of such parameters"
+        return "CAD values" if self.source == "cad" else "typical magnitudes of such parameters"
 
 
 def judge(
@@ -106,7 +106,7 @@ def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding
 
 
 def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) -> Verdict:
-    """Return the verdict; if it is not pass and the training motion is too short, with this cause first."""
+    """Return the verdict; unless it is pass, its reason begins with a training motion that is too short."""
     seconds = sum(report.seconds for report in excitation.values())
     min_motion = 3.0  # of all training files together [s] (our choice)
     if verdict.level == "pass" or not excitation or seconds >= min_motion:
@@ -135,7 +135,7 @@ def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -
 
 
 def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> list[Finding]:
-    """Return the finding on the first unseen case with errors larger than their intervals, beyond chance.
+    """Return the finding on the first unseen recording with errors outside their intervals more often than by chance.
 
     Args:
         expected: by unseen case.
@@ -152,7 +152,7 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
 
 
 def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
-    """Return how a recording leaves the training range."""
+    """Return the finding on a recording whose motion leaves the training range."""
     if expected is None or not (share := float(expected.beyond.mean())):
         return []
     joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]

@@ -158,7 +158,7 @@ def _copy(export: Export, path: Path) -> list[str]:
 
 def _offsets(export: Export, path: Path) -> list[str]:
     geometry.export_offsets(export.robot, path)
-    return [f"{path.name}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones"]
+    return [f"{path.name}: joint offsets only, without the rest of the geometry; --model offsets fits the best offsets"]
 
 
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
@@ -218,7 +218,7 @@ class ExportFile:
     marked: bool = False
 
 
-_TO_MASTER = "for the controller: joint offsets to add to its mastering; the rest of the geometry left out"
+_TO_MASTER = "for the controller: joint offsets to add to its mastering; contains no other part of the geometry"
 _ONLY = f"only for programs that apply {TERMS}, worse than {URDF} without them; masses as in the source"
 _TO_SIMULATE = "for simulators: motor inertia, friction and offset of each joint, with sigmas"
 _UR = "for ur_description: kinematics_params_file"
@@ -260,7 +260,7 @@ def deliver(export: Export, out: Path) -> list[str]:
 
 
 def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
-    """Write the named files of `FILES`, each to its own path.
+    """Write single files of an export, each to the path given in `targets`.
 
     Returns:
         What was written and what to know of it, in words.

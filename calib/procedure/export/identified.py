@@ -41,7 +41,7 @@ PLAIN = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
 
 @dataclass(frozen=True, eq=False)
 class Drives:
-    """Drive terms that fit a table, and those that do not.
+    """Drive parameters by joint (armature, damping, friction, offset), and the names of all other drive terms.
 
     Attributes:
         values: (n, 4) armature [kg m² or kg], damping [N m s/rad or N s/m], friction, offset [N m or N].
@@ -289,7 +289,7 @@ def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:
-    """Return an identified model without the terms that do not fit the table."""
+    """Return an identified model without the drive terms that ``drives.csv`` cannot contain."""
     left, first = drive_table(dynamics).left, dynamics.model.inertial
     values = np.array(dynamics.values)
     values[[first + k for k, one in enumerate(dynamics.model.columns) if one.name in left]] = 0.0

@@ -28,7 +28,7 @@ Layer = Callable[..., None]  # draws onto the axes of a panel, whose scales are 
 
 
 def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
-    """Return a function that makes a layer from a drawing function's arguments, without its axes.
+    """Return a drawing function as a maker of layers: it takes the same arguments without the axes.
 
     What it returns can be pickled, which the cache of drawn pictures needs.
     """
@@ -257,7 +257,7 @@ def figures(charts: Mapping[str, Chart]) -> dict[str, Figure]:
 
 
 def picture(chart: Chart, caption: str) -> Picture:
-    """Return a chart as a picture for a page; a chart drawn before is taken from the cache."""
+    """Return a chart with a caption as a picture for a page, from the cache if it was drawn before."""
     return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH)
 
 

@@ -144,7 +144,7 @@ def autocorrelations(
 
 
 def from_folder(folder: Path) -> dict[str, Picture]:
-    """Return the figures of geometry against dynamics from an identification's folder, by name; empty without a fit."""
+    """Return the figures on the geometry's effect on the dynamics, by name, from an identification's folder."""
     result: dict[str, Picture] = {}
     rows = [
         row for row in _read(TwoGeometries, folder / GEOMETRIES) if row.essential == "yes" and row.calibrated != 0.0

@@ -187,8 +187,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[page.KeyF
     allowed = f"{tolerance:g} %" if tolerance else ""
     return [
         page.KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
-        page.KeyFigure("the same in the motion's band", "", percent(band.total), "", basis),
-        page.KeyFigure(f"in that band, the worst row: {row}", "", percent(worst), "", basis),
+        page.KeyFigure("torque unexplained in the motion's band", "", percent(band.total), "", basis),
+        page.KeyFigure(f"torque unexplained in the motion's band, worst joint: {row}", "", percent(worst), "", basis),
     ]
 
 

@@ -69,7 +69,7 @@ def read_lines(inputs: Inputs) -> list[str]:
         lines.append(f"{Path(block.file).name}: {len(block)} rows of kind {block.kind}{tools}, sigmas {sigma}{ignored}")
     for name, unseen in inputs.unseen.items():
         role = "held out" if unseen.held_out else "validation"
-        lines.append(f"{name}: {len(unseen.block)} rows of kind {unseen.block.kind} unseen ({role})")
+        lines.append(f"{name}: {len(unseen.block)} rows of kind {unseen.block.kind}, not used in the fit ({role})")
     return lines
 
 

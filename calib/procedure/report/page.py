@@ -70,7 +70,7 @@ def grouped(
     title: str, header: Sequence[str], groups: Mapping[str, Iterable[Sequence[str]]], note: str = "",
     strong: Callable[[Sequence[str]], bool] = lambda row: False, texts: int = 1,
 ) -> Table:  # fmt: skip
-    """Return a table of rows under headings, with the `strong` rows in bold, and numbers behind `texts` columns."""
+    """Return a table of rows under headings, with the `strong` rows in bold; the first `texts` columns are text."""
     rows = [row for heading, own in groups.items() for row in ((heading,), *own)]
     bold = frozenset(k for k, row in enumerate(rows) if strong(row))
     return Table(title, header, rows, note, bold, range(texts, len(header)))

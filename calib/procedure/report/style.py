@@ -58,7 +58,7 @@ STYLE: Any = {
 
 @contextmanager
 def styled(quiet_titles: bool = False) -> Iterator[None]:
-    """Apply our style within a context, and restore matplotlib's settings; quiet titles are small panel titles."""
+    """Apply the common style within a context, and restore matplotlib's settings; quiet titles are small titles."""
     with matplotlib.rc_context(STYLE | ({"axes.titleweight": "normal", "axes.titlesize": 7.5} if quiet_titles else {})):
         yield
 

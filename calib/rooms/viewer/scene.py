@@ -254,7 +254,7 @@ def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
 
 
 def _joined(fitted: Measured, errors: Path) -> Measured:
-    """Return fitted rows followed by a session's unseen rows."""
+    """Return the fitted poses followed by a session's unseen poses, if its file of errors exists."""
     table = read_table(errors) if errors.is_file() else ()
     if not isinstance(table, Table) or "x" not in table:  # written by an earlier version
         return fitted

@@ -131,7 +131,7 @@ def about(scene: Scene) -> str:
 
 
 def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) -> list[Any]:
-    """Return the clock and a count of its own for `count` poses, or `some` of them, from `start` on [s]."""
+    """Return the time columns of `count` poses, or `some` of them: the common clock from `start` [s], and a counter."""
     steps = np.arange(1, count + 1) if some is None else some + 1
     return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
 
@@ -226,7 +226,7 @@ def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> fl
 
 
 def _part(name: str) -> str:
-    """Return a name as one part of an entity path."""
+    """Return a name, escaped as one part of a Rerun entity path."""
     return rr.escape_entity_path_part(name)
 
 
