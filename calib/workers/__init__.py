@@ -114,7 +114,7 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
 
 @contextmanager
 def finishing() -> Iterator[None]:
-    """Complete the block in spite of one Ctrl-C, which is ignored; a second one ends it at once."""
+    """Run the block to its end: the first Ctrl-C is ignored, a second one stops it at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -139,7 +139,7 @@ def _newcomer(
 
 
 def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """Return log det(εI + information) of rows with each Jacobian (K,), columns scaled by their size over the draws."""
+    """Return log det(εI + information) (K,) of the rows after adding each Jacobian; columns are scaled by their rms."""
     scale = np.sqrt((jacobians**2).mean((0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
     z, known = jacobians / scale, rows / scale

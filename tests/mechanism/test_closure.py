@@ -97,7 +97,7 @@ def test_a_stewart_platform_upside_down_is_beyond_a_type_2_singularity():
     ("name", "old", "new", "words"),
     [
         ("dualv", "d = 0.41\n", "d = 1.41\n", "loop of leg1 does not close at the platform's home"),
-        ("dualv", '["x", "y", "rz"]', '["x", "y"]', "lower needs a value per coordinate|platform has 3 freedoms"),
+        ("dualv", '["x", "y", "rz"]', '["x", "y"]', "lower needs 2 values, one per coordinate|platform has 3 freedoms"),
         ("dualv", '["x", "y", "rz"]', '["x", "y", "rx"]', "the platform can move in x, y, rz"),
         ("dualv", '["x", "y", "rz"]', '["x", "y", "spin"]', r"names the platform's independent coordinates|lower"),
         ("dualv", 'actuated = ["motor1"]', 'actuated = ["motor9"]', "not one of its joints.*motor1"),

@@ -21,7 +21,7 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """Goal F ≤ goal + weight · γ; weight None: |goal|, 0: a hard goal."""
+    """Goal F ≤ goal + weight · γ. If weight is None, |goal| is used; weight 0 makes the goal hard."""
 
     objective: Objective
     goal: float

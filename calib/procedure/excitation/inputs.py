@@ -402,7 +402,7 @@ def read_prior(
 
 
 def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return the information (b, b) of an identification, and the root of its torque errors' density (rows,)."""
+    """Return the information (b, b) of an identification, and the square root of its torque error density (rows,)."""
     density, covariance = IdentificationFolder(folder).metrics().error_density, model.covariance
     if covariance is None or density is None or len(density) != model.exact.model.rows:
         raise UsageError(f"{folder}: states no covariance of the design's columns, or no torque errors; identify again")

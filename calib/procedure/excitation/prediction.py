@@ -139,7 +139,7 @@ def _errors_known(given: ExcitationInputs) -> bool:
 
 
 def _known(given: ExcitationInputs) -> np.ndarray:
-    """Return a triangular root (c, c) of the information that earlier motions contain on the columns."""
+    """Return a root (c, c) of the information matrix of earlier motions, for the columns of the design."""
     assert given.prior is not None
     columns = slice(None) if given.columns.columns is None else given.columns.columns
     values, V = np.linalg.eigh(given.prior.information[columns][:, columns])

@@ -325,7 +325,7 @@ def _best_rows(J: np.ndarray) -> np.ndarray:
 
 
 def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks]) -> bool:
-    """Return whether the named freedoms hold everywhere in the workspace, after a check of their number.
+    """Return whether the platform has the named freedoms in the whole workspace; raise if their number is wrong.
 
     Raises:
         RobotError: for another number of freedoms than named, or names that do not distinguish them.
@@ -343,7 +343,7 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
             )
         if np.linalg.cond(values[2][6 - left :, robot.selected]) > 1e8:
             robot.refuse(
-                f"the platform can move in {_motions(values[2][6 - left :])}; freedom names {', '.join(robot.freedom)}"
+                f"the platform can move in {_motions(values[2][6 - left :])}; freedom lists {', '.join(robot.freedom)}"
             )
         fixed = fixed and float(np.abs(np.concatenate(rows, axis=1)[0] @ named).max()) < 1e-9
         if trial == 3:

@@ -168,7 +168,9 @@ def _box(table: Mapping[str, Any], key: str, freedom: tuple[str, ...], place: st
     """Return one bound per coordinate of the platform."""
     values = table.get(key)
     if not isinstance(values, list) or len(values) != len(freedom):
-        refuse_robot(place, f"{key} needs a value per coordinate of freedom, {len(freedom)}; found {shown(values)}")
+        refuse_robot(
+            place, f"{key} needs {len(freedom)} values, one per coordinate in 'freedom'; found {shown(values)}"
+        )
     kinds = ["angle" if name in COORDINATES[3:] else "length" for name in freedom]
     return np.array([number(value, f"{place}, {key}", kind) for value, kind in zip(values, kinds)])
 

@@ -282,7 +282,7 @@ class ParallelModel:
         return States(posture.q[:, own], motion.v[:, own], motion.a[:, own])
 
     def known_parameters(self) -> np.ndarray | None:
-        """Return the bodies' parameters of the robot's file (inertial,), payloads zero; None without inertias."""
+        """Return the inertial parameters of the robot's file (inertial,), zero for payloads; None if it has none."""
         robot = self.known.robot
         parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
         if len(parts) < len(robot.legs) or robot.platform is None:
