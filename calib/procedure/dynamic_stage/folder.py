@@ -73,11 +73,11 @@ class IdentificationFolder:
         return UnseenFolder(self.path / "unseen")
 
     def dynamics(self) -> Dynamics:
-        """Read the model."""
+        """Return the identified model, read from the folder."""
         return read_dynamics(self.path)[1]
 
     def metrics(self) -> ModelMetrics:
-        """Read the record of the identification."""
+        """Return the content of ``metrics.json``."""
         return read_json(self.numbers, "identify again", ModelMetrics, with_current_keys)
 
     def findings(self) -> ModelFindings:

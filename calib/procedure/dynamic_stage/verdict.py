@@ -34,7 +34,7 @@ SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb frict
 
 @dataclass(frozen=True)
 class Resting:
-    """Base parameters determined by a prior, not by the motion.
+    """Base parameters whose values come from a prior, not from the motion.
 
     Attributes:
         names: theirs.

@@ -169,7 +169,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
-    """Return the chart of each parameter on both geometries with error bars, and of the differences in sigmas."""
+    """Return the chart of each parameter's value on both geometries, and of the differences in sigmas."""
     table = np.array([(row.nominal, row.sigma_nominal, row.calibrated, row.sigma_calibrated) for row in rows])
     nominal, s_nominal, own, s_own = table.T
     x, percent = np.arange(len(rows)), 100.0 / np.abs(own)

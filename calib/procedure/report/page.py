@@ -19,7 +19,7 @@ COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a header.
+    """Table of a report: rows of text under a header.
 
     Attributes:
         header: names of the columns.
@@ -197,7 +197,7 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
 
 
 def _rich_table(table: Table) -> RichTable:
-    """Return a table as a table of rich."""
+    """Return a table as a rich renderable."""
     title = table.title[:1].lower() + table.title[1:]
     result = RichTable(
         title=RichText(title), title_justify="left", caption=RichText(table.note) if table.note else None,

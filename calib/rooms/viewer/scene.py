@@ -146,7 +146,7 @@ class Scene:
 
 
 def read(folder: str | Path, robot: str | None = None) -> Scene:
-    """Return the scene of a folder's results.
+    """Return what to show of a folder's results: robot, poses, motions, torques.
 
     Args:
         folder: of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.

@@ -94,7 +94,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
 
 
 def _send(recording: Any, scene: Scene) -> None:
-    """Log all parts of a scene."""
+    """Write all parts of a scene into a Rerun recording."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("about", rr.TextDocument(about(scene), media_type="text/markdown"), static=True)
     start = 0.0
