@@ -47,6 +47,12 @@ def test_a_velocity_formed_otherwise_is_named():
     np.testing.assert_allclose(found.factor, 1.0, atol=0.1)
 
 
+def test_noise_wider_than_the_smoothed_sign_is_noted():
+    one = problem(0, 1e-3, v0=0.005)
+    test = compare_with_loop(one, METHODS["iv"].estimate(one))
+    assert "noisy-signs" in [one.code for one in test.findings(taken=True)]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cloe", "clie"])
 @pytest.mark.parametrize("noise", [(0.0, 0.05), (2e-5, 0.02), (5e-4, 0.1), (2e-3, 0.05)])

@@ -63,6 +63,9 @@ def folder(tmp_path_factory):
     np.savetxt(path / "readings.csv", table[:, :4], delimiter=",", header=motors, comments="")
     (path / "way.csv").write_text("x [mm],y [mm],rz [deg]\n0,0,0\n50,40,15\n-60,20,-20\n0,0,0\n")
     (path / "outside.csv").write_text("x [mm],y [mm],rz [deg]\n0,0,0\n300,0,0\n")
+    log = np.loadtxt(path / "load.csv", delimiter=",", skiprows=1)
+    shifted = np.column_stack([log + 0.02 * (np.arange(9) == 1), log[:, 1]])
+    np.savetxt(path / "shifted.csv", shifted, delimiter=",", header=f"{HEAD},elbow1 [rad]", comments="")
     np.savetxt(path / "passive.csv", table[:, :5], delimiter=",", header=motors + ",elbow1 [deg]", comments="")
     return path
 
@@ -191,6 +194,13 @@ def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
     given = [out, *rest] if command == "new" else [*rest, "--out", out]
     assert calib(command, *given) == code
     assert said in "".join(capsys.readouterr())
+
+
+def test_encoders_passive_joints_and_payloads_are_noted(folder, tmp_path):
+    words = ["--options", folder / "options.toml", "--out", tmp_path, "--no-plots"]
+    assert calib("identify", "dualv", folder / "shifted.csv", *words) == 0
+    codes = {one["code"] for one in json.loads((tmp_path / "metrics.json").read_text())["noticed"]}
+    assert {"encoders-contradict", "passive-joints-unread", "payload-never"} <= codes
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():

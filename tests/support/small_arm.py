@@ -31,9 +31,9 @@ LOOP = LoopSettings(controller="pd", kp=tuple(PD.kp), kd=tuple(PD.kd), rate=RATE
 
 
 @cache
-def robot() -> tuple[Plant, IdentificationModel, bases.Base]:
+def robot(v0: float = 0.2) -> tuple[Plant, IdentificationModel, bases.Base]:
     chain = mdh.chain("turn and slide", ROWS)
-    terms = drives.standard(["Ia Fv Fc"] * 2, 0.2, [False, True])
+    terms = drives.standard(["Ia Fv Fc"] * 2, v0, [False, True])
     model = IdentificationModel(bodies_of(chain), terms)
     return Plant(model.bodies, terms, np.concatenate([LINKS, DRIVES])), model, bases.find(model)
 
@@ -44,9 +44,11 @@ def motion(rate: float = RATE) -> controllers.Reference:
     return known_robots.random_fourier(-limit, limit, np.full(2, 3.0), 5.0, rate, 8, acceleration=20.0, seed=5)
 
 
-def problem(seed: int, sigma_q: float = 0.0, sigma_tau: float = 0.05, rate: float = RATE) -> IdentificationProblem:
+def problem(
+    seed: int, sigma_q: float = 0.0, sigma_tau: float = 0.05, rate: float = RATE, v0: float = 0.2
+) -> IdentificationProblem:
     """Return the problem of a log at 200 Hz; of a loop at 700 Hz 3.5 periods per sample."""
-    plant, model, base = robot()
+    plant, model, base = robot(v0)
     tick = rate / 200.0
     run = simulate(plant, PD, motion(rate), Sensing(sigma_q, sigma_tau=sigma_tau, every=tick), seed)
     asked = motion(rate).at(np.arange(len(run.t)) * tick)[0]

@@ -19,6 +19,7 @@ from calib.identification.model_file import to_table
 from calib.identification.prediction import Dynamics
 from calib.procedure.export import identified
 from calib.procedure.export.delivery import Export, deliver
+from calib.procedure.findings import catalogue
 from calib.robot import description
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_tree import read as read_tree
@@ -120,6 +121,19 @@ def check_torques_with_pinocchio(path: Path, given: identified.IdentifiedRobot) 
         tau = pin.rnea(model, data, place, np.concatenate([v[k], rest]), np.concatenate([a[k], rest]))[:2]
         tau = tau + model.damping[:2] * v[k] + model.friction[:2] * sign[k] + drives[:, 0] * a[k] + drives[:, 3]
         assert np.abs(tau - wanted[k]).max() < 1e-9 * max(1.0, np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("change", "factor", "code"),
+    [
+        ("", 30.0, "masses-unlike"),
+        ('izz="0.03"/></inertial>', 1.2, "description-inconsistent"),
+    ],
+)
+def test_masses_that_are_not_the_descriptions_are_said(tmp_path, change, factor, code):
+    source = SOURCE.replace("AXIS", "revolute").replace(change, change.replace("0.03", "0.9"))
+    given = identified.read(write_identification(tmp_path, source, factor=factor))
+    assert any(catalogue()[code].says.split("{")[0] in line for line in identified.notes_of(given))
 
 
 def test_all_else_of_the_source_stays(tmp_path):

@@ -14,6 +14,8 @@ from calib.data.poses.pose_lists import Targets, read_targets
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
+from calib.geometry.observation import layout
+from calib.procedure.findings import catalogue
 from calib.procedure.kinematic_stage import compensation, inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.kinematics import forward
@@ -130,6 +132,19 @@ def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(c
     assert far["reason"] == f"extrapolated: {names[0]}, {names[5]} outside the measured range"
     assert f"EXTRAPOLATED: 1 of 2 targets have joints outside the measured range ({names[0]}, " in out
     assert float(far["expected [mm]"]) > 1.2 * float(near["expected [mm]"])
+
+
+@pytest.mark.parametrize(
+    ("first", "code"), [(0.5, "expected-as-unseen"), (3.1, "expected-beyond-range")], ids=["inside", "outside"]
+)
+def test_without_an_error_model_and_orientations_it_is_said(cell, fitted, here, first, code):
+    given = compensation.read(fitted)
+    table = layout(given.cell)
+    kept = [not table.names[k].endswith((".rx", ".ry", ".rz")) for k in given.free]
+    known = dict(free=given.free[kept], covariance=given.covariance[np.ix_(kept, kept)], discrepancy=None)
+    found = compensation.compensate(replace(given, **known), Targets(np.array([[first, -1.2, 1.3, 0.4, 0.9, 0.2]])))
+    said = " ".join(compensation.lines(found))
+    assert "no orientations were measured" in said and catalogue()[code].says.split(":")[0] in said
 
 
 def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):

@@ -147,6 +147,16 @@ def test_lengths_that_grew_together_are_noted_whatever_else_was_wrong(cell, cali
         assert size["factor"] == pytest.approx(factor, abs=3 * size["sigma"] + 5e-4) and level_of(found) == "note"
 
 
+def test_lengths_of_another_size_that_joint_errors_hide_are_another_robots(cell, calib):
+    """The nominal arm's error is mostly that of two joints here; the fitted lengths have one factor all the same."""
+    near, off = {"q1": 0.0, "q2": -1.2, "q3": 1.3}, {"q2": 0.05, "q3": -0.05, "q5": 0.05}
+    rows = [row for row in cell.measure(4000) if all(abs(row[q] - middle) < 0.8 for q, middle in near.items())]
+    for row in rows:
+        row |= {axis: 1.03 * row[axis] for axis in "xyz"} | {q: row[q] + by for q, by in off.items()}
+    fitted(cell, calib, rows, "geometry")
+    assert "lengths-of-another-robot" in noticed()
+
+
 def computed(cell) -> np.ndarray:
     q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in cell.measure(COUNT)])
     return forward(cell.nominal, q)[:, :3, 3]

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,14 @@ import pytest
 from sessions import begin, copy_of, edit, go_on, kinds
 
 from calib import cli
+from calib.data.recordings.recording_files import read_recording
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
+from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session import commands, steps
+from calib.procedure.session.dynamics_steps import check_motion, designed_motions
 from calib.procedure.session.folder import Session, open_session
+from calib.robot.library import load_calibrated
 from calib.rooms.cells import demo
 from calib.rooms.cells.truth import torque_errors
 from calib.rooms.cells.virtual_cells import virtual_cell
@@ -175,11 +180,12 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (scaled("tau_joint4", -1.0), "training.csv: torque of joint4 .* reverse the sign of the column of joint4"),
         (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
         (scaled("tau_joint", 1e-2), "times those of the nominal masses"),
+        (scaled("tau_joint", 12.0), "are they in mNm"),
         (numbers(another), "does not contain the motion designed in this session"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
-    ids=["rad", "swapped", "rehearsal", "sign", "one sign", "horizontal", "unit", "another", "stopped", "missing"],
+    ids=["rad", "swapped", "rehearsal", "sign", "one", "horizontal", "unit", "mNm", "another", "stopped", "missing"],
 )
 def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
     path = recorded.path("7-recorded/training.csv")
@@ -187,6 +193,14 @@ def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], st
     with pytest.raises(MeasurementError, match=message):
         go_on(recorded)
     assert kinds(recorded)["excite"] == steps.DONE and not recorded.path("8-dynamics/dynamics.json").exists()
+
+
+def test_a_motion_played_too_seldom_and_loosely_is_noted(recorded: Session) -> None:
+    path, motion = recorded.path("7-recorded/training.csv"), designed_motions(recorded)["training"]
+    log = read_recording(str(path), joints_of(load_calibrated(recorded.fit.path).chain))
+    loose = replace(log, q=log.q + 0.3 * log.q.std(axis=0) * np.sin(40.0 * log.t)[:, None])
+    found, noted = check_motion(loose, motion, {}, 5)
+    assert found.periods == 2 and [one.code for one in noted] == ["repetitions-missing", "tracking-loose"]
 
 
 def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_proof(recorded: Session) -> None:
