@@ -5,7 +5,6 @@ reason, where the folder is absent.
 """
 
 import gc
-import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,8 +32,19 @@ settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("fixed")
 
 
-if "CALIB_FINDINGS" in os.environ:  # see tests/procedure/test_findings.py
-    produced.note()
+def pytest_addoption(parser: pytest.Parser) -> None:
+    words = "note the findings that tests make the sources say; a run of the slow tests compares with the catalogue"
+    parser.addoption("--findings", action="store_true", help=words)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("findings"):
+        produced.note()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if session.config.getoption("findings") and session.config.option.markexpr == "not slow":
+        session.config.cache.set(produced.KEY, sorted(produced.CODES))
 
 
 @pytest.fixture(scope="session", autouse=True)

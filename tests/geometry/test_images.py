@@ -21,6 +21,7 @@ from calib.robot.calibrated import Deflection
 from calib.robot.library import load
 from calib.rooms.camera.board_and_lens import board_poses
 from calib.rooms.camera.camera_guess import complete_camera
+from calib.rooms.camera.image_findings import image_notes
 from calib.rooms.camera.lens import Lens
 from calib.rooms.camera.optics import SHAPE, BoardShape
 from calib.rooms.camera.pixels import Pixels
@@ -168,6 +169,13 @@ def test_two_cameras_see_one_board():
     assert found.cell.optics.lens_names == ("camera", "other camera")
     own = replace(found.cell, stations=found.cell.stations[:1], tools=found.cell.tools[:1])
     assert position_errors(cell.cell, own, found.cell.chain)[2] < 0.03
+
+
+def test_corners_that_are_detected_worse_than_stated_are_said():
+    cell, block = study()
+    _, found = fitted(cell, replace(block, sigma=0.1 * block.sigma))
+    (one,) = [one for one in image_notes(found) if one.code == "corners-off"]
+    assert one.values["times"] == pytest.approx(10.0, rel=0.1)
 
 
 @pytest.mark.slow

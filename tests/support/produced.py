@@ -8,6 +8,7 @@ from calib.errors import Finding
 
 SOURCES = str(Path(calib.__file__).parent)
 CODES: set[str] = set()
+KEY = "calib/findings"  # of the codes of the quick tests, in pytest's cache
 
 
 def note() -> None:

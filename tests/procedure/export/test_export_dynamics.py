@@ -125,10 +125,7 @@ def check_torques_with_pinocchio(path: Path, given: identified.IdentifiedRobot) 
 
 @pytest.mark.parametrize(
     ("change", "factor", "code"),
-    [
-        ("", 30.0, "masses-unlike"),
-        ('izz="0.03"/></inertial>', 1.2, "description-inconsistent"),
-    ],
+    [("", 30.0, "masses-unlike"), ('izz="0.03"/></inertial>', 1.2, "description-inconsistent")],
 )
 def test_masses_that_are_not_the_descriptions_are_said(tmp_path, change, factor, code):
     source = SOURCE.replace("AXIS", "revolute").replace(change, change.replace("0.03", "0.9"))
