@@ -103,7 +103,7 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
         [1e3 * wanted[:, :3, 3], to_quaternion(wanted), drawn(cell, 120, 5)]
     ))  # fmt: skip
     out = commanded(calib, fitted, "--frame", "seen", "--tool", "tool")
-    assert "instrument's frame, station 'seen'" in out and "targets: 'tool'" in out
+    assert "instrument's frame, station 'seen'" in out and "tool 'tool'" in out
     rows = commands()
     assert {row["status"] for row in rows} == {"reached"}
     position, turn = off(true_poses(cell, numbers(rows, Q)), wanted)
@@ -152,7 +152,7 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     q = drawn(cell, 100, 6)
     write(here / "t.csv", [f"q{k + 1} [deg]" for k in range(6)], np.rad2deg(q))
     out = commanded(calib, fitted)
-    assert "base frame of the calibrated robot" in out and "targets: 'flange'" in out
+    assert "base frame of the calibrated robot" in out and "tool 'flange'" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
     found = compensation.read(fitted)
     goal = Goal(compensation.placements(found)[1], torques=found.torques)
