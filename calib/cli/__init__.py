@@ -79,7 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 @lru_cache(maxsize=1)
-def _command() -> Any:
+def command_tree() -> Any:
     """Return the Typer commands, built once per process from the functions' signatures."""
     return get_command(app)
 
@@ -92,7 +92,7 @@ def run(arguments: list[str] | None = None) -> int:
             what = "is not UTF-8; rename the file" if word else "is empty; leave the option out, or give it a value"
             return _complain(f"the argument after {before} {what}", 2)
     try:
-        code = int(_command()(args=_spread(given), standalone_mode=False) or 0)
+        code = int(command_tree()(args=_spread(given), standalone_mode=False) or 0)
         return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
     except typer.Exit as stop:
         return stop.exit_code
@@ -128,7 +128,7 @@ def _spread(arguments: list[str]) -> list[str]:
     command = next((word for word in arguments[:2] if word in ("fit", "identify", "compare")), None)
     if command is None:
         return arguments
-    known = [*_command().params, *_command().commands[command].params]
+    known = [*command_tree().params, *command_tree().commands[command].params]
     flags = [name for one in known if getattr(one, "is_flag", False) for name in (*one.opts, *one.secondary_opts)]
     result: list[str] = []
     option, positionals, spreading = "", 0, False

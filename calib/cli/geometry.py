@@ -171,7 +171,7 @@ def export(
         )
     say(*lines)
     if found.corrections is not None:
-        say(f"note: these files do not include the corrections of {folder}/joint_corrections.csv")
+        say(f"note: these files do not include the corrections (joint_corrections.csv in {folder})")
     if own.level:
         say(str(own))
     exit_failed(own.level)

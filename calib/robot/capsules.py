@@ -227,11 +227,11 @@ class Capsules:
 
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
-        return self._measured(self._lines(q))[0]
+        return self._measured(self.lines_at(q))[0]
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
         """Return the derivatives (m, pairs, n) of `distances`: normal times the velocities of the nearest points."""
-        lines = self._lines(q)
+        lines = self.lines_at(q)
         _, normal, one, two = self._measured(lines)
         count = len(self.own)
         second = np.concatenate([self.bodies[self.own[:, 1]], self.bodies[self.world[:, 0]]])
@@ -248,7 +248,7 @@ class Capsules:
         near_obstacles = self._with_obstacles
         if near_obstacles is not None and good.any():
             unsure = np.flatnonzero(good)
-            lines = self._lines(q[unsure])
+            lines = self.lines_at(q[unsure])
             near = ~np.all(near_obstacles._measured(lines, rough=True)[0] > margin, axis=1)
             some = _Lines(*(part[near] for part in (lines.start, lines.end, lines.axes, lines.places)))
             good[unsure[near]] = np.all(near_obstacles._measured(some)[0] > margin, axis=1)
@@ -290,7 +290,7 @@ class Capsules:
         Returns:
             Distances (m, L) [m] of the L capsules of all other bodies, and their derivatives (m, L, n).
         """
-        lines = self._lines(q)
+        lines = self.lines_at(q)
         others = self.solid[self.bodies[self.solid] < self.bodies.max()]
         shape = (len(q), len(others), 3)
         first, last = np.broadcast_to(start[:, None], shape), np.broadcast_to(np.atleast_2d(end)[:, None], shape)
@@ -301,7 +301,8 @@ class Capsules:
         gradient = self._closing(lines, normal, link, self.bodies[others]) - (1.0 - along)[..., None] * (normal @ slope)
         return distance - self.radii[others], gradient
 
-    def _lines(self, q: np.ndarray) -> _Lines:
+    def lines_at(self, q: np.ndarray) -> _Lines:
+        """Return the lines along the middles of the capsules at postures q (m, n)."""
         return _lines_of(self.chain, q, self.targets)
 
     def _measured(self, lines: _Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ def problem(seed: int, p: int = 8, count: int = 100):
 
 
 @pytest.mark.parametrize("equal", [0, 2])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(8))
 def test_linear_constraints_give_the_optimum_of_cvxpy_and_prove_it(seed, equal):
     cvxpy = pytest.importorskip("cvxpy")
     matrix, target, rng = problem(seed)

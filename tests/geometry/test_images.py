@@ -293,7 +293,7 @@ def test_every_closed_form_places_exact_poses(method, monkeypatch):
     rng = np.random.default_rng(1)
     arm, station, tool = (pose(Rotation.random(n, rng=rng), rng.normal(size=(n, 3))) for n in (12, 1, 1))
     seen = station[0] @ arm @ tool[0]
-    only = {"Shah": place_pose, "Li": robust._li, "Park-Martin": robust._park_martin}[method]
+    only = {"Shah": place_pose, "Li": robust.by_li, "Park-Martin": robust.by_park_martin}[method]
     one, two = only(arm, seen)
     assert one == pytest.approx(station[0], abs=1e-9) and two == pytest.approx(tool[0], abs=1e-9)
     assert place_robustly(arm, seen, 1.0).error < 1e-9

@@ -4,14 +4,14 @@ import pytest
 import typer
 from rich.table import Table
 
-from calib.cli import _command
+from calib.cli import command_tree
 from calib.cli.shared import MAX_LINES, command, say
 
 LISTINGS = {"formats", "explain"}  # what they print is what was asked for
 
 
 def test_every_command_has_the_option():
-    commands = _command().commands
+    commands = command_tree().commands
     with_it = {name for name, one in commands.items() if any("-v" in option.opts for option in one.params)}
     assert with_it == set(commands) - LISTINGS
 

@@ -154,7 +154,7 @@ def test_capsules_measure_as_coal_does(arm):
     ]
     found = capsules.from_chain(chain, 0.04, -0.2, things, targets=[(0.05, 0, 0.05)])
     q = random_joints(chain, 20, 3)
-    distances, lines = found.distances(q), found._lines(q)
+    distances, lines = found.distances(q), found.lines_at(q)
     solids = [coal.Box(0.3, 0.4, 0.5), coal.Sphere(0.2), coal.Cylinder(0.1, 0.8)]
     assert len(found.world) > 6 and (arm == "motley" or len(found.own) > 1)
 

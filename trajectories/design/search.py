@@ -247,10 +247,11 @@ class StartSearch:
         if self._evaluation is None or key != self._at:
             self._evaluation, self._at = evaluate(self.problem, self.basis, y, self.sharpness), key
             self.count += 1
-            self._remember(np.array(y), self._evaluation)
+            self.remember(np.array(y), self._evaluation)
         return self._evaluation
 
-    def _remember(self, y: np.ndarray, found: Evaluation) -> None:
+    def remember(self, y: np.ndarray, found: Evaluation) -> None:
+        """Keep an evaluated motion if it is within the limits and the best so far, or the nearest to the limits."""
         missed = unmet(self.problem, found.values) if self.problem.goals else None
         lacking = (max(found.excess, 0.0), missed[0] if missed else 0.0)
         if lacking < self.least:

@@ -231,7 +231,7 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
         return State(step, READY, "was interrupted; will be repeated")
     if entry is None:
         return State(step, READY, step.purpose)
-    if changes := _changes(entry.inputs, _inputs(session, step)):
+    if changes := changed_inputs(entry.inputs, _inputs(session, step)):
         kinds, used = step.kept
         if session.brought(*kinds):
             return State(step, KEPT, f"{changes}; kept, since {used}")
@@ -264,7 +264,7 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
     return marks
 
 
-def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+def changed_inputs(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Return a text on the differences between two sets of fingerprints."""
     changed = [name for name in now if _value(name, before.get(name, "{}")) != _value(name, now[name])]
     parts = [f"{name} {'has changed' if name in before else 'is new'}" for name in changed]

@@ -47,7 +47,7 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
         lever: what a radian counts in the misfit [m].
     """
     methods: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
-        "Shah": by_orientations, "Li": _li, "Park-Martin": _park_martin,
+        "Shah": by_orientations, "Li": by_li, "Park-Martin": by_park_martin,
     }  # fmt: skip
     best: Placement | None = None
     kept_share = 0.7
@@ -70,7 +70,7 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
     return best
 
 
-def _li(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def by_li(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X with B_i = S A_i X, from Z B_i = A_i X, Z = S⁻¹: 12 linear equations a pose in 24 unknowns."""
     m, eye = len(arm), np.eye(3)
     a, b = arm[:, :3, :3], seen[:, :3, :3]
@@ -90,7 +90,7 @@ def _li(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return invert(pose(z, shift[3:])), pose(x, shift[:3])
 
 
-def _park_martin(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def by_park_martin(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X; with M = A_i⁻¹ A_j and N = B_i⁻¹ B_j, M X = X N: log R_M = R_X log R_N, then t_X linearly."""
     order = np.argsort(Rotation.from_matrix(arm[:, :3, :3]).as_rotvec()[:, 0])
     first, second = order, np.roll(order, max(1, len(order) // 2))

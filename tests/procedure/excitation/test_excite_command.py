@@ -225,14 +225,14 @@ def test_a_motion_folder_is_written_whole(designed, tmp_path):
 
 def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
     """An interrupt in the middle of the search: the folder is written, verified, and says so."""
-    remember = StartSearch._remember
+    remember = StartSearch.remember
 
     def interrupting(run, y, found):
         remember(run, y, found)
         if run.kept == 5:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(StartSearch, "_remember", interrupting)
+    monkeypatch.setattr(StartSearch, "remember", interrupting)
     code, out, err = calib("excite", "lwr4plus", "--out", "e", "--goal", "wrist=0.1", *QUICK)
     assert code == 0 and "interrupted: this is the best" in out, err
     assert "note: interrupted before any motion met the goals" in out

@@ -28,7 +28,7 @@ from calib.procedure.session.settings import (
     read_settings,
     written,
 )
-from calib.procedure.session.steps import _changes
+from calib.procedure.session.steps import changed_inputs
 from calib.records import plain
 
 # as the version before typed settings (commit a217159) wrote it
@@ -61,9 +61,9 @@ def test_a_session_of_schema_1_goes_on_without_dynamics(old: Path) -> None:
 
 def test_a_step_is_not_stale_because_a_number_is_spelled_otherwise() -> None:
     place = "session.toml [fit] tolerance_mm"
-    assert _changes({place: "0"}, {place: "0.0"}) == ""
-    assert _changes({place: "0"}, {place: "0.5"}) == f"{place} has changed"
-    assert _changes({"a.csv": "10"}, {"a.csv": "1e1"}) == "a.csv has changed", "a file's mark is no number"
+    assert changed_inputs({place: "0"}, {place: "0.0"}) == ""
+    assert changed_inputs({place: "0"}, {place: "0.5"}) == f"{place} has changed"
+    assert changed_inputs({"a.csv": "10"}, {"a.csv": "1e1"}) == "a.csv has changed", "a file's mark is no number"
 
 
 @settings(deadline=None)
