@@ -52,20 +52,43 @@ class MotionConstraint(Protocol):
         ...
 
 
+class TwoSided:
+    """Columns of a limit from both sides: the upper sides of some rows, then their lower sides.
+
+    Attributes:
+        joints: indices of the limited rows.
+        rows: names of all rows; default joint 1, 2 ...
+    """
+
+    joints: np.ndarray
+    rows: tuple[str, ...] = ()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        names = [self.rows[j] if self.rows else f"joint {j + 1}" for j in self.joints]
+        return tuple(f"{name} {side}" for side in ("upper", "lower") for name in names)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.tile(np.arange(len(self.joints)), 2)
+
+
 @dataclass(frozen=True, eq=False)
-class BoxLimit:
+class BoxLimit(TwoSided):
     """Box limit lower ≤ d^r q / dt^r ≤ upper.
 
     Attributes:
         order: r, 0 to 3.
         lower, upper: (n,); infinite where there is no limit.
         unit: of the values.
+        rows: names of the n rows; default joint 1, 2 ...
     """
 
     order: int
     lower: np.ndarray
     upper: np.ndarray
     unit: str = ""
+    rows: tuple[str, ...] = ()
     joints: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -91,16 +114,8 @@ class BoxLimit:
         return ORDERS[self.order]
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"joint {j + 1} {side}" for side in ("upper", "lower") for j in self.joints)
-
-    @property
     def scale(self) -> np.ndarray:
         return np.tile((self.upper - self.lower)[self.joints] / 2, 2)
-
-    @property
-    def groups(self) -> np.ndarray:
-        return np.tile(np.arange(len(self.joints)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         x = motion.orders[self.order][:, self.joints]
@@ -114,7 +129,7 @@ class BoxLimit:
 
 
 @dataclass(frozen=True, eq=False)
-class TorqueLimit:
+class TorqueLimit(TwoSided):
     """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max: the model's uncertainty is a margin.
 
     Attributes:
@@ -150,17 +165,8 @@ class TorqueLimit:
         object.__setattr__(self, "joints", np.flatnonzero(np.isfinite(self.limits)))
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        names = self.rows or tuple(f"joint {j + 1}" for j in range(len(self.limits)))
-        return tuple(f"{names[j]} {side}" for side in ("upper", "lower") for j in self.joints)
-
-    @property
     def scale(self) -> np.ndarray:
         return np.tile(self.limits[self.joints], 2)
-
-    @property
-    def groups(self) -> np.ndarray:
-        return np.tile(np.arange(len(self.joints)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         Y = motion.evaluated(self.regressor)

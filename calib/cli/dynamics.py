@@ -115,12 +115,12 @@ def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = Fa
         skip: whole periods to leave out at the beginning
     """
     from calib.files import results
-    from calib.procedure.excitation import recall as excitation_recall
+    from calib.procedure.excitation import coefficients
 
-    with results([(out, excitation_recall.SUFFIXES)], excitation_recall.inputs(folder, log), overwrite):
-        found = excitation_recall.find(folder, log, skip)
-        excitation_recall.write(found, out)
-    say_written(excitation_recall.lines(found), out)
+    with results([(out, coefficients.SUFFIXES)], coefficients.inputs(folder, log), overwrite):
+        found = coefficients.find(folder, log, skip)
+        coefficients.write(found, out)
+    say_written(coefficients.lines(found), out)
 
 
 @command(app)

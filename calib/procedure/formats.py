@@ -43,7 +43,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     "waypoints": ("the CSV of calib plan --waypoints", "calib.procedure.excitation.planning"),
     "excitation": (
         "trajectory.toml of calib excite, and what calib recall writes",
-        "calib.procedure.excitation.coefficients calib.procedure.excitation.recall",
+        "calib.procedure.excitation.coefficients",
     ),
     "recordings": (
         "recordings of motion, for calib identify",

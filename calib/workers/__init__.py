@@ -11,16 +11,20 @@ Processes are spawned, not forked, so that threads of numerical libraries do no 
 parallel.
 """
 
+from __future__ import annotations
+
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calib.errors import TaskLost, UsageError
-from calib.workers.crew import Crew, Stream, streamed
+
+if TYPE_CHECKING:
+    from calib.workers.processes import Crew, Stream
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
         cluster.dask(text) if "://" in text else closing(processes.Processes(int(text)))
     )
     with made as crew:
-        yield Workers(partial(streamed, crew), here="://" not in text)
+        yield Workers(partial(processes.streamed, crew), here="://" not in text)
 
 
 @contextmanager

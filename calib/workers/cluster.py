@@ -12,7 +12,7 @@ from threading import Lock
 from typing import Any
 
 from calib.errors import CalibError, UsageError, refused_as
-from calib.workers.crew import Answer, Died, run_call
+from calib.workers.processes import Answer, Died, run_call
 
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
 NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)

@@ -19,9 +19,8 @@ from calib.dynamics import rigid_body
 from calib.dynamics.drives import added_inertia
 from calib.errors import CannotSimulate, UsageError
 from calib.records import frozen
-from calib.rooms.parallel.mechanism.leg_links import compiled
-from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, wrench_regressor
-from calib.rooms.parallel.mechanism.platform_motion import along
+from calib.rooms.parallel.mechanism.closure import compiled
+from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, preload_directions
 
 FAR = 0.3  # [rad or m] between encoders and reference at which a run is given up

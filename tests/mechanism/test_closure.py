@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from calib.errors import NoPosture, RobotError
-from calib.rooms.parallel.mechanism import parallel_files
-from calib.rooms.parallel.mechanism.closure import closed, coordinates_of
-from calib.rooms.parallel.mechanism.leg_links import leg_links
+from calib.rooms.parallel.mechanism import parallel_robot
+from calib.rooms.parallel.mechanism.closure import closed, coordinates_of, leg_links
 from calib.rooms.parallel.mechanism.velocities import of_platform, of_readings
 from calib.rooms.parallel.robots import find
 
@@ -14,13 +13,13 @@ ROBOTS = ("dualv", "fivebar", "stewart")
 
 
 def text(name: str) -> str:
-    return parallel_files.library()[name].read_text(encoding="utf-8")
+    return parallel_robot.library()[name].read_text(encoding="utf-8")
 
 
 def made(tmp_path, content: str):
     path = tmp_path / "robot.toml"
     path.write_text(content, encoding="utf-8")
-    return closed(parallel_files.read(path))
+    return closed(parallel_robot.read(path))
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -57,9 +56,9 @@ def test_velocities_and_accelerations_are_derivatives(name):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_files_are_read_back_exactly(name, tmp_path):
-    robot = parallel_files.read(parallel_files.library()[name])
-    again = parallel_files.read(parallel_files.write(tmp_path / "again.toml", robot))
-    assert parallel_files.to_table(again) == parallel_files.to_table(robot)
+    robot = parallel_robot.read(parallel_robot.library()[name])
+    again = parallel_robot.read(parallel_robot.write(tmp_path / "again.toml", robot))
+    assert parallel_robot.to_table(again) == parallel_robot.to_table(robot)
 
 
 def test_poses_out_of_reach_are_named():

@@ -11,8 +11,7 @@ from calib.errors import CannotSimulate
 from calib.identification.identify import identify_model
 from calib.identification.rows import make_case
 from calib.identification.settings import IdentificationSettings
-from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
-from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
+from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, along, make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
 from calib.rooms.parallel.robots import find
 

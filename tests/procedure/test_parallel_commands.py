@@ -9,11 +9,10 @@ from without_figures import run
 
 import calib as api
 from calib.robot import library
-from calib.rooms.parallel.mechanism import parallel_files
+from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import closed
 from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
-from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model
-from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor, along
+from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, along, make_parallel_model
 from calib.rooms.parallel.robots import find
 
 HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
@@ -204,5 +203,5 @@ def test_encoders_passive_joints_and_payloads_are_noted(folder, tmp_path):
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():
-    parallel = parallel_files.library()
+    parallel = parallel_robot.library()
     assert not set(parallel) & set(library.names()) and "dualv" in parallel

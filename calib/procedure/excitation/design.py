@@ -19,7 +19,7 @@ from calib.errors import UsageError, require
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits, located
-from calib.procedure.excitation.playback import Playback, check_playback, play
+from calib.procedure.excitation.playback import Playback, check_start, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import AIMS, COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
 from calib.robot.calibrated import CalibratedChain
@@ -48,14 +48,6 @@ from trajectories.fourier import fourier_family
 SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
 
 
-@dataclass(frozen=True, eq=False)
-class NamedGoal:
-    """A goal of the search and the name under which it was given."""
-
-    name: str
-    goal: AttainmentGoal
-
-
 def objectives_of(
     settings: ExcitationSettings, condition: Excitation, errors_known: bool = False
 ) -> tuple[tuple[Objective, float], ...]:
@@ -77,7 +69,7 @@ def objectives_of(
     return ((replace(condition, index=(*aims, AIMS[0])[0]), 1.0),)
 
 
-def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[NamedGoal]:
+def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
     """Return the goals of the settings, soft ones first.
 
     Args:
@@ -93,7 +85,7 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
                 continue
             name, value = split_goal(text)
             objective, goal = _objective(name, value, given, condition, settings.shortest)
-            result.append(NamedGoal(name, AttainmentGoal(objective, goal, weight)))
+            result.append(AttainmentGoal(objective, goal, weight))
     return result
 
 
@@ -281,15 +273,15 @@ def search_motion(
 ) -> Designed:
     """Search for an exciting motion of an arm, or of the platform's coordinates of a parallel robot."""
     say = progress or (lambda words: None)
-    check_playback(settings, given)
+    check_start(settings.start, given.chain, given.limits)
     problem, checked, notes = _excitation_problem(given, settings)
     condition = _condition_objective(given, settings)
-    named_goals = read_goals(settings, given, condition)
+    goals = read_goals(settings, given, condition)
     report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
     search = partial(
         design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
     )
-    found, problem = _searched(problem, named_goals, settings.starts, search, say)
+    found, problem = _searched(problem, goals, settings.starts, search, say)
     say("verifying")
     found, problem = _whole(found, problem, settings.rate)
     with finishing():
@@ -297,17 +289,18 @@ def search_motion(
     front = None
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
-            front = _front(problem, given, found, named_goals, settings.front, report)
+            front = _front(problem, given, found, goals, settings.front, report)
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
     outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
         say("predicting sigmas of other periods")
-        outlook, predicted = foretell(given, settings, problem, found, partial(_problem_of_period, given, settings))
+        of_period = lambda period: _excitation_problem(given, replace(settings, period=period, shortest=None))[0]  # noqa: E731
+        outlook, predicted = foretell(given, settings, problem, found, of_period)
     pairs = zip(problem.goals, found.values)
     reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
-    cut = ("interrupted before any motion met the goals",) if named_goals and not problem.goals else ()
+    cut = ("interrupted before any motion met the goals",) if goals and not problem.goals else ()
     cut += _missed(problem, found, given)
     return Designed(
         given, settings, problem, found, proof, condition_found,
@@ -327,11 +320,6 @@ def _missed(problem: ExcitationProblem, found: SearchResult, given: ExcitationIn
     idle = "without friction light joints have hardly any torque: state [friction] in the limits file, or a model"
     known = given.model.friction or not any(isinstance(goal.objective, TorqueSlack) for goal in problem.goals)
     return tuple(words if known or not words else [*words, idle])
-
-
-def _problem_of_period(given: ExcitationInputs, settings: ExcitationSettings, period: float) -> ExcitationProblem:
-    """Return the problem with another, fixed period [s]."""
-    return _excitation_problem(given, replace(settings, period=period, shortest=None))[0]
 
 
 def _excitation_problem(
@@ -374,14 +362,11 @@ def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) 
 
 
 def _searched(
-    problem: ExcitationProblem, named_goals: list[NamedGoal], starts: int, search: Search, say: Progress
+    problem: ExcitationProblem, goals: list[AttainmentGoal], starts: int, search: Search, say: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
     """Search for a motion; with goals, a first run proposes those of the condition numbers."""
-    if not named_goals:
-        return search(problem, starts=starts), problem
-    goals = tuple(one.goal for one in named_goals)
-    if set(SCALINGS) & {one.name for one in named_goals}:
-        problem = replace(problem, goals=goals)
+    if not goals or any(isinstance(one.objective, Excitation) for one in goals):
+        problem = replace(problem, goals=tuple(goals))
         return search(problem, starts=starts), problem
     first = search(problem, starts=starts)
     if first.interrupted:
@@ -463,13 +448,12 @@ def _front(
     problem: ExcitationProblem,
     given: ExcitationInputs,
     found: SearchResult,
-    named_goals: list[NamedGoal],
+    goals: list[AttainmentGoal],
     count: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
     """Return trade-offs: the first torque goal (default: wrist) is varied from its present to its best value."""
-    goals = (one.goal.objective for one in named_goals)
-    slack = next((one for one in goals if isinstance(one, TorqueSlack)), None)
+    slack = next((one.objective for one in goals if isinstance(one.objective, TorqueSlack)), None)
     slack = slack or torque_slack(wrist(given.chain.n), given, "front")
     motion = problem.basis().motion(found.x)
     begin = slack.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value

@@ -198,7 +198,7 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
     shaped, deviation = planned.shaped, planned.deviation
     return plain({
         "feasible": True, "duration": planned.track.duration, "margins": _margins(planned),
-        "active_share": _active_share(planned), "active_within": ACTIVE,
+        "active_share": planned.active_share, "active_within": ACTIVE,
         "iterations": sum(one.iterations for one in planned.timings),
         "tightened": max(one.tightened for one in planned.timings),
         "history": [one.history for one in planned.timings],
@@ -218,7 +218,7 @@ def plan_lines(planned: Planned) -> list[str]:
     """Return the lines that `calib plan` prints: duration, margins, limits, notes."""
     words = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; closer than {ACTIVE:.0%} to a limit for "
-        f"{_active_share(planned):.1%} of the time; all limits are respected at "
+        f"{planned.active_share:.1%} of the time; all limits are respected at "
         f"{_verified(planned)} instants",
         "smallest margins:",
     ]
@@ -243,12 +243,6 @@ class _PlanMargin:
     at: str
     share: float
     joints: list[float]
-
-
-def _active_share(planned: Planned) -> float:
-    """Return the share of the time during which the motion is close to a limit."""
-    seconds = [one.duration for one in planned.timings]
-    return float(np.average([one.active_share for one in planned.timings], weights=seconds))
 
 
 def _verified(planned: Planned) -> int:

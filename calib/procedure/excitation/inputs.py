@@ -71,6 +71,11 @@ class IdentifiableColumns:
     names: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
+    @property
+    def kept(self) -> np.ndarray | slice:
+        """Index of the columns."""
+        return slice(None) if self.columns is None else self.columns
+
 
 @dataclass(frozen=True, eq=False)
 class PriorMotions:
@@ -332,9 +337,8 @@ def identifiable(
     model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None
 ) -> IdentifiableColumns:
     """Return the columns that a motion with locked joints, together with earlier motions, can identify."""
-    names, known, sigmas = model.exact.names, None, None
-    if prior is not None:
-        known, sigmas = prior.information, prior.sigmas
+    names = model.exact.names
+    known, sigmas = (None, None) if prior is None else (prior.information, prior.sigmas)
     if not locked:
         return IdentifiableColumns(None, sigmas, names)
     still = np.isin(model.exact.joint_of_row, list(locked))

@@ -166,6 +166,12 @@ class Planned:
     rehearsal: Setpoints | None = None
     sigma: np.ndarray | None = None
 
+    @property
+    def active_share(self) -> float:
+        """Share of the time during which the motion is close to a limit."""
+        seconds = [one.duration for one in self.timings]
+        return float(np.average([one.active_share for one in self.timings], weights=seconds))
+
 
 def plan(
     robot: str | Path | CalibratedChain,
@@ -227,9 +233,7 @@ def plan(
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
     known.bounds.check(motion)
-    lead, remarks = None, ()
-    if settings.start is not None:
-        lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
+    lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
     return Planned(
         chain, known.bounds, bounds, lower, upper, timings, motion, (*known.notes, *notes, *remarks), margins,
         deviation, shaped, lead, slowed(motion, settings.slower) if settings.slower != 1 else None, sigma,

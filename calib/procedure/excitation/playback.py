@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.dynamics.load_cases import LoadCases
 from calib.errors import UsageError, require
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
 from calib.procedure.excitation.limits import DEFAULT_RISE, MotionLimits
@@ -45,12 +44,6 @@ class Playback:
     notes: tuple[str, ...]
 
 
-def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> None:
-    """Raise an error, before the search, if the motion could not be played with these settings."""
-    if settings.start is not None:
-        _check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
-
-
 def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
     """Return the setpoints of a designed motion: approach, periods and rehearsal, as the settings say."""
     model, limits, chain = given.model, given.limits, given.chain
@@ -58,10 +51,8 @@ def play(family: Family, found: SearchResult, given: ExcitationInputs, settings:
     count = round(period * settings.rate)  # a period holds a whole number of the controller's samples
     motion = dense_motion(family, found.x, np.arange(count + 1) * (period / count), found.factor)
     once = _with_torque(Setpoints(settings.rate, motion.q, motion.v, motion.a), model)
-    lead, notes = None, ()
-    if settings.start is not None:
-        lead, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
-        lead = _with_torque(lead, model)
+    lead, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
+    lead = None if lead is None else _with_torque(lead, model)
     ahead = [] if lead is None else [lead]
     slow = _with_torque(slowed(joined([*ahead, once]), settings.slower), model) if settings.slower > 1 else None
     for name, track in (("approach", lead), ("rehearsal", slow)):
@@ -70,21 +61,16 @@ def play(family: Family, found: SearchResult, given: ExcitationInputs, settings:
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
-    """Return the track with the torques that the model predicts; unchanged if its parameters are unknown."""
+    """Return the track with predicted torques, of the load with which each is largest; as is if parameters lack."""
     if dynamics.values is None:
         return track
-    return replace(track, tau=_torque(dynamics.exact, dynamics.values, track))
-
-
-def _torque(model: LoadCases, values: np.ndarray, track: Setpoints) -> np.ndarray:
-    """Return the motor torques (N, n), of the load with which each is largest."""
-    parts = []
+    parts, model = [], dynamics.exact
     for begin in range(0, len(track), BLOCK_ROWS):
         part = (np.ascontiguousarray(x[begin : begin + BLOCK_ROWS]) for x in (track.q, track.v, track.a))
-        torque = (model.regressor(*part) @ values)[:, model.limited]  # (N, loads, n)
+        torque = (model.regressor(*part) @ dynamics.values)[:, model.limited]  # (N, loads, n)
         largest = np.abs(torque).argmax(axis=1, keepdims=True)
         parts.append(np.take_along_axis(torque, largest, axis=1)[:, 0])
-    return np.concatenate(parts)
+    return replace(track, tau=np.concatenate(parts))
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
@@ -99,21 +85,22 @@ def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Ch
 
 
 def approach_to(
-    start: Sequence[float], goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
-) -> tuple[Setpoints, tuple[str, ...]]:
+    start: Sequence[float] | None, goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
+) -> tuple[Setpoints | None, tuple[str, ...]]:
     """Return the approach from a pose to the start of a motion, a straight line in joint space, and notes.
 
     Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
 
     Args:
-        start: (n,) where the robot stands [rad or m]; goal: (n,).
+        start: (n,) where the robot stands [rad or m]; None: no approach; goal: (n,).
 
     Raises:
         UsageError: for a start beyond the joint limits, or an approach that violates a clearance.
     """
-    here = np.asarray(start, dtype=float)
+    here = check_start(start, chain, known)
+    if here is None:
+        return None, ()
     boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
-    _check_start(here, chain, known)
     sizes = {order: box.upper for order, box in boxes.items()}
     free = np.full(chain.n, np.inf)
     velocity = np.minimum(sizes.get(1, free), MAX_APPROACH_SPEED)
@@ -133,10 +120,13 @@ def approach_to(
     return found, tuple(notes)
 
 
-def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
-    """Raise an error if joint values (n,) are wrong in number or beyond the joint limits."""
-    limits = known.positions
-    require(start.shape == (chain.n,), f"start: expected {chain.n} joint values, found {start.size}", UsageError)
-    for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):
+def check_start(start: Sequence[float] | None, chain: Chain, known: MotionLimits) -> np.ndarray | None:
+    """Return the joint values (n,) of a start; raise an error if wrong in number or beyond the joint limits."""
+    if start is None:
+        return None
+    limits, here = known.positions, np.asarray(start, dtype=float)
+    require(here.shape == (chain.n,), f"start: expected {chain.n} joint values, found {here.size}", UsageError)
+    for name, value, lower, upper in zip(chain.joint_names, here, limits.lower, limits.upper):
         if not lower <= value <= upper:
             raise UsageError(f"start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
+    return here

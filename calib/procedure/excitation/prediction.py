@@ -118,8 +118,7 @@ def foretell(
             continue
         shorter = _shortened(problem, found, problem_of, period, evaluations)
         others += [] if shorter is None else [predict(shorter[0], shorter[1].x, shorter[1].factor, 1.0)[0]]
-    model, columns = given.model, given.columns.columns
-    kept = slice(None) if columns is None else columns
+    model, kept = given.model, given.columns.kept
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
     before, earlier = None, [None] * len(spread)
     if _errors_known(given):
@@ -141,8 +140,8 @@ def _errors_known(given: ExcitationInputs) -> bool:
 def _known(given: ExcitationInputs) -> np.ndarray:
     """Return a root (c, c) of the information matrix of earlier motions, for the columns of the design."""
     assert given.prior is not None
-    columns = slice(None) if given.columns.columns is None else given.columns.columns
-    values, V = np.linalg.eigh(given.prior.information[columns][:, columns])
+    kept = given.columns.kept
+    values, V = np.linalg.eigh(given.prior.information[kept][:, kept])
     return np.sqrt(np.maximum(values, 0.0))[:, None] * V.T
 
 
@@ -169,11 +168,7 @@ def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
     q, v, a = low + (high - low) * rng.random((TASK_STATES, n)), *(2.0 * rng.random((2, TASK_STATES, n)) - 1.0)
     for j, value in given.locked.items():
         q[:, j], v[:, j], a[:, j] = 0.0 if value is None else value, 0.0, 0.0
-    return _columns(given, given.model.exact.regressor(q, fast * v, DEFAULT_RISE * fast * a))
-
-
-def _columns(given: ExcitationInputs, Y: np.ndarray) -> np.ndarray:
-    return Y if given.columns.columns is None else Y[:, :, given.columns.columns]
+    return given.model.exact.regressor(q, fast * v, DEFAULT_RISE * fast * a)[:, :, given.columns.kept]
 
 
 def _prediction(
@@ -189,7 +184,7 @@ def _prediction(
         weight, earlier = rows / PERIOD_SAMPLES, np.zeros((0, task.shape[2]))
     else:
         weight, earlier = period * repeat / PERIOD_SAMPLES, _known(given)
-    Y = _columns(given, given.model.exact.regressor(motion.q, motion.v, motion.a)) / sigmas[:, None]
+    Y = given.model.exact.regressor(motion.q, motion.v, motion.a)[:, :, given.columns.kept] / sigmas[:, None]
     root = _root(np.concatenate([np.sqrt(weight) * Y.reshape(-1, Y.shape[2]), earlier]))
     return MotionPrediction(period * repeat, rows, *_torque_sigma(given, task, root)), np.linalg.norm(root, axis=1)
 

@@ -160,12 +160,11 @@ def _profile_figure(planned: Planned) -> Chart:
             below.append(line(instants, used.max(axis=1), colour=colour, label=name if start == 0.0 else ""))
         start = float(times[-1])
     below.append(level(1.0))
-    share = np.average([one.active_share for one in planned.timings], weights=[one.duration for one in planned.timings])
     panels = [
         Panel(below, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),
         Panel(above, x="time [s]", y="speed along the path", xlim=(0.0, start)),
     ]
-    return Chart(panels, 3.8, title=f"{start:.3g} s, close to a limit for {share:.0%} of the time")
+    return Chart(panels, 3.8, title=f"{start:.3g} s, close to a limit for {planned.active_share:.0%} of the time")
 
 
 def trained_on(folder: Path, joints: Sequence[Joint]) -> Picture:

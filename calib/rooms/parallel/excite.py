@@ -4,7 +4,8 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -26,12 +27,16 @@ from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Joint
 from calib.robot.tables import dumps
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
-from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
-from calib.rooms.parallel.mechanism.platform_motion import PlatformRegressor
+from calib.rooms.parallel.mechanism.parallel_model import (
+    ParallelModel,
+    PlatformRegressor,
+    make_parallel_model,
+    rows_named,
+)
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, loop_jacobians
 from calib.rooms.parallel.robots import ParallelMechanism
 from trajectories.basis import SampledMotion
-from trajectories.constraints import BoxLimit, MotionConstraint
+from trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
 from trajectories.design.verify import dense_motion
 from trajectories.setpoints import Setpoints
 
@@ -41,62 +46,32 @@ FIGURES = "plot_*.png"
 MOTION = (ROBOT, METRICS, PLANNED, coefficients.NAME, FIGURES)
 
 
-@dataclass(frozen=True)
-class _Platform:
-    """The platform's coordinates, treated as the joints of a serial arm in the search."""
-
-    name: str
-    joint_names: tuple[str, ...]
-
-    @property
-    def n(self) -> int:
-        return len(self.joint_names)
-
-    @property
-    def joints(self) -> tuple[Joint, ...]:
-        return tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in self.joint_names)
-
-
 @dataclass(frozen=True, eq=False)
-class _PlatformBox(BoxLimit):
-    """Limits of the platform's coordinates, by name."""
-
-    names: tuple[str, ...] = ()
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"platform {self.names[j]} {side}" for side in ("upper", "lower") for j in self.joints)
-
-
-@dataclass(frozen=True, eq=False)
-class _ActuatorLimit:
+class _ActuatorLimit(TwoSided):
     """|τ| ≤ τ_max, or |q̇| ≤ v_max, of each actuator; a `trajectories.constraints.MotionConstraint`.
 
     Attributes:
         plan: takes platform coordinates to the robot's motion.
         of: the motion of N samples -> (N, n), what is limited.
-        names: of the n actuators; limits (n,), finite.
+        rows: names of the n actuators.
+        limits: (n,), finite.
         name, unit: of the limit.
     """
 
     plan: PlatformRegressor
     of: Callable[[LoopMotion], np.ndarray]
-    names: tuple[str, ...]
+    rows: tuple[str, ...]
     limits: np.ndarray
     name: str = "torque"
     unit: str = "N m"
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"{name} {side}" for side in ("upper", "lower") for name in self.names)
+    def joints(self) -> np.ndarray:
+        return np.arange(len(self.limits))
 
     @property
     def scale(self) -> np.ndarray:
         return np.tile(self.limits, 2)
-
-    @property
-    def groups(self) -> np.ndarray:
-        return np.tile(np.arange(len(self.limits)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         own = self.of(self.plan.motion(motion.q, motion.v, motion.a))
@@ -248,17 +223,20 @@ def design_parallel(
     base = bases.find(ParallelModel(known, model.terms, rows_named(known), ()))
     columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
     plan: Any = PlatformRegressor(model, columns, values, preload)
-    constraints: list[MotionConstraint] = [_PlatformBox(0, own.lower, own.upper, names=own.freedom)]
+    coordinates = tuple(f"platform {name}" for name in own.freedom)
+    constraints: list[MotionConstraint] = [BoxLimit(0, own.lower, own.upper, rows=coordinates)]
     if acceleration is not None:
-        constraints.append(_PlatformBox(2, -acceleration, acceleration, names=own.freedom))
+        constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
     constraints += [
         _ActuatorLimit(plan, plan.torques, own.joint_names, (1.0 - GUARD) * bounds.torque),
         _ActuatorLimit(plan, plan.speeds, own.joint_names, bounds.velocity, "velocity", "rad/s"),
     ]
+    joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in own.freedom)
+    platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)  # like an arm's
     free = np.full(own.r, np.inf)
     sigmas = np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
     given = ExcitationInputs(
-        cast(Any, _Platform(own.name, own.freedom)),
+        platform,
         MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
         ExcitedModel(plan, plan, None, None, False), {}, IdentifiableColumns(None, sigmas, base.names), None,
     )  # fmt: skip

@@ -32,7 +32,7 @@ from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
-from calib.rooms.parallel.mechanism import parallel_files
+from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.geometric_fit import (
     LoopFit,
@@ -132,7 +132,7 @@ class ParallelFit(Judged):
 
         def write(folder: Path) -> None:
             words, read = f"calibrated from {self.nominal.source}", {"files": [str(each) for each in self.files]}
-            parallel_files.write(folder / ROBOT, self.robot.chain, words, read)
+            parallel_robot.write(folder / ROBOT, self.robot.chain, words, read)
             files.write_table(folder / ESTIMATE, HEADER, list(self._table()))
             write_covariance(folder / COVARIANCE, found.names, found.covariance)
             files.write_json(folder / METRICS, self.to_dict())
@@ -258,9 +258,8 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
     """
     table = read_table(path)
     readings = [table.numbers(joint.name, "angle" if joint.kind == "revolute" else "length") for joint in robot.joints]
-    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for name in table.header:
-        if name in passive:
+        if name in robot.passive:
             table.fail("is of a passive joint: its encoder cannot be used; remove the column", name)
         if name in COORDINATES and name not in robot.freedom:
             table.fail(f"is not a platform coordinate ({', '.join(robot.freedom)}); remove the column", name)

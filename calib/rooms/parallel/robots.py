@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.robot.calibrated import ROBOT
-from calib.rooms.parallel.mechanism import parallel_files
+from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 
@@ -31,8 +30,8 @@ class ParallelMechanism:
 
     known: ClosedRobot
     source: Path
-    kind: str = "parallel robot"
-    instead: Mapping[str, str] = field(default_factory=lambda: INSTEAD)
+    kind = "parallel robot"
+    instead = INSTEAD
 
     @property
     def chain(self) -> ParallelRobot:
@@ -41,7 +40,7 @@ class ParallelMechanism:
 
     def write(self, folder: Path) -> None:
         """Write ``robot.toml``."""
-        parallel_files.write(folder / ROBOT, self.known.robot, f"from {self.source}")
+        parallel_robot.write(folder / ROBOT, self.known.robot, f"from {self.source}")
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
         """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.excite.read_model` reads it."""
@@ -68,21 +67,17 @@ class ParallelMechanism:
         return repr(self)[1:-1].replace("ParallelMechanism", self.kind)
 
 
-def path_of(robot: object) -> Path | None:
-    """Return the file of a parallel robot that `robot` names: a TOML, a folder with one, a library name; else None."""
-    if not isinstance(robot, (str, Path)):
-        return None
-    path = Path(robot) / ROBOT if Path(robot).is_dir() else Path(robot)
-    if path.is_file():
-        return path if path.suffix == ".toml" and parallel_files.is_parallel(path) else None
-    return parallel_files.library().get(str(robot))
-
-
 def find(robot: object) -> ParallelMechanism | None:
-    """Return the parallel robot that `robot` names; None if it is another kind of robot or unknown.
+    """Return the parallel robot of a TOML file, a folder with one, or a library name; None for any other robot.
 
     Raises:
         RobotError: for a file that contradicts itself, loops that do not close at home.
     """
-    path = path_of(robot)
-    return None if path is None else ParallelMechanism(closed(parallel_files.read(path)), path)
+    if not isinstance(robot, (str, Path)):
+        return None
+    path = Path(robot) / ROBOT if Path(robot).is_dir() else Path(robot)
+    if not path.is_file():
+        path = parallel_robot.library().get(str(robot))
+    elif path.suffix != ".toml" or not parallel_robot.is_parallel(path):
+        return None
+    return None if path is None else ParallelMechanism(closed(parallel_robot.read(path)), path)

@@ -1,5 +1,5 @@
 """Closed-loop mechanisms: models of parallel and redundantly actuated robots for identification and calibration.
 
-`parallel_robot` says what such a robot is, `parallel_files` is its TOML; `closure` solves the loops, `velocities`
+`parallel_robot` describes such a robot and reads its TOML file; `closure` solves the loops, `velocities`
 differentiates them; `parallel_model` is the regressor.
 """

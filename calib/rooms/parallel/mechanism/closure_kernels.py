@@ -46,7 +46,7 @@ def invert(A, out):
 
 @njit(**OPTIONS)
 def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
-    """Write one leg at one posture; see `calib.rooms.parallel.mechanism.leg_links.LegLinks`.
+    """Write one leg at one posture; see `calib.rooms.parallel.mechanism.closure.LegLinks`.
 
     Args:
         held: c.

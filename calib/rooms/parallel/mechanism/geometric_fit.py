@@ -21,8 +21,15 @@ import numpy as np
 from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
-from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed, coordinates_of
-from calib.rooms.parallel.mechanism.leg_links import Posture, leg_links, links_of, times
+from calib.rooms.parallel.mechanism.closure import (
+    ClosedRobot,
+    Posture,
+    closed,
+    coordinates_of,
+    leg_links,
+    links_of,
+    times,
+)
 from calib.rooms.parallel.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians, preload_directions
 from calib.transforms import displace

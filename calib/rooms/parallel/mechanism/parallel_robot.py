@@ -1,23 +1,48 @@
-"""Description of a parallel robot: a platform and its legs, each a serial chain from base to platform.
+"""A parallel robot and its TOML file: legs as MDH tables, platform, and attachment of each leg.
 
-    closure of leg k:   tip_k(q_k) = P · attachment_k        (six equations where the leg is rigid with the platform,
-                                                              three where a spherical joint ends it)
+kind = "parallel"                # required: distinguishes it from a serial arm
+name = "dualv"
+gravity = [0, 0, -9.81]          # in the base frame [m/s²]
+source = "where the numbers come from"
 
-Nothing is planar or symmetric by construction: a planar robot is one whose loops leave x, y and rz. The virtual tree of
-the papers (Khalil & Ibrahim 2007; Briot, Gautier & Krut 2013) is all legs side by side, and the free platform.
+[platform]
+freedom = ["x", "y", "rz"]       # its independent coordinates: of x y z (position) rx ry rz (about the base's axes)
+lower = [-0.1, -0.1, "-30 deg"]  # box of them around home in which states are drawn and motions designed
+upper = [0.1, 0.1, "30 deg"]
+home = {xyz = [0, 0, 0], rpy = [0, 0, 0]}   # in the base; default the identity
+inertia = [XX, XY, XZ, YY, YZ, ZZ, MX, MY, MZ, M]   # about its frame, optional
+
+[[leg]]                          # one table per leg
+name = "leg1"                    # default leg1 leg2 ...
+base = {xyz = [0.4, 0.1, 0], rpy = [0, 0, 0]}       # where its first row stands in the base; default the identity
+attachment = {xyz = [0, 0.11, 0]}                   # where the platform holds its end, in the platform's frame
+end = "rigid"                    # the last row's link is the platform; or "spherical": a ball joint behind it
+actuated = ["motor1"]            # names of its joints with a motor and an encoder
+home = ["130 deg", "-90 deg", 0] # joint values that close its loop at home; Newton's start, so a degree is enough
+tail = {xyz = [0, 0, 0.1]}       # what follows its last row, optional
+
+[[leg.joint]]                    # its rows: keys of an MDH table (calib.robot.mdh), limits and inertia included
+name = "motor1"
+d = 0.28
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 
-from calib.errors import refuse_robot
-from calib.records import Frozen
+from calib import files
+from calib.config_types import shown
+from calib.errors import refuse_robot, suggestion
+from calib.records import Frozen, frozen
+from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain, Joint
+from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, spelled, vector, word
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 FORCES = ("N", "N", "N", "N m", "N m", "N m")
@@ -73,6 +98,13 @@ class Leg(Frozen):
 @dataclass(frozen=True, eq=False)
 class ParallelRobot(Frozen):
     """A parallel robot: its legs and platform.
+
+        closure of leg k:   tip_k(q_k) = P · attachment_k    (six equations where the leg is rigid with the platform,
+                                                              three where a spherical joint ends it)
+
+    Nothing is planar or symmetric by construction: a planar robot is one whose loops leave x, y and rz. The virtual
+    tree of the papers (Khalil & Ibrahim 2007; Briot, Gautier & Krut 2013) is all legs side by side, and the free
+    platform.
 
     Attributes:
         name: of the robot.
@@ -170,6 +202,12 @@ class ParallelRobot(Frozen):
         )
 
     @property
+    def passive(self) -> tuple[str, ...]:
+        """Names of the joints without a motor."""
+        names = [joint.name for leg in self.legs for joint in leg.chain.joints]
+        return tuple(name for name in names if name not in self.joint_names)
+
+    @property
     def platform_label(self) -> str:
         """Label of the platform's parameters: the number after the legs' last joints."""
         return str(max(leg.chain.n for leg in self.legs) + 1)
@@ -177,3 +215,149 @@ class ParallelRobot(Frozen):
     def with_legs(self, legs: tuple[Leg, ...]) -> ParallelRobot:
         """Return the robot with other legs: another geometry."""
         return replace(self, legs=legs)
+
+
+KIND = "parallel"
+TOP = ("kind", "name", "gravity", "source", "platform", "leg", "provenance")
+_PLATFORM = ("freedom", "lower", "upper", "home", "inertia")
+_LEG = ("name", "base", "attachment", "end", "actuated", "home", "tail", "joint")
+
+
+def library() -> dict[str, Path]:
+    """Return the files of the shipped parallel robots, by name."""
+    return {path.stem: path for path in sorted(Path(__file__).with_name("library").glob("*.toml"))}
+
+
+def is_parallel(path: str | Path) -> bool:
+    """Return whether a TOML file contains ``kind = "parallel"`` or ``[[leg]]`` tables."""
+    table = load(path)
+    return table.get("kind") == KIND or "leg" in table
+
+
+def read(path: str | Path) -> ParallelRobot:
+    """Return the parallel robot of a TOML file (schema above), without solving its loops (`closure.closed`).
+
+    Raises:
+        RobotError: naming the table, the key and what is wrong with it.
+    """
+    return _from_table(load(path), str(path))
+
+
+def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
+    """Return the robot of a parsed table; `where` names it in messages."""
+    check_keys(table, TOP, where)
+    if table.get("kind") != KIND:
+        refuse_robot(
+            where, f'kind is {shown(table.get("kind"))}; for a robot with legs and a platform state kind = "parallel"'
+        )
+    gravity = vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity")
+    own, place = table.get("platform"), f"{where}, [platform]"
+    if not isinstance(own, Mapping):
+        refuse_robot(where, "no [platform] table found")
+    check_keys(own, _PLATFORM, place)
+    freedom = _words(own.get("freedom"), f"{place}, freedom")
+    legs = table.get("leg")
+    if not isinstance(legs, list) or not legs or not all(isinstance(leg, Mapping) for leg in legs):
+        refuse_robot(where, "no [[leg]] tables found; a parallel robot needs one per leg")
+    return ParallelRobot(
+        name=word(table, "name", where),
+        legs=tuple(_leg(leg, k, gravity, where) for k, leg in enumerate(legs)),
+        freedom=freedom,
+        home=placement(own.get("home", {}), f"{place}, home"),
+        lower=_box(own, "lower", freedom, place),
+        upper=_box(own, "upper", freedom, place),
+        platform=frozen(vector(own["inertia"], 10, f"{place}, inertia")) if "inertia" in own else None,
+        gravity=gravity,
+    )
+
+
+def write(
+    path: str | Path, robot: ParallelRobot, source: str = "", provenance: Mapping[str, Any] | None = None
+) -> Path:
+    """Write a parallel robot as a TOML file that `read` reproduces to the last bit."""
+    return files.write(path, dumps(to_table(robot, source) | ({"provenance": provenance} if provenance else {})))
+
+
+def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
+    """Return the table (schema above) that `_from_table` reads back exactly."""
+    table: dict[str, Any] = {"kind": KIND, "name": robot.name, "gravity": robot.gravity.tolist()}
+    if source:
+        table["source"] = source
+    table["platform"] = {
+        "freedom": list(robot.freedom),
+        "lower": robot.lower.tolist(),
+        "upper": robot.upper.tolist(),
+        "home": placement_table(robot.home),
+    }
+    if robot.platform is not None:
+        table["platform"]["inertia"] = robot.platform.tolist()
+    table["leg"] = [_leg_table(leg) for leg in robot.legs]
+    return table
+
+
+def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str) -> Leg:
+    place = f"{where}, [[leg]] number {number_ + 1}"
+    check_keys(entry, _LEG, place)
+    name = word(entry, "name", place, f"leg{number_ + 1}")
+    place = f"{place} ('{name}')"
+    rows = {"name": name, "joint": entry.get("joint"), "gravity": gravity.tolist(), "propose_beta": False}
+    if "tail" in entry:
+        rows["tail"] = entry["tail"]
+    chain = _based(mdh.from_table(rows, place), placement(entry.get("base", {}), f"{place}, base"))
+    home = entry.get("home", [0.0] * chain.n)
+    if not isinstance(home, list) or len(home) != chain.n:
+        refuse_robot(place, f"home needs one value per joint, {chain.n}; found {shown(home)}")
+    kinds = ["angle" if joint.kind == "revolute" else "length" for joint in chain.joints]
+    return Leg(
+        name,
+        chain,
+        _actuated(entry, chain, place),
+        np.array([number(value, f"{place}, home", kind) for value, kind in zip(home, kinds)]),
+        placement(entry.get("attachment", {}), f"{place}, attachment"),
+        word(entry, "end", place, "rigid"),
+    )
+
+
+def _based(chain: Chain, base: np.ndarray) -> Chain:
+    """Return the chain with a placement before its first element."""
+    first = replace(chain.elements[0], placement=None if np.array_equal(base, np.eye(4)) else base)
+    return replace(chain, elements=(first, *chain.elements[1:]))
+
+
+def _actuated(entry: Mapping[str, Any], chain: Chain, place: str) -> tuple[int, ...]:
+    named = _words(entry.get("actuated", []), f"{place}, actuated")
+    for one in named:
+        if one not in chain.joint_names:
+            near = suggestion(one, chain.joint_names)
+            refuse_robot(place, f"actuated '{one}' is not one of its joints{near}: {', '.join(chain.joint_names)}")
+    return tuple(sorted(chain.joint_names.index(one) for one in dict.fromkeys(named)))
+
+
+def _words(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        refuse_robot(where, f"expected a list of names, found {shown(value)}")
+    return tuple(value)
+
+
+def _box(table: Mapping[str, Any], key: str, freedom: tuple[str, ...], place: str) -> np.ndarray:
+    """Return one bound per coordinate of the platform."""
+    values = table.get(key)
+    if not isinstance(values, list) or len(values) != len(freedom):
+        refuse_robot(place, f"{key} needs a value per coordinate of freedom, {len(freedom)}; found {shown(values)}")
+    kinds = ["angle" if name in COORDINATES[3:] else "length" for name in freedom]
+    return np.array([number(value, f"{place}, {key}", kind) for value, kind in zip(values, kinds)])
+
+
+def _leg_table(leg: Leg) -> dict[str, Any]:
+    base = leg.chain.elements[0].placement
+    own = mdh.to_table(_based(leg.chain, np.eye(4)))
+    table: dict[str, Any] = {"name": leg.name}
+    if base is not None:
+        table["base"] = placement_table(base)
+    table |= {"attachment": placement_table(leg.attachment), "end": leg.end}
+    table["actuated"] = [leg.chain.joint_names[j] for j in leg.actuated]
+    table["home"] = [spelled(float(value)) for value in leg.home]
+    if "tail" in own:
+        table["tail"] = own["tail"]
+    table["joint"] = own["joint"]
+    return table

@@ -5,13 +5,12 @@ q̈_k = J_k⁺ (G_k ṫ + g_k)        g_k: acceleration of the attachment at ṫ
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.records import shaped
-from calib.rooms.parallel.mechanism.closure import ClosedRobot, twists
-from calib.rooms.parallel.mechanism.leg_links import LegLinks, Posture, leg_links
+from calib.rooms.parallel.mechanism.closure import ClosedRobot, LegLinks, Posture, leg_links, times, twists
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +68,14 @@ def of_platform(
         rate, change: (N, r) independent parts of its twist, and their derivatives.
         jacobians: of the postures, where they are known already.
     """
-    found = loop_jacobians(known, posture) if jacobians is None else jacobians
-    v = np.einsum("ntr,nr->nt", found.joints, rate)
-    twist = np.einsum("nkr,nr->nk", found.platform, rate)
+    found = jacobians or loop_jacobians(known, posture)
+    v, twist = times(found.joints, rate), times(found.platform, rate)
     shifts, starts = [], known.robot.starts
     for one, a, b in zip(found.links, starts, starts[1:]):
         shifts.append(_end_bias(one, v[:, a:b]) - _attachment_bias(one, twist))
     _, still = twists(known, found.links, shifts)
-    turning = still + np.einsum("nkr,nr->nk", found.platform, change)
-    accelerations = [
-        (one.inverse @ (one.carried @ turning[:, :, None] - shift[:, :, None]))[:, :, 0]
-        for one, shift in zip(found.links, shifts)
-    ]
+    turning = still + times(found.platform, change)
+    accelerations = [times(one.inverse, times(one.carried, turning) - shift) for one, shift in zip(found.links, shifts)]
     return LoopMotion(posture, found, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
 
 
@@ -92,22 +87,17 @@ def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarr
     """
     found = loop_jacobians(known, posture)
     back = np.linalg.pinv(found.readings) if known.robot.redundant else np.linalg.inv(found.readings)
-    rate = (back @ v[:, :, None])[:, :, 0]
+    rate = times(back, v)
     still = of_platform(known, posture, rate, np.zeros_like(rate), found)
-    change = (back @ (a - still.a[:, known.robot.actuated])[:, :, None])[:, :, 0]
-    return LoopMotion(
-        posture, found, still.v, still.a + np.einsum("ntr,nr->nt", found.joints, change), still.twist,
-        still.change + np.einsum("nkr,nr->nk", found.platform, change), rate,
-    )  # fmt: skip
+    change = times(back, a - still.a[:, known.robot.actuated])
+    return replace(still, a=still.a + times(found.joints, change), change=still.change + times(found.platform, change))
 
 
 def _attachment_bias(one: LegLinks, twist: np.ndarray) -> np.ndarray:
     """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); no angular part."""
     result = np.zeros(one.gap.shape)
     turn = twist[:, 3:]
-    result[:, :3] = (
-        turn * np.einsum("ni,ni->n", turn, one.lever)[:, None] - one.lever * np.sum(turn**2, axis=1)[:, None]
-    )
+    result[:, :3] = cross(turn, cross(turn, one.lever))
     return result
 
 
