@@ -50,9 +50,9 @@ from trajectories.errors import NothingFeasible
 from trajectories.places import Clearance, Workspace
 from trajectories.setpoints import Setpoints
 
-MAX_SPEED = 100.0  # [rad/s or m/s] a number above that is no limit of a robot's joint (our choice)
-MAX_ACCELERATION = 3000.0  # [rad/s² or m/s²] direct drives of fast parallel robots reach 1300 (our choice)
-MAX_TORQUE = 1e5  # [N m or N] (our choice)
+# [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
+MAX = {"velocity": 100.0, "acceleration": 3000.0, "torque": 1e5, "effort": 1e5}
+EXAMPLES = {"velocity": '[velocity] all = "90 deg/s"', "acceleration": "[acceleration] all = 5.0"}
 MAX_EXCESS = 0.01  # of a limit, by which a written sample may be beyond it: rounding to whole samples
 DEFAULT_RISE = 2.0  # [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
 DEFAULT_ORIGIN = f"default, {DEFAULT_RISE:g}/s times the speed limit, since none is stated"
@@ -83,12 +83,9 @@ class MotionBounds:
     place: str = f"{PLACE}, such as {{}}"
 
     def __post_init__(self) -> None:
-        for what, kinds, advice in (
-            ("speed", {"velocity": MAX_SPEED}, '[velocity] all = "90 deg/s"'),
-            ("acceleration", {"acceleration": MAX_ACCELERATION, "effort": MAX_TORQUE}, "[acceleration] all = 5.0"),
-        ):
-            sizes = {"effort": self.torque, "velocity": self.velocity, "acceleration": self.acceleration}
-            free = np.all([sizes[kind] > most for kind, most in kinds.items()], axis=0)
+        sizes = {"effort": self.torque, "velocity": self.velocity, "acceleration": self.acceleration}
+        for what, kinds in (("velocity", ("velocity",)), ("acceleration", ("acceleration", "effort"))):
+            free = np.all([sizes[kind] > MAX[kind] for kind in kinds], axis=0)
             if not free.any():
                 continue
             names = self._named(joint for joint, one in zip(self.joints, free) if one)
@@ -96,10 +93,11 @@ class MotionBounds:
             written += [f"{kind} {x:g}" for kind in kinds for x in sizes[kind][free] if np.isfinite(x)]
             wrong = [words for words in dict.fromkeys(written) if words.split()[0] in kinds]
             found = f" ({', '.join(wrong)} is no limit)" if wrong else ""
-            other = "" if what == "speed" else "; efforts count where masses are known or a model is named (--model)"
+            speed = what == "velocity"
+            other = "" if speed else "; efforts count where masses are known or a model is named (--model)"
             raise UsageError(
-                f"{self.robot}: no limit for the {what} of {names}{found}; without it no motion is written; state "
-                f"it {self.place.format(advice)}{other}"
+                f"{self.robot}: no limit for the {'speed' if speed else what} of {names}{found}; without it no motion "
+                f"is written; state it {self.place.format(EXAMPLES[what])}{other}"
             )
 
     def _named(self, joints: Iterable[Joint]) -> str:
@@ -109,12 +107,10 @@ class MotionBounds:
     def lines(self) -> list[str]:
         """Return the limits of the motion as text, a line per kind, for the heads of files."""
         result = []
-        for order, (kind, most) in enumerate(
-            (("velocity", MAX_SPEED), ("acceleration", MAX_ACCELERATION), ("torque", MAX_TORQUE)), 1
-        ):
+        for order, kind in enumerate(("velocity", "acceleration", "torque"), 1):
             by_size: dict[str, list[Joint]] = {}
             for joint, size in zip(self.joints, getattr(self, kind)):
-                words = f"{size:.4g} {motion_units([joint.kind])[order]}" if size <= most else "none"
+                words = f"{size:.4g} {motion_units([joint.kind])[order]}" if size <= MAX[kind] else "none"
                 by_size.setdefault(words, []).append(joint)
             sizes = "; ".join(f"{words} {self._named(joints)}" for words, joints in by_size.items())
             result.append(f"{kind} limits: " + ("none" if [*by_size] == ["none"] else f"{sizes} ({self.origin[kind]})"))
@@ -128,16 +124,13 @@ class MotionBounds:
         Raises:
             UsageError: naming the joint.
         """
-        for kind, values, most, example in (
-            ("velocity", track.v, MAX_SPEED, '[velocity] all = "90 deg/s"'),
-            ("acceleration", track.a, MAX_ACCELERATION, "[acceleration] all = 5.0"),
-        ):
-            peak, limit = np.abs(values).max(axis=0), np.minimum(getattr(self, kind), most)
+        for kind, values in (("velocity", track.v), ("acceleration", track.a)):
+            peak, limit = np.abs(values).max(axis=0), np.minimum(getattr(self, kind), MAX[kind])
             j = int(np.argmax(peak / limit))
             if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
                 raise UsageError(
                     f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, above "
-                    f"{limit[j]:.4g}; it is not written; state a limit {self.place.format(example)}"
+                    f"{limit[j]:.4g}; it is not written; state a limit {self.place.format(EXAMPLES[kind])}"
                 )
 
 
@@ -323,7 +316,7 @@ def _bounds(
     tables = {"velocity": stated.velocity, "torque": stated.torque}
     origin = {kind: f"robot description, {path}" if table else "robot description" for kind, table in tables.items()}
     origin["acceleration"] = path
-    free = (acceleration > MAX_ACCELERATION) & (torque > MAX_TORQUE)
+    free = (acceleration > MAX["acceleration"]) & (torque > MAX["torque"])
     if default and free.any():
         origin["acceleration"] = DEFAULT_ORIGIN if np.isinf(acceleration).all() else f"{path}, or {DEFAULT_ORIGIN}"
         acceleration = np.where(free, DEFAULT_RISE * velocity, acceleration)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,21 +53,20 @@ class _ActuatorLimit(TwoSided):
     Attributes:
         plan: takes platform coordinates to the robot's motion.
         of: the motion of N samples -> (N, n), what is limited.
-        rows: names of the n actuators.
-        limits: (n,), finite.
+        limits: (n,), finite; rows: names of the n actuators.
         name, unit: of the limit.
     """
 
     plan: PlatformRegressor
     of: Callable[[LoopMotion], np.ndarray]
-    rows: tuple[str, ...]
     limits: np.ndarray
+    rows: tuple[str, ...] = ()
     name: str = "torque"
     unit: str = "N m"
+    joints: np.ndarray = field(init=False)
 
-    @property
-    def joints(self) -> np.ndarray:
-        return np.arange(len(self.limits))
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joints", np.arange(len(self.limits)))
 
     @property
     def scale(self) -> np.ndarray:
@@ -228,8 +227,8 @@ def design_parallel(
     if acceleration is not None:
         constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
     constraints += [
-        _ActuatorLimit(plan, plan.torques, own.joint_names, (1.0 - GUARD) * bounds.torque),
-        _ActuatorLimit(plan, plan.speeds, own.joint_names, bounds.velocity, "velocity", "rad/s"),
+        _ActuatorLimit(plan, plan.torques, (1.0 - GUARD) * bounds.torque, own.joint_names),
+        _ActuatorLimit(plan, plan.speeds, bounds.velocity, own.joint_names, "velocity", "rad/s"),
     ]
     joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in own.freedom)
     platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)  # like an arm's

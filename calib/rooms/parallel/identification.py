@@ -171,12 +171,13 @@ def _of_arms(method: Method) -> bool:
 def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
     """Yield findings on redundant encoders that contradict each other, and on unused columns."""
     robot = known.robot
+    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
         q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
         apart = float(np.sqrt(np.mean((q - known.locate(q).q[:, robot.actuated]) ** 2))) if robot.redundant else 0.0
         yield finding("encoders-contradict", file=case.name, count=robot.n, rms=apart)
         unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
-        if named := [name for name in robot.passive if name in unread]:
+        if named := [name for name in passive if name in unread]:
             yield finding("passive-joints-unread", file=case.name, joints=named)
 
 

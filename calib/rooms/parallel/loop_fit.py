@@ -257,9 +257,10 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
         MeasurementError: naming the column that is missing, and which there are; or one that is not known.
     """
     table = read_table(path)
+    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     readings = [table.numbers(joint.name, "angle" if joint.kind == "revolute" else "length") for joint in robot.joints]
     for name in table.header:
-        if name in robot.passive:
+        if name in passive:
             table.fail("is of a passive joint: its encoder cannot be used; remove the column", name)
         if name in COORDINATES and name not in robot.freedom:
             table.fail(f"is not a platform coordinate ({', '.join(robot.freedom)}); remove the column", name)

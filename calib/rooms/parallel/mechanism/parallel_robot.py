@@ -28,7 +28,7 @@ d = 0.28
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -202,12 +202,6 @@ class ParallelRobot(Frozen):
         )
 
     @property
-    def passive(self) -> tuple[str, ...]:
-        """Names of the joints without a motor."""
-        names = [joint.name for leg in self.legs for joint in leg.chain.joints]
-        return tuple(name for name in names if name not in self.joint_names)
-
-    @property
     def platform_label(self) -> str:
         """Label of the platform's parameters: the number after the legs' last joints."""
         return str(max(leg.chain.n for leg in self.legs) + 1)
@@ -256,6 +250,7 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
         refuse_robot(where, "no [platform] table found")
     check_keys(own, _PLATFORM, place)
     freedom = _words(own.get("freedom"), f"{place}, freedom")
+    turns = [name in COORDINATES[3:] for name in freedom]
     legs = table.get("leg")
     if not isinstance(legs, list) or not legs or not all(isinstance(leg, Mapping) for leg in legs):
         refuse_robot(where, "no [[leg]] tables found; a parallel robot needs one per leg")
@@ -264,8 +259,8 @@ def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
         legs=tuple(_leg(leg, k, gravity, where) for k, leg in enumerate(legs)),
         freedom=freedom,
         home=placement(own.get("home", {}), f"{place}, home"),
-        lower=_box(own, "lower", freedom, place),
-        upper=_box(own, "upper", freedom, place),
+        lower=_values(own.get("lower"), turns, f"{place}, lower", "coordinate of freedom"),
+        upper=_values(own.get("upper"), turns, f"{place}, upper", "coordinate of freedom"),
         platform=frozen(vector(own["inertia"], 10, f"{place}, inertia")) if "inertia" in own else None,
         gravity=gravity,
     )
@@ -304,15 +299,12 @@ def _leg(entry: Mapping[str, Any], number_: int, gravity: np.ndarray, where: str
     if "tail" in entry:
         rows["tail"] = entry["tail"]
     chain = _based(mdh.from_table(rows, place), placement(entry.get("base", {}), f"{place}, base"))
-    home = entry.get("home", [0.0] * chain.n)
-    if not isinstance(home, list) or len(home) != chain.n:
-        refuse_robot(place, f"home needs one value per joint, {chain.n}; found {shown(home)}")
-    kinds = ["angle" if joint.kind == "revolute" else "length" for joint in chain.joints]
+    turns = [joint.kind == "revolute" for joint in chain.joints]
     return Leg(
         name,
         chain,
         _actuated(entry, chain, place),
-        np.array([number(value, f"{place}, home", kind) for value, kind in zip(home, kinds)]),
+        _values(entry.get("home", [0.0] * chain.n), turns, f"{place}, home", "joint"),
         placement(entry.get("attachment", {}), f"{place}, attachment"),
         word(entry, "end", place, "rigid"),
     )
@@ -339,13 +331,11 @@ def _words(value: Any, where: str) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _box(table: Mapping[str, Any], key: str, freedom: tuple[str, ...], place: str) -> np.ndarray:
-    """Return one bound per coordinate of the platform."""
-    values = table.get(key)
-    if not isinstance(values, list) or len(values) != len(freedom):
-        refuse_robot(place, f"{key} needs a value per coordinate of freedom, {len(freedom)}; found {shown(values)}")
-    kinds = ["angle" if name in COORDINATES[3:] else "length" for name in freedom]
-    return np.array([number(value, f"{place}, {key}", kind) for value, kind in zip(values, kinds)])
+def _values(values: Any, turns: Sequence[bool], place: str, each: str) -> np.ndarray:
+    """Return a list of values [rad where `turns`, else m], one per `each`."""
+    if not isinstance(values, list) or len(values) != len(turns):
+        refuse_robot(place, f"expected one value per {each}, {len(turns)}; found {shown(values)}")
+    return np.array([number(value, place, "angle" if turn else "length") for value, turn in zip(values, turns)])
 
 
 def _leg_table(leg: Leg) -> dict[str, Any]:
