@@ -126,8 +126,12 @@ class ParallelModel:
     def inertial(self) -> int:
         return 10 * len(self.labels)
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
+        return self._names
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
         bodies = (name + label for label in self.labels for name in STANDARD)
         return (*bodies, *(one.name for one in self.terms))
 
