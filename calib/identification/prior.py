@@ -42,7 +42,6 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel
-from calib.estimation.constrained import within
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
@@ -359,18 +358,6 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
             for mass, end, moves in zip(masses, ends, moving)
         ]
     )
-
-
-def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return argmin ‖R x - z‖² (p,) under A x >= 0: positive motor inertia and dissipative friction.
-
-    Args:
-        factor: (p + 1, p + 1) triangle of data and prior, whitened.
-        rows: A (c, p); one of a single entry is kept exactly.
-    """
-    found = within(factor, rows, np.zeros(len(rows)), np.full(len(rows), np.inf)).values
-    alone = rows[np.count_nonzero(rows, axis=1) == 1]
-    return np.where((alone != 0.0).any(axis=0), np.maximum(found, 0.0), found)
 
 
 STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)

@@ -15,9 +15,9 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
+from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop import LoopSettings, check_loop, per_joint
-from calib.identification.methods.parameter_constraints import ConstraintSettings
 from calib.identification.methods.registry import METHODS
 from calib.robot.chain import Chain
 

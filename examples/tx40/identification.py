@@ -38,9 +38,10 @@ from calib.estimation.essential import Rule, eliminate
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
+from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.loop import Controller
-from calib.identification.methods.parameter_constraints import ConstraintSettings, hold, make_constraints
 from calib.identification.rows import Case, make_case, observe
+from calib.rooms.alternatives.parameter_constraints import hold, make_constraints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier, trapezoidal
 from calib.rooms.closed_loop.controllers import Reference, identify_controller, pd

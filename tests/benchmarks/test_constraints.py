@@ -12,8 +12,9 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.identification.methods.parameter_constraints import ConstraintSettings, make_constraints
+from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.rows import make_case
+from calib.rooms.alternatives.parameter_constraints import make_constraints
 from calib.rooms.cells import known_robots
 from calib.rooms.cells.known_robots import random_fourier
 from calib.rooms.closed_loop.instrumental import identify_instrumental

@@ -13,9 +13,10 @@ from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import JointRange
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
-from calib.identification.methods.parameter_constraints import ConstraintSettings, make_constraints
+from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.rows import make_case
 from calib.robot import mdh
+from calib.rooms.alternatives.parameter_constraints import make_constraints
 from calib.rooms.cells import known_robots
 from calib.rooms.closed_loop import controllers, instrumental, instrumental_variables
 from calib.rooms.closed_loop.controllers import identify_controller
@@ -158,7 +159,7 @@ def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_ot
     held = found(case, v0=np.inf, constraints=make_constraints(bounds, model, base, base.names, [None] * base.b))
     assert held.fit.estimate.values[place] == pytest.approx(limit, rel=1e-6)
     assert held.fit.estimate.sigma[place] < 1e-9 * plain.fit.estimate.sigma[place]
-    assert held.constrained is not None and held.constrained.findings()[0].code == "on-its-bound"
+    assert held.constrained is not None and held.constrained.findings[0].code == "on-its-bound"
 
 
 @pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])

@@ -12,7 +12,10 @@ from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
-from calib.identification.rows import Case, make_case
+from calib.identification.identify import chain_states, common_decimator, find_base
+from calib.identification.methods.method import IdentificationProblem
+from calib.identification.rows import Case, make_case, observe
+from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot import description
 from calib.robot.chain import Chain, Element, Joint
 
@@ -119,3 +122,14 @@ def write(folder: Path, name: str, seed: int, **how) -> Path:
 def robot(tmp_path: Path) -> Path:
     """Return the planted arm's robot.toml."""
     return description.write(tmp_path / "planted.toml", arm())
+
+
+@pytest.fixture(scope="module")
+def problem() -> IdentificationProblem:
+    """Return a problem of identification of the planted arm."""
+    settings, cases = IdentificationSettings(), [case("a", 0)]
+    model, decimator = make_model(arm(), settings), common_decimator(cases, settings)
+    base = find_base(model, cases, chain_states(arm(), model))
+    rows = tuple(observe(model, base.kept, case, decimator) for case in cases)
+    terms = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
+    return IdentificationProblem(model, base, cases, decimator, rows, tuple(terms), np.full(base.b, -1))

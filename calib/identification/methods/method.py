@@ -21,8 +21,8 @@ from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, empty, retriangulate
+from calib.identification.constraint_settings import ConstraintSettings, Held
 from calib.identification.loop import LoopSettings
-from calib.identification.methods.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.prior import Prior
 from calib.identification.rows import Case, ObservationRows, pool, triangulate
 from calib.records import frozen
@@ -88,17 +88,6 @@ class IdentificationProblem:
         """Triangles of all rows, one group per torque row."""
         return pool(triangulate(self.rows), self.rows[0].target.shape[1])
 
-    @cached_property
-    def constrained(self) -> Constraints:
-        """Constraints on the columns.
-
-        Raises:
-            UsageError: see `make_constraints`.
-        """
-        settings = self.constraints or ConstraintSettings()
-        names = (*self.base.names, *self.rows[0].names[self.base.b :])
-        return make_constraints(settings, self.model, self.base, names, self.terms)
-
     @property
     def nonnegative(self) -> np.ndarray:
         """Columns that must not be negative (p,) bool: inertia and friction of drives."""
@@ -127,7 +116,7 @@ class MethodEstimate:
         simulations: number of closed-loop simulations.
         seconds: computing time.
         failure: reason for a missing solution, and advice.
-        held: the constrained estimate, for a method with constraints.
+        held: the constraints and which of them bind, for a method with constraints.
         alone: whether only values and covariance describe it, because least squares of `pooled` differs.
     """
 

@@ -4,12 +4,10 @@ from collections.abc import Mapping
 
 from calib.errors import UsageError, one_of
 from calib.extensions import offered
-from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OLS, PC_WLS, TLS, WLS
+from calib.identification.methods.least_squares import OLS, WLS
 from calib.identification.methods.method import Method
 
-METHODS: Mapping[str, Method] = {
-    one.name: one for group in ((OLS, WLS, IRLS, TLS, PC_OLS, PC_WLS, PC_IRLS), *offered("methods")) for one in group
-}
+METHODS: Mapping[str, Method] = {one.name: one for group in ((OLS, WLS), *offered("methods")) for one in group}
 VERSIONS: Mapping[str, int] = {one.name: one.version for one in METHODS.values()}
 
 

@@ -22,7 +22,7 @@ import scipy.linalg
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.estimation.constrained import minimise
+from calib.estimation.cone_program import minimise
 from calib.estimation.triangles import retriangulate
 from calib.identification.possible.information import Information
 from calib.identification.prior import DRIVES, PAYLOAD, RADIUS, ROTOR, rods

@@ -154,8 +154,9 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     geometry_tables.write(outcome, folder)
     if found.loop.table:
         files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, found.loop.table)
-    held = found.fitted.held is not None and found.fitted.held.solution.binding.any()
-    if found.prior is not None or held:  # else estimate and covariance say it all
+    held = found.fitted.held
+    binding = held is not None and (held.binding or held.postures)
+    if found.prior is not None or binding:  # else estimate and covariance say it all
         information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
     expected = outcome.intervals.get(first.name)

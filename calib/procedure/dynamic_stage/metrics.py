@@ -15,12 +15,12 @@ import numpy as np
 from calib.data.signals.motion import Motion
 from calib.errors import Finding
 from calib.estimation.essential import EliminationStep
+from calib.identification.constraint_settings import Binding
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.loop import LoopMetrics, Replay
-from calib.identification.methods.parameter_constraints import Binding
 from calib.identification.methods.registry import METHODS
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
@@ -175,7 +175,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         switched_off=found.friction.off,
         drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
         loop=found.loop.metrics,
-        constraints=held and ConstraintMetrics(held.constraints.names, held.binding, held.postures),
+        constraints=held and ConstraintMetrics(held.names, held.binding, held.postures),
         filters={case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)},
         geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
         repeated=outcome.repeated,

@@ -192,7 +192,7 @@ def parameter_findings(found: Identification[Any]) -> tuple[Finding, ...]:
     rests = resting_parameters(found)
     prior = finding("regularised", count=len(rests.names), parameters=rests.of, source=rests.origin, names=rests.names)
     condition = settle([finding("motion-condition", condition=found.condition[1])])
-    held = found.fitted.held.findings() if found.fitted.held is not None else []
+    held = found.fitted.held.findings if found.fitted.held is not None else ()
     return *condition, *held, *_negative(found), *([prior] if rests.names else [])
 
 

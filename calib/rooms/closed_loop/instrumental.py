@@ -9,7 +9,7 @@ x_{k+1} = W_s⁺ y. A Coulomb sign whose measured speed is noisier than the widt
 noise: no instrument helps there, and the simulated sign, which rests on the reference, takes its place in W; or that of
 the measured speed in half the band where the simulation does not follow the motion, as with a wrong controller (our
 choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
-(`calib.identification.methods.parameter_constraints`); they do not cure a bias.
+(`calib.rooms.alternatives.parameter_constraints`); they do not cure a bias.
 """
 
 from __future__ import annotations
@@ -28,16 +28,11 @@ from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, Usa
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
+from calib.identification.constraint_settings import ConstraintSettings, Held
 from calib.identification.loop import ExogeneityTest
-from calib.identification.methods.parameter_constraints import (
-    Constraints,
-    ConstraintSettings,
-    Held,
-    hold,
-    make_constraints,
-)
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate
 from calib.records import frozen
+from calib.rooms.alternatives.parameter_constraints import Constraints, hold, make_constraints
 from calib.rooms.closed_loop import instrumental_variables
 from calib.rooms.closed_loop.instrumental_variables import Instruments, InstrumentStrength
 from calib.rooms.closed_loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples

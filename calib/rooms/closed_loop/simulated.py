@@ -11,8 +11,10 @@ from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
 from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
-from calib.identification.methods.least_squares import CONSISTENT, CONSTRAINED, WLS
+from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
+from calib.rooms.alternatives.estimators import CONSISTENT, CONSTRAINED
+from calib.rooms.alternatives.parameter_constraints import constraints_of
 from calib.rooms.closed_loop.instrumental import Instrumental, identify_instrumental
 from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops
 
@@ -88,7 +90,7 @@ class _Simulated(Method):
             found = identify_instrumental(
                 model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
                 inertia=inertia, positive=loop.positive, terms=terms,
-                constraints=problem.constrained if self.takes_constraints else None,
+                constraints=constraints_of(problem) if self.takes_constraints else None,
             )  # fmt: skip
             result = replace(
                 plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),

@@ -25,9 +25,9 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.geometry import fit as geometry
 from calib.geometry.first_guess import install
+from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.loop import Controller, LoopSettings
 from calib.identification.methods.method import IdentificationProblem
-from calib.identification.methods.parameter_constraints import ConstraintSettings
 from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load

@@ -26,10 +26,11 @@ from calib.dynamics.idim import IdentificationModel
 from calib.errors import Diverged, NotConverged
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.triangles import condition_numbers
-from calib.estimation.whiteness import scatter
-from calib.identification.methods.least_squares import samples_of, weighed
+from calib.identification.methods.least_squares import weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.prior import residual_inflation
+from calib.rooms.alternatives.estimators import samples_of
+from calib.rooms.studies.methods.score_covariance import scatter
 from calib.rooms.studies.methods.simulated_robot import serial_arm, with_friction
 
 BLOCK = 1000  # samples at a time

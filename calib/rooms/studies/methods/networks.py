@@ -11,10 +11,11 @@ import numpy as np
 
 from calib.errors import NotConverged
 from calib.estimation.linear import LinearFit, wls
-from calib.estimation.samples import Samples
 from calib.estimation.triangles import Triangles, combine, solve_triangle
-from calib.identification.methods.least_squares import samples_of, weighed
+from calib.identification.methods.least_squares import weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
+from calib.rooms.alternatives.estimators import samples_of
+from calib.rooms.alternatives.samples import Samples
 
 EPOCHS = 60  # at most
 

@@ -7,7 +7,7 @@ q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, section
 Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
 ∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`)
 where differences take one simulation per parameter. What is left is what noise did in the loop, correlated over time;
-the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`calib.estimation.whiteness`).
+the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`score_covariance`).
 
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
 """
@@ -22,13 +22,13 @@ from calib.errors import CalibError, NotConverged, UsageError
 from calib.estimation import nonlinear
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
-from calib.estimation.whiteness import scatter
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.rows import thinned
 from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops, low_passed, simulated_samples
 from calib.rooms.closed_loop.simulated import attempted_in_loop
 from calib.rooms.closed_loop.simulation import Sensing, simulate
+from calib.rooms.studies.methods.score_covariance import scatter
 from calib.rooms.studies.methods.simulated_robot import (
     BelievedRobot,
     believed_robot,

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError, NotConverged, Unidentifiable
-from calib.estimation.constrained import Definite, contradicting, from_free, restricted, within
+from calib.estimation.cone_program import from_free
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect, combine
+from calib.rooms.alternatives.constrained import Definite, contradicting, restricted, within
 from calib.rooms.closed_loop.instrumental_variables import instrument, projected
 
 

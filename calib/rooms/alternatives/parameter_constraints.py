@@ -4,85 +4,32 @@ A row is lower <= aᵀ β <= upper over the columns that are estimated. A standa
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
 over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `MIN_EIGENVALUE`, S making the mean diagonal one.
-Bodies that can exist are a cone (`calib.identification.methods.body_cone`), which M(q) > 0 follows from.
+Bodies that can exist are a cone (`calib.rooms.alternatives.body_cone`), which M(q) > 0 follows from.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.config import strict
-from calib.config_types import Checked, Expect, Flag, Real, Text, Whole
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, NotConverged, UsageError, finding, refuse_option, require, suggestion
-from calib.estimation.constrained import Constrained, Definite, contradicting, restricted, within
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
-from calib.identification.methods.body_cone import BodyCone, cone_of
-from calib.records import Frozen, Number, frozen
+from calib.identification.constraint_settings import Binding, ConstraintSettings, Held
+from calib.identification.methods.method import IdentificationProblem
+from calib.records import Frozen, frozen
+from calib.rooms.alternatives.body_cone import BodyCone, cone_of
+from calib.rooms.alternatives.constrained import Constrained, Definite, contradicting, restricted, within
 
-POSTURES = 50  # at which M(q) must be positive definite (our choice)
 MIN_EIGENVALUE = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
 RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4  # factor and limit of it where an estimate cannot be simulated (our choice)
-
-
-def _in_order(value: Any) -> Any:
-    match value:
-        case [int() | float() as low, int() | float() as high] if low > high:
-            raise ValueError(f"the lower bound {low:g} is above the upper {high:g}")
-    return value
-
-
-@strict
-@dataclass(frozen=True)
-class WeightedSum:
-    """A constraint on a weighted sum of parameters: `equal`, or at least `least` and at most `most`."""
-
-    weights: Mapping[str, float]
-    least: float | None = None
-    most: float | None = None
-    equal: float | None = None
-    name: Text = ""
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Lower and upper bound of the sum; infinite if not stated."""
-        low, high = (self.least, self.most) if self.equal is None else (self.equal, self.equal)
-        return -np.inf if low is None else low, np.inf if high is None else high
-
-
-Bounds = Annotated[
-    tuple[Annotated[float, Real(infinite=True)], Annotated[float, Real(infinite=True)]],
-    Expect("two numbers, [lower, upper]; -inf or inf for no bound"), Checked(_in_order),
-]  # fmt: skip
-
-
-@strict
-@dataclass(frozen=True)
-class ConstraintSettings:
-    """Table [constraints] of the options file; without it the PC methods use its defaults.
-
-    Attributes:
-        signs: inertia and friction of drives must not be negative.
-        inertia: number of random postures in which M(q) must be positive definite; 0: none.
-        bodies: bodies must be physically consistent; replaces `inertia`.
-        bounds: name of a parameter → [lower, upper]; equal bounds fix it.
-        sum: constraints on weighted sums of parameters.
-    """
-
-    signs: Flag = True
-    inertia: Annotated[int, Whole(0, 10_000)] = POSTURES
-    bodies: Flag = False
-    bounds: Mapping[str, Bounds] = field(default_factory=dict)
-    sum: tuple[WeightedSum, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +57,7 @@ class Constraints(Frozen):
     likely: np.ndarray | None = None
 
     def solve(self, factor: np.ndarray) -> Constrained:
-        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.constrained.within`.
+        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.rooms.alternatives.constrained.within`.
 
         Raises:
             NotConverged: with the last β, if no positive definite inertia satisfies the other constraints.
@@ -163,71 +110,6 @@ def _unsatisfied(words: str) -> Iterator[None]:
         raise NotConverged(f"[constraints]: {words} ({error})", error.last) from error
 
 
-@dataclass(frozen=True, eq=False)
-class Binding:
-    """A constraint that is binding at an estimate.
-
-    Attributes:
-        name: name of the constraint.
-        multiplier: μ, slope of ½ ‖R β - z‖² against the bound; of either sign for an equality.
-        free: aᵀ β of the unconstrained estimate; NaN for M(q).
-        sigma: standard deviation of `free`.
-        bound: value of the binding bound.
-        equality: whether it is an equality constraint.
-    """
-
-    name: str
-    multiplier: Number
-    free: Number
-    sigma: Number
-    bound: Number
-    equality: bool
-
-    def findings(self, plane: str) -> list[Finding]:
-        """Return the findings on this constraint; `plane`: name of the one that replaces the cone of bodies."""
-        sigmas = abs(self.free - self.bound) / max(self.sigma, 1e-300)
-        max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is named (our choice)
-        if self.name == plane:
-            return [finding("held-to-bodies", name=self.name, sigmas=sigmas)]
-        if self.equality and sigmas <= max_sigmas:
-            return []
-        code = "against-equality" if self.equality else "on-its-bound"
-        return [finding(code, name=self.name, free=self.free, sigma=self.sigma)]
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """A constrained estimate, its binding constraints, and the unconstrained estimate.
-
-    Attributes:
-        constraints: the requested constraints, the cone of bodies as a plane.
-        solution: the optimum with its multipliers.
-        binding: constraints that are binding.
-        tight: indices of the postures in which M(q) is on its bound.
-        free: the unconstrained estimate.
-    """
-
-    constraints: Constraints
-    solution: Constrained
-    binding: tuple[Binding, ...]
-    tight: np.ndarray
-    free: LinearFit
-
-    @property
-    def postures(self) -> int:
-        """Number of postures in which M(q) is on its bound."""
-        return len(self.tight)
-
-    def findings(self) -> list[Finding]:
-        """Return the findings on binding constraints."""
-        found = [one for each in self.binding for one in each.findings(self.constraints.plane)]
-        if self.postures:
-            found.append(finding("held-definite", postures=self.postures))
-            if self.constraints.least > MIN_EIGENVALUE:
-                found.append(finding("held-from-singular", times=self.constraints.least / MIN_EIGENVALUE))
-        return found
-
-
 def make_constraints(
     settings: ConstraintSettings,
     model: RegressorModel,
@@ -269,6 +151,17 @@ def make_constraints(
     cone = cone_of(model, base) if settings.bodies and model.inertial else None
     inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
     return Constraints(tuple(words), matrix, low, high, inertia, cone)
+
+
+def constraints_of(problem: IdentificationProblem) -> Constraints:
+    """Return the constraints on a problem's columns.
+
+    Raises:
+        UsageError: see `make_constraints`.
+    """
+    names = (*problem.base.names, *problem.rows[0].names[problem.base.b :])
+    settings = problem.constraints or ConstraintSettings()
+    return make_constraints(settings, problem.model, problem.base, names, problem.terms)
 
 
 def hold(
@@ -318,7 +211,24 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
             float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound), bool(same[places[k]]),
         ))  # fmt: skip
     tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
-    return Held(constraints, found, tuple(binding), tight, free)
+    findings = tuple(_findings(constraints, binding, len(tight)))
+    return Held(constraints.names, tuple(binding), tight, free, findings)
+
+
+def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
+    """Yield the findings on binding constraints, and on the `postures` in which M(q) is on its bound."""
+    max_sigmas = 3.0  # standard deviations by which the data speak against an equality that is named (our choice)
+    for one in binding:
+        sigmas = abs(one.free - one.bound) / max(one.sigma, 1e-300)
+        if one.name == constraints.plane:
+            yield finding("held-to-bodies", name=one.name, sigmas=sigmas)
+        elif not one.equality or sigmas > max_sigmas:
+            code = "against-equality" if one.equality else "on-its-bound"
+            yield finding(code, name=one.name, free=one.free, sigma=one.sigma)
+    if postures:
+        yield finding("held-definite", postures=postures)
+        if constraints.least > MIN_EIGENVALUE:
+            yield finding("held-from-singular", times=constraints.least / MIN_EIGENVALUE)
 
 
 def _words(name: str, low: float, high: float) -> str:

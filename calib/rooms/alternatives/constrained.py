@@ -10,20 +10,16 @@ Constraints add knowledge, not consistency: where they bind at wrong values the 
 the bias of least squares in a loop.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# clarabel is a compiled extension without stubs
-
 from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
 import scipy.linalg
 
-from calib.errors import CalibError, NotConverged, require
+from calib.errors import CalibError, require
+from calib.estimation.cone_program import from_free, minimise
 from calib.estimation.triangles import require_rank
 from calib.records import frozen, shaped
-
-ACCURACIES = 1e-10, 1e-8, 1e-6  # of the scaled problem; the others where rounding forbids the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,69 +50,6 @@ class Definite:
         return bool((sizes >= -max_violation * self.least).all())
 
 
-@dataclass(frozen=True, eq=False)
-class ConeOptimum:
-    """Optimum b (p,) of a cone program, with the multipliers of rows (c,), matrices (k, n, n) and equalities (e,)."""
-
-    values: np.ndarray
-    rows: np.ndarray
-    matrices: np.ndarray
-    equalities: np.ndarray
-
-
-def minimise(
-    upper: np.ndarray,
-    target: np.ndarray,
-    rows: np.ndarray,
-    offset: np.ndarray,
-    matrices: np.ndarray,
-    least: np.ndarray | float = 0.0,
-    equal: np.ndarray | None = None,
-    held: np.ndarray | None = None,
-) -> ConeOptimum:
-    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; t = R b - z is an unknown: no squares.
-
-    Args:
-        upper, target: R (m, p), z (m,), of order one.
-        rows, offset: A (c, p), c (c,).
-        matrices: (k, n, n, p), M_k = Σ_j A_kj b_j.
-        least: λ, one or (k,).
-        equal, held: E (e, p), d (e,); None for none.
-
-    Raises:
-        NotConverged: where no point satisfies all.
-    """
-    import clarabel
-    from scipy import sparse
-
-    (m, p), (size, n, _, _) = upper.shape, matrices.shape
-    equal, held = np.zeros((0, p)) if equal is None else equal, np.zeros(0) if held is None else held
-    i, j = np.tril_indices(n)[::-1]  # upper triangle, column by column
-    weight = np.where(i == j, 1.0, np.sqrt(2.0))
-    flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
-    system = np.vstack([upper, equal, -rows, -flat])
-    right = np.concatenate([target, held, offset, -np.outer(np.broadcast_to(least, size), i == j).ravel()])
-    ends = np.cumsum([m, len(equal), len(rows)])
-    cones = [clarabel.ZeroConeT(int(ends[1])), *[clarabel.NonnegativeConeT(len(rows))][: len(rows)]]
-    cones += [clarabel.PSDTriangleConeT(n)] * size
-    settings = clarabel.DefaultSettings()
-    settings.verbose, settings.max_threads = False, 1
-    cost = sparse.diags(np.repeat([0.0, 1.0], [p, m])).tocsc()
-    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
-    for accuracy in ACCURACIES:
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
-        found = clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings).solve()
-        if str(found.status) in ("Solved", "AlmostSolved", "PrimalInfeasible"):
-            break
-    b, dual = np.array(found.x)[:p], np.array(found.z)
-    if str(found.status) not in ("Solved", "AlmostSolved"):
-        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {found.status}", b)
-    pushes = np.zeros((size, n, n))
-    pushes[:, i, j] = dual[ends[2] :].reshape(size, len(i)) / weight
-    pushes[:, j, i] = pushes[:, i, j]
-    return ConeOptimum(b, dual[ends[1] : ends[2]], pushes, -dual[ends[0] : ends[1]])
-
-
 def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
     """Return the indices of rows lower <= A b <= upper that contradict each other; empty if all can be satisfied.
 
@@ -139,23 +72,6 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
         return ()
     places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
     return tuple(sorted({int(places[k]) for k in np.flatnonzero(found.ineqlin.marginals < -1e-9)}))
-
-
-def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return the estimate under A b = d from the unconstrained one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
-
-    Gouriéroux & Monfort (1995, section 10.3): under inequalities the same, A and d those that bind.
-
-    Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
-        free: (p,) b_f.
-        normals: A (k, p), of full rank.
-        held: d (k,).
-    """
-    p = len(free)
-    turned = scipy.linalg.solve_triangular(factor[:p, :p].T, normals.T, lower=True)  # R⁻ᵀ Aᵀ
-    push = np.linalg.lstsq(turned, np.linalg.lstsq(turned.T, normals @ free - held)[0])[0]
-    return np.asarray(free - scipy.linalg.solve_triangular(factor[:p, :p], turned @ push))
 
 
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:

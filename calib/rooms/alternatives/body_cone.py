@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
-from calib.estimation.constrained import minimise
+from calib.estimation.cone_program import minimise
 from calib.records import Frozen
 
 

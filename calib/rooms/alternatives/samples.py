@@ -18,6 +18,7 @@ from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit, leverage, wls
 from calib.estimation.triangles import Triangles, absorb, combine, empty, solve_triangle
 from calib.records import frozen, shaped
+from calib.rooms.alternatives import sample_weights
 
 CHUNK = 2000  # samples whitened at a time
 ROUNDS = 200
@@ -93,7 +94,7 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
 
     S, weights and x alternate until x moves by less than 1e-4 of its standard deviation. Starts from a row-wise Cauchy
     fit with median spreads, because a covariance estimated from all samples would hide the outliers that made it. The
-    covariance of x is that of the M-estimator, `robust.variance_factor`.
+    covariance of x is that of the M-estimator, `sample_weights.variance_factor`.
 
     Args:
         data: the samples.
@@ -107,7 +108,7 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
     for _ in range(ROUNDS):
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
         size = _sizes(residual, covariance, data.present)
-        weights = robust.weigh(size, data.joints)
+        weights = sample_weights.weigh(size, data.joints)
         covariance = _scatter(data, residual, weights * _consistent(data), weights)
         factor, last = _factor(data, covariance, weights), values
         values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
@@ -142,7 +143,7 @@ def _pack(
     squares = np.sum(weights * _consistent(data) * size**2)
     dof = int(data.joints[weights > 0.0].sum() / inflation) - len(values)
     residual_std = float(np.sqrt(squares / np.sum(weights * data.joints)))
-    covariance = robust.variance_factor(size, data.joints) * inflation * inverse @ inverse.T
+    covariance = sample_weights.variance_factor(size, data.joints) * inflation * inverse @ inverse.T
     estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
     outliers = (weights == 0.0) & (data.joints > 0)
     fit = LinearFit(estimate, np.sqrt(np.diag(noise)), *conditions)
@@ -211,7 +212,7 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
 def _consistent(data: Samples) -> np.ndarray:
     """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
-    each = [robust.consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    each = [sample_weights.consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
     return np.array(each)[data.joints]
 
 
