@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-MAX_CORE = 33_000  # lines of everything but calib/rooms
+MAX_CORE = 32_000  # lines of everything but calib/rooms
 SLACK = 40  # lines by which a package may stay below its row before the row has to be lowered
 
 
