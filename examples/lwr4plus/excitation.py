@@ -60,6 +60,7 @@ from calib.rooms.cells import lwr4plus
 from calib.rooms.cells.cell import measure
 from calib.rooms.cells.virtual_cells import lwr4plus_cell
 from calib.rooms.closed_loop.controllers import Reference
+from calib.workers.threads import one_blas_thread
 from trajectories.design.objectives import condition_numbers
 
 PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0  # of a trajectory and of a log [s]; of the controller [Hz]
@@ -227,6 +228,7 @@ class Task:
         return "spline, 20 waypoints" if self.what is None else f"moves at {self.what:g}"
 
 
+@one_blas_thread()  # as the API does
 def done(task: Task) -> tuple[Reference, dict[str, Any]]:
     """Return the result of one task: motion, logs, identification and errors."""
     arm, plan = task.arm, task.what
