@@ -35,6 +35,8 @@ OBJECTIVES = [
     Excitation("cond", "normalised", sigmas=np.where(np.arange(7) == 4, np.inf, 1.0), columns=np.arange(3, 40)),
     Excitation("smallest", "raw"),
     Excitation("smallest", "normalised", sharpness=8.0, existing=PAST.T @ PAST),
+    Excitation("trace", existing=PAST.T @ PAST),
+    Excitation("trace", sigmas=np.linspace(0.2, 2.0, 7), columns=np.arange(3, 40), task=PAST.T[3:40] @ PAST[:, 3:40]),
     TorqueSlack((5, 6), CHI, LIMITS),
     FrictionCoverage(np.full(7, 0.2), np.full(7, 1.0), wanted=0.4),
     Duration(),

@@ -6,6 +6,8 @@ M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
     cond       s_1 / s_b                       minimise (Gautier & Khalil 1992; Kolyubin et al. 2019, eq. 24)
     logdet     -(log det M) / b                minimise (D-optimality; per column, so that searches are well scaled)
     smallest   -s_b                            minimise (E-optimality)
+    trace      log tr(A M⁻¹) / 2               minimise (A-optimality; I-optimality where A = Σ yᵀy of a task's rows y,
+                                               whose predicted variances tr(A M⁻¹) sums)
 
 Swevers et al. (1997) weigh the rows with the covariance of the torques: logdet with `sigmas`. Column scaling: ``raw``
 takes the columns in SI units, ``normalised`` divides each by its norm over the motion (so that the unit of a parameter
@@ -24,7 +26,7 @@ import numpy as np
 from trajectories.basis import SampledMotion
 from trajectories.errors import BadInput, NotExciting
 
-Index = Literal["cond", "logdet", "smallest"]
+Index = Literal["cond", "logdet", "smallest", "trace"]
 Scaling = Literal["raw", "normalised"]
 
 
@@ -68,13 +70,14 @@ class Excitation:
     """An index of the information matrix, as an objective.
 
     Attributes:
-        index: "cond", "logdet" or "smallest".
+        index: "cond", "logdet", "smallest" or "trace".
         scaling: "raw", "normalised", or (b,) by which the columns are divided.
         sharpness: p of the smoothing; infinite for the index itself.
         sigmas: (n,) standard deviations of the torques [N m or N]; None: 1. Infinite: that joint's rows tell nothing.
         existing: (b, b) information of motions recorded before, in the same sigmas: the next motion complements them.
             A triangle R of theirs gives it as Rᵀ R.
         columns: (c,) which of the regressor's columns count; None: all.
+        task: (c, c) A of the index "trace", of these columns; None: the identity.
     """
 
     index: Index = "cond"
@@ -83,6 +86,7 @@ class Excitation:
     sigmas: np.ndarray | None = None
     existing: np.ndarray | None = None
     columns: np.ndarray | None = None
+    task: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.index not in get_args(Index):
@@ -118,6 +122,8 @@ class Excitation:
         diagonal = np.diag(M)
         if not (diagonal > 0).all():
             raise NotExciting(f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion")
+        if self.index == "trace":
+            return self._trace(M)
         normalised = isinstance(self.scaling, str) and self.scaling == "normalised"
         d = diagonal**-0.5 if normalised else (1.0 if isinstance(self.scaling, str) else 1.0 / self.scaling)
         d = np.broadcast_to(d, diagonal.shape)
@@ -132,6 +138,16 @@ class Excitation:
         if normalised:
             by_m -= np.diag(np.einsum("ij,ji->i", C, by_c) / diagonal)
         return value, by_m, exact
+
+    def _trace(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """Return log tr(A M⁻¹) / 2, its derivative by M, -M⁻¹ A M⁻¹ / (2 tr), and the index again: it has no kinks."""
+        d = np.diag(M) ** -0.5
+        eigenvalues, V = np.linalg.eigh(M * d * d[:, None])
+        inverse = (V / np.maximum(eigenvalues, 1e-15 * eigenvalues[-1])) @ V.T * d * d[:, None]
+        spread = inverse if self.task is None else inverse @ self.task
+        trace = float(np.trace(spread))
+        value = 0.5 * np.log(trace)
+        return value, -0.5 * spread @ inverse / trace, value
 
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
         """Return F and ∂F/∂λ; λ rising."""

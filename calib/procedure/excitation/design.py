@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import cast, get_args
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.playback import Playback, check_start, play
-from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
+from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell, task_regressors
 from calib.procedure.excitation.settings import AIMS, COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
 from calib.robot.calibrated import CalibratedChain
 from calib.workers import finishing
@@ -49,24 +50,51 @@ SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
 
 
 def objectives_of(
-    settings: ExcitationSettings, condition: Excitation, errors_known: bool = False
+    settings: ExcitationSettings, condition: Excitation, given: ExcitationInputs
 ) -> tuple[tuple[Objective, float], ...]:
     """Return the objectives and their weights: the aim of the settings, or both condition numbers with equal weights.
 
     Args:
         condition: see `read_goals`.
-        errors_known: of the torques, by an identification: without goals the determinant is the aim.
+        given: robot and model; without goals the determinant is the aim where an identification states torque errors.
 
     Raises:
         UsageError: for two aims, or one together with the condition numbers that it replaces.
     """
-    aims: list[Index] = [one for one in AIMS if one in settings.goals]
+    errors_known = given.prior is not None and given.prior.sigmas is not None
+    aims = [one for one in AIMS if one in settings.goals]
     if not aims and not (errors_known and not settings.goals):
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
     others = [text for text in (*settings.goals, *settings.hard) if text.partition("=")[0] in (*SCALINGS, *AIMS)]
     if len(others) > 1:
         raise UsageError(f"goals {', '.join(others)}: '{aims[0]}' replaces the others; leave them out")
-    return ((replace(condition, index=(*aims, AIMS[0])[0]), 1.0),)
+    aim = (*aims, AIMS[0])[0]
+    if aim in get_args(Index):
+        return ((replace(condition, index=cast(Index, aim)), 1.0),)
+    return ((_predicted(aim, settings, condition, given), 1.0),)
+
+
+def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, given: ExcitationInputs) -> Excitation:
+    """Return the predicted σ of a typical task's torques, or of the parameters, as an objective.
+
+    Rows are weighted by the torque errors that earlier motions state, or else by the torque limits.
+
+    Raises:
+        UsageError: where torque limits or the parameters' values are not known.
+    """
+    exact, limits, values = given.model.exact, given.limits.torque, given.model.values
+    sigmas = np.ones(len(exact.joint_of_row)) if condition.sigmas is None else condition.sigmas
+    if aim == "torque":
+        require(np.isfinite(limits).all(), "goal 'torque': needs torque limits of all joints", UsageError)
+        rows = (task_regressors(given, settings.seed) / limits[exact.joint_of_row][:, None])[:, exact.limited.ravel()]
+        wanted = np.einsum("nri,nrj->ij", rows, rows) / rows[:, :, 0].size
+    else:
+        require(values is not None, "goal 'parameters': needs masses, or a model (--model)", UsageError)
+        own = cast(np.ndarray, values)[slice(None) if condition.columns is None else condition.columns]
+        wanted = np.diag(np.divide(1.0, own**2, out=np.zeros(len(own)), where=own != 0.0))
+    if given.prior is None and np.isfinite(limits).all():
+        sigmas = sigmas * limits[exact.joint_of_row]
+    return replace(condition, index="trace", scaling="raw", sigmas=sigmas, task=wanted)
 
 
 def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
@@ -328,7 +356,7 @@ def _excitation_problem(
     """Return the optimisation problem (condition numbers, limits), the constraints to verify, and notes."""
     search, checked, notes = _constraints(given.model, given.limits)
     condition, smooth = _condition_objective(given, settings), given.model.smooth
-    objectives = objectives_of(settings, condition, given.prior is not None and given.prior.sigmas is not None)
+    objectives = objectives_of(settings, condition, given)
     family, coarse = _family(given, settings)
     problem = ExcitationProblem(
         family, smooth.regressor, smooth.regressor_gradient, objectives, search, samples=settings.samples,

@@ -107,7 +107,7 @@ def foretell(
     if not np.isfinite(limits).all():
         return None, ()
     sigmas = share * limits
-    task = _task(given, settings.seed)
+    task = task_regressors(given, settings.seed)
     predict = partial(_prediction, given, sigmas, task)
     own, spread = predict(problem.family, found.x, found.factor, settings.repeat)
     others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
@@ -159,7 +159,7 @@ def _torque_sigma(given: ExcitationInputs, task: np.ndarray, root: np.ndarray) -
     return torque, float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
 
 
-def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
+def task_regressors(given: ExcitationInputs, seed: int) -> np.ndarray:
     """Return the regressors (TASK_STATES, n, c) at random typical states."""
     box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
     low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)

@@ -12,7 +12,7 @@ HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more
 DRIVES = ("Ia", "Fv", "Fc", "off")  # terms that a description may state
 GOALS = ("raw", "normalised", "duration", "coverage", "wrist")  # and joint1, joint2, …
 Solver = Literal["slsqp", "mma", "ccsaq", "auglag"]
-AIMS: tuple[Literal["logdet", "smallest"], ...] = ("logdet", "smallest")
+AIMS = ("logdet", "smallest", "torque", "parameters")
 COARSE = 5  # harmonics that a search begins with (our choice)
 
 
@@ -59,8 +59,9 @@ class ExcitationSettings:
 
     Attributes:
         goals: raw=35, normalised=6 (condition numbers), wrist=0.1 or joint6=0.1 (mean torque as a share of the limit,
-            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; logdet or smallest: this
-            index instead of the condition numbers; repeatable
+            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; repeatable.
+            Instead of condition numbers, without a number: logdet, smallest (of the information), torque or parameters
+            (predicted σ of torques on a typical task, or of parameters relative to their values)
         hard: a goal that must be reached; repeatable
         period: largest period of the motion [s]
         shortest: shortest period that the search may use [s]; default: the period is fixed

@@ -426,6 +426,16 @@ def test_other_solvers_end_within_the_limits_too(solver):
     assert found.proof.feasible and np.isfinite(found.condition.raw)
 
 
+def test_designs_for_predicted_sigmas_predict_smaller_ones():
+    """Of torques on the typical task, and of the parameters relative to their values."""
+    found = {goal: design.excite("lwr4plus", replace(SHORT, goals=goal)) for goal in ((), ("torque",), ("parameters",))}
+    torque = {goal: one.outlook.own.torque_sigma_share for goal, one in found.items()}
+    rsd = {goal: np.mean([row.rsd**2 for row in one.predicted if row.rsd]) for goal, one in found.items()}
+    assert torque["torque",] < torque[()] and rsd["parameters",] < rsd[()]
+    with pytest.raises(UsageError, match="needs masses, or a model"):
+        design.excite("ur10e", replace(SHORT, goals=("parameters",)))
+
+
 def test_a_goal_out_of_reach_is_named():
     found = design.excite("lwr4plus", replace(SHORT, goals=("raw=300", "joint7=0.5")))
     said = " ".join(found.notes)
