@@ -414,4 +414,4 @@ JointNumber = Annotated[int, Whole(1, 99, start=1)]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
 Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]
-"""A number or a text with a unit, read by `number`; another key states its quantity."""
+"""A number, or a text with a unit, parsed by `number`; another key of the table gives the quantity, e.g. length."""

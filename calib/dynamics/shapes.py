@@ -118,7 +118,7 @@ def _presliding(seen: JointRange) -> dict[str, tuple[float, ...]]:
 
 
 def _cable(seen: JointRange) -> dict[str, tuple[float, ...]]:
-    """Return candidate harmonics with a period of twice the travel, for cables and hoses: a smooth function on it."""
+    """Return candidate harmonics of period 2 · travel, which represent any smooth torque of cables and hoses."""
     return {f".{k}": (k * math.pi / seen.travel, math.inf) for k in (1, 2, 3)}  # no more (our choice)
 
 

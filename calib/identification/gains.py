@@ -103,7 +103,7 @@ def identify_gains(
     reference: int | None = None,
     own: Sequence[int] = (),
 ) -> DriveGains:
-    """Return the drive gains estimated from triangles of [W P | i], one group per joint.
+    """Return the drive gains estimated from R factors of [W P | i], one group per joint.
 
     Args:
         currents: columns of the model with the payload, target the currents.
@@ -214,7 +214,7 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
 
 
 def _astray(error: NotConverged, reference: int, own: Sequence[int]) -> int:
-    """Return the joint whose gain diverged most, where the gains do not converge: the motion does not identify it.
+    """Return the joint whose gain diverged most (gains not converged): the motion does not identify this gain.
 
     Raises:
         NotConverged: the error, where no joint is left.

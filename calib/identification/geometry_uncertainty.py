@@ -97,7 +97,7 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
 
 
 def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return the change of the estimate (p,) if the rows of nearly standing joints are left out."""
+    """Return the change of the estimate (p,) if the rows of nearly standing joints are omitted."""
     how, decimator = estimator(found), common_decimator(cases, found.settings)
     faster = [
         replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
@@ -114,7 +114,7 @@ def cut(rows: ObservationRows, own: slice) -> ObservationRows:
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
-    """Return the inverse of an upper triangle (p, p) with columns in different units."""
+    """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
     unit = np.linalg.norm(upper, axis=0)
     return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
 
@@ -172,7 +172,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def sigma_geometry(self) -> np.ndarray:
-        """Standard deviation (p,) of the parameters due to the uncertain geometry; zero if it is taken as exact."""
+        """Standard deviation (p,) of the parameters due to the uncertain geometry; zero if the geometry is exact."""
         if self.geometry is None:
             return np.zeros(len(self.names))
         return np.sqrt(np.clip(np.diag(self.geometry), 0.0, None))
@@ -220,7 +220,7 @@ def propagate(
 def sensitivity(
     found: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return dφ/dg (p, K + 2), and rms changes of the rigid torque per unit, φ fixed and re-estimated, (K + 2,) each.
+    """Return dφ/dg (p, K + 2), and rms changes of the rigid torque per unit, with φ fixed or re-estimated (K + 2,).
 
     The last two columns turn gravity about the base's x and y axes [per rad].
     """

@@ -229,7 +229,7 @@ class ExogeneityTest:
 
 @dataclass(frozen=True, eq=False)
 class LoopMetrics:
-    """Results of testing an estimate with instrumental variables from a simulated closed loop.
+    """Results of testing an estimate with instrumental variables from a simulated control loop.
 
     Attributes:
         failure: why there are no instruments.
@@ -265,7 +265,7 @@ class LoopMetrics:
 
 @dataclass(frozen=True)
 class LoopDisagreement:
-    """Differences between an estimate that simulates the stated loop and one that does not.
+    """Differences between an estimate that simulates the given control loop and an estimate that does not.
 
     Attributes:
         method, beside: methods of the two estimates.
@@ -285,7 +285,7 @@ class LoopDisagreement:
 
 @dataclass(frozen=True, eq=False)
 class LoopResults:
-    """Results of simulating the closed loop of the recordings; empty if no loop is stated in the options.
+    """Results of simulating the closed loop of the recordings; empty if the options describe no loop.
 
     Attributes:
         metrics: as ``metrics.json`` stores them; None without a loop.

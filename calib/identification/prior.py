@@ -101,7 +101,7 @@ class Prior:
         return np.insert(self.rows, [len(self.own)] * more, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return which parameters (b,) rest on the prior: the data reduce their variance by less than `resting_share`.
+        """Return the parameters (b,) that rest on the prior: data reduce their variance by less than `resting_share`.
 
         Counted about the whole robot's share: its factor s is one number, and soon identified.
         """
@@ -364,7 +364,7 @@ STEPS = (TEMPERING, 2.0 * TEMPERING, 4.0 * TEMPERING)
 
 
 def tempered_prior(find: Callable[..., Prior], rows: Sequence[ObservationRows], regimes: Regimes) -> Prior:
-    """Return the prior with the tempering that best predicts held-out regimes.
+    """Return the prior with the tempering that best predicts held-out ranges of motion.
 
     Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
     one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by

@@ -1,4 +1,4 @@
-"""Rows y = W x of cases: computed in blocks at the full rate, with the same low-pass and decimation of y and W.
+"""Rows y = W x of cases, computed in blocks at the full rate; y and W get the same low-pass and decimation.
 
 A `Case` is one recording: its motion, the torques to explain, and what the robot carried.
 """
@@ -88,7 +88,7 @@ def make_case(
 
 
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:
-    """Return a unique name per recording: the file's, with the cut or the folder if needed.
+    """Return a unique name per recording: the file's name, with the cut or the folder if needed.
 
     Raises:
         UsageError: where the same recording and cut is given twice.
@@ -214,7 +214,7 @@ def term_columns(one: DriveTerm, case: Case, load: np.ndarray | None = None) -> 
 
 
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
-    """Return the states (s, N) of friction with memory, zero at the start of each segment."""
+    """Return the states (s, N) of friction with hysteresis, zero at the start of each segment."""
     parts = [drives.friction_states(terms, case.motion.q[a:b].T) for a, b in segments(case.motion.segment)]
     return np.concatenate(parts, axis=1)
 
@@ -245,7 +245,7 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 
 
 def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
-    """Return the triangles of all rows, one group per time block and torque row: group = block · rows + row.
+    """Return the R factors of all rows, one group per time block and torque row: group = block · rows + row.
 
     The last block holds the samples beside cuts.
     """
@@ -261,7 +261,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
 
 
 def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:
-    """Return triangles with one group per torque row, over all blocks or the given ones."""
+    """Return R factors with one group per torque row, over all blocks or the given ones."""
     count = data.groups // rows
     wanted = range(count) if blocks is None else blocks
     index = np.array([[block * rows + row for block in wanted] for row in range(rows)], dtype=int)
@@ -305,6 +305,6 @@ class _HasEnergy(Protocol):
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return the decimated mask (M, rows): true where more than half of the samples of a mask (N, rows) are."""
+    """Return the decimated mask (M, rows): true where more than half of the samples of a mask (N, rows) are true."""
     share = decimate(mask.astype(float), decimator, segment)
     return (share > 0.5) & mask[kept(segment, decimator)] if len(decimator.taps) == 1 else share > 0.5

@@ -155,7 +155,7 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 def require_simulable(
     settings: IdentificationSettings, with_loop: bool, with_models: bool = False
 ) -> IdentificationSettings:
-    """Return the settings for a method that simulates: with standard friction, unless a step is stated and taken.
+    """Return the settings for a method that simulates: with standard friction, unless it supports the stated one.
 
     Args:
         with_loop: whether it simulates the closed loop, or the robot alone.

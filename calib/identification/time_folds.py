@@ -1,4 +1,4 @@
-"""Cross-validation of models over time blocks: all from triangles, one fit per fold.
+"""Cross-validation of models over time blocks: computed from R factors, one fit per fold.
 
 Regimes of a motion, on which models are judged without having been fitted to them, are each joint's extremes. A model
 that is right goes on being right where a joint is faster, accelerates more, or stands farther out than in its training
@@ -22,10 +22,10 @@ FAST_SHARE, END_SHARE = 0.1, 0.15  # of the rows: a joint's fastest, its hardest
 
 @dataclass(frozen=True, eq=False)
 class Regimes:
-    """Products [W y]ᵀ[W y] by regime and torque row: of joint j's rows, those with joint j in the regime.
+    """Products [W y]ᵀ[W y] of the samples in which a torque row's joint is in a range of motion (e.g. fast).
 
     Attributes:
-        squares, counts: (k, rows, p + 1, p + 1) and (k, rows) of the k regimes.
+        squares, counts: (k, rows, p + 1, p + 1) and (k, rows) of the k ranges.
         whole, total: (rows, p + 1, p + 1) and (rows,) of all rows.
     """
 
@@ -36,7 +36,7 @@ class Regimes:
 
 
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
-    """Return the products by regime of cases, from their rows."""
+    """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction."""
     motions = [case.motion for case in cases]
     chosen = [kept(motion.segment, decimator) for motion in motions]
     q, v, a = (
@@ -70,7 +70,7 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Triangles of all candidate columns by (block, row), with their weights and priors.
+    """R factors of all candidate columns by (block, row), with their weights and priors.
 
     Attributes:
         data: triangles by (block, row).
@@ -113,7 +113,7 @@ class CrossValidation:
         return self._known[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (regimes, rows) in each held-out regime of a model with these columns."""
+        """Return the squared errors (ranges, rows) in each held-out range of motion of a model with these columns."""
         assert self.regimes is not None
         index, weight = np.append(columns, self.data.parameters), 1.0 / (self.std**2 * self.inflation)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
@@ -139,7 +139,7 @@ class CrossValidation:
         return result
 
     def _fitted(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return for each run of blocks the least-squares fit to all other blocks."""
+        """Return, for each run of blocks, the least-squares fit to all other blocks."""
         chosen, group = self.data.select(columns), self.group[columns]
         prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
         folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
@@ -180,7 +180,7 @@ class CrossValidation:
 def estimate(
     data: Triangles, std: np.ndarray, inflation: np.ndarray, group: np.ndarray, prior: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (p,) and prior standard deviations (p,): infinite without ridge, 0 where switched off.
+    """Return values (p,) and prior standard deviations (p,): infinite without ridge, 0 for columns switched off.
 
     Columns with a group are regularised towards zero as strongly as the evidence says (`calib.estimation.relevance`);
     with none, this is weighted least squares. Directions without any data stay where they are: at zero.

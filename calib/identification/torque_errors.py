@@ -111,7 +111,7 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
 
 COVERED, SIGMAS = 0.95, 1.96
 OPTIMISM = 0.6
-"""Factor by which errors on other motion exceed those on held-out time, on the deviations between blocks.
+"""Factor on the deviations between blocks: errors on other motion exceed those on held-out time.
 
 Friction and filters were chosen on that time, too. It holds 95 % on average over two kinds of pairs that count alike:
 33 of parts of real recordings (1.35 to 50 s to learn from; 92.5 %) and 14 of simulated arms, which are the same on
@@ -145,7 +145,7 @@ class TorqueDiscrepancy:
     scale: tuple[tuple[float, ...], ...]
 
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
-        """Return log(1 + d²) (N, rows) of states q, v, a (N, n) each: over the row's joint, or over all without one."""
+        """Return log(1 + d²) (N, rows) of states q, v, a (N, n) each: of the row's joint, or of all joints."""
         away = np.sum((self._outside(q, v, a) / np.array(self.scale)[:, None]) ** 2, axis=0)
         own, left = divmod(rows, away.shape[1])
         return np.log1p(np.broadcast_to(away.sum(axis=1)[:, None], (len(q), rows)) if left else np.tile(away, own))
@@ -255,7 +255,7 @@ class TorqueIntervals:
 
 
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
-    """Return the error intervals of a model on a recording, compared with the errors of `predicted` (N, rows)."""
+    """Return a model's 95 % error bounds on a recording, and which errors of `predicted` (N, rows) lie within them."""
     motion = case.motion
     max_samples = 5000  # samples of a recording that intervals are evaluated at
     index = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), max_samples)).astype(int))
@@ -358,7 +358,7 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
 
 
 def _apart(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
-    """Return the blocks to hold out together: each block with those that repeat its motion.
+    """Return the blocks to hold out together: each block with all blocks that repeat its motion.
 
     A block is repeated by another that has been in half of its states (see `calib.data.signals.persistency.repeats`).
     Where that leaves fewer than two, the blocks as they are.

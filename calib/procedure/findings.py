@@ -96,7 +96,7 @@ class Verdicts:
         return Verdicts(own)
 
     def __str__(self) -> str:
-        """Return the worst verdict with the reasons of all stages at this level."""
+        """Return the worst verdict, with the reasons of all stages that have it."""
         reasons = (f"{stage}: {one.reason}" for stage, one in self.stages.items() if one.level == self.level)
         return f"verdict {self.level}: {'; '.join(reasons)}{'; do not use' if self.level == 'fail' else ''}"
 

@@ -29,7 +29,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
         "calib.procedure.dynamic_stage.geometry_tables",
     ),
     "exports": (
-        "what calib export --into writes",
+        "files that calib export --into writes",
         "calib.procedure.export.delivery calib.identification.possible.solve",
     ),
     "constraints": ("the TOML file of calib select --constraints", "calib.procedure.measuring.constraints_file"),
@@ -52,7 +52,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     **merged("topics"),
 }
-"""Topic → what it is, and the modules whose docstrings describe it."""
+"""Topic → short description, and the modules whose docstrings document the topic."""
 
 SCHEMAS: Mapping[str, tuple[str, str]] = {
     "options": ("calib.data.poses.fit_options", "FitOptions"),

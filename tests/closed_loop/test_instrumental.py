@@ -214,7 +214,7 @@ def test_what_cannot_be_done_is_said():
         found(case, method="2sls")
     with pytest.raises(UsageError, match="'ZZ9'"):
         found(case, positive=("ZZ9",))
-    with pytest.raises(UsageError, match="no regular inertia"):
+    with pytest.raises(UsageError, match="is no inertia above 0"):
         found(case, Loop(controllers.pd(PD.kp, np.zeros(2)), motion(), EVERY))
     with pytest.raises(NotConverged, match="after 1 iterations"):
         found(case, limit=1)

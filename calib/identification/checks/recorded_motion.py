@@ -113,7 +113,7 @@ def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _coarse(t: np.ndarray, max_gap: float = 60.0) -> np.ndarray:
-    """Return a time grid with spacing `STEP` [s] over sample times (N,); gaps longer than `max_gap` are cut to that.
+    """Return a time grid with spacing `STEP` [s] over sample times (N,); longer gaps are cut to `max_gap`.
 
     `max_gap`: between samples that the grid bridges [s]; a log may go on after weeks.
     """
@@ -141,7 +141,7 @@ def _found(q: np.ndarray, reference: np.ndarray, min_likeness: float = 0.9) -> R
 
 
 def _unlike(data: Pair) -> np.ndarray:
-    """Return the share (1,) of a motion's variance that the worst recorded period leaves unexplained; 1 without one."""
+    """Return the share (1,) of a motion's variance that the worst recorded period leaves unexplained; 1 if none is."""
     found = _found(*data)
     return np.array([1.0 if found is None else max(1.0 - min(found.likeness), 1e-9)])
 
@@ -206,7 +206,7 @@ def share_of_nominal(
 
 
 def bodies_under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
-    """Return the bodies of a chain with a gravity vector [m/s²]; with None, that of the chain."""
+    """Return the chain's bodies with gravity set to the given vector [m/s²]; None keeps the chain's gravity."""
     bodies = bodies_of(chain)
     return bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))
 

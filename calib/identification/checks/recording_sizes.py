@@ -40,7 +40,7 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True)
 class ClockRatio:
-    """Ratio of inertias to masses, relative to the ratio of rods between the joints, and its relative sigma."""
+    """Ratio of identified inertias to masses, relative to that of rods between the joints, and its relative sigma."""
 
     ratio: float
     relative_sigma: float
@@ -143,7 +143,7 @@ def _shares(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints or the zero offset of one that best explains the torques; None if none does.
+    """Return the exchange of two joints or the zero offset of one joint that best explains the torques, or None.
 
     The torques are those of the robot's own masses, and what is left of each joint's is a share of its variance.
     """

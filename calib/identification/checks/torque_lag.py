@@ -24,7 +24,7 @@ ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and t
 
 @dataclass(frozen=True)
 class Lag:
-    """Lag of the torques behind the positions of the same row [s], and the improvement by correcting it.
+    """Lag of the torques behind the positions of the same row [s], and how much its correction reduces the residual.
 
     Attributes:
         sigma: standard deviation of `seconds` [s].

@@ -91,7 +91,7 @@ class FrictionSelection:
         for step in self.steps:
             left = tuple(1 + joint for joint in _flat([joints[name] for name in step.terms if name in joints]))
             if step.terms and left != step.kept_at_joints:
-                step = replace(step, kept_at_joints=left, note="" if left else "switched off by the fit of all steps")
+                step = replace(step, kept_at_joints=left, note="" if left else "switched off by the final fit")
             steps.append(step)
         return replace(self, steps=tuple(steps), off=off)
 
@@ -271,7 +271,7 @@ def _carries(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the geometric mean of a joint's squared errors in held-out regimes (k,) did not increase."""
+    """Return whether the geometric mean of a joint's squared errors in held-out ranges (k,) did not increase."""
     used = (before > 0.0) & (after > 0.0)
     return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
 

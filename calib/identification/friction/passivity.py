@@ -76,7 +76,7 @@ def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
 
 
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
-    """Return the joints, from 0, whose friction adds energy: their torque is reversed, or another joint's.
+    """Return the joints, from 0, whose friction adds energy: their torques are reversed, or belong to another joint.
 
     Raises:
         MeasurementError: where these are most of the joints that move.

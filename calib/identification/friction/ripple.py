@@ -174,7 +174,7 @@ def _family(n: int) -> tuple[tuple[int, ...], ...]:
 def _terms(
     joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None
 ) -> tuple[DriveTerm, ...]:
-    """Return the drive terms of a joint's ripple, wave by wave; without `track` they hold at all positions."""
+    """Return the drive terms of a joint's ripple, wave by wave; without `track`, the terms apply at all positions."""
     edges = (0.0, *nodes, np.inf)
     found = []
     for source, order in waves:

@@ -85,7 +85,7 @@ class IdentificationProblem:
 
     @cached_property
     def pooled(self) -> Triangles:
-        """Triangles of all rows, one group per torque row."""
+        """R factors of all rows, one group per torque row."""
         return pool(triangulate(self.rows), self.rows[0].target.shape[1])
 
     @property
@@ -155,7 +155,7 @@ class MethodEstimate:
         return self.fit.estimate
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
-        """Return triangles on which least squares gives this estimate, with std and inflation (g,), for tests."""
+        """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
         if self.alone:
             return _standing_for(self.estimate), np.ones(1), np.ones(1)
         if self.beforehand is None:
@@ -169,7 +169,7 @@ class MethodEstimate:
 
 
 def _standing_for(estimate: Estimate) -> Triangles:
-    """Return triangles of one group whose least-squares solution is an estimate with its covariance."""
+    """Return the R factor of one group, whose least-squares solution is an estimate with its covariance."""
     p = len(estimate.values)
     factor = np.zeros((1, p + 1, p + 1))
     factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]

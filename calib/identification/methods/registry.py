@@ -1,4 +1,4 @@
-"""Table of all identification methods by name, those of rooms included."""
+"""Table of all identification methods by name, including those of the packages in `calib.rooms`."""
 
 from collections.abc import Mapping
 

@@ -80,7 +80,7 @@ def of(found: Identification, chain: Chain) -> Information:
 
 
 def _information(found: Identification) -> np.ndarray:
-    """Return the triangle [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
+    """Return the R factor [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
 
     Rows count as their residuals' autocorrelation lets them. The ridge of richer friction stays in: those terms have
     no other prior.
@@ -141,5 +141,5 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 
 
 def write(found: Identification, folder: Path) -> None:
-    """Write the triangle of an identification's data (`_information`)."""
+    """Write the R factor of an identification's data (`_information`)."""
     files.write_numbers(folder / INFORMATION, (*found.names, "target"), _information(found))

@@ -195,7 +195,7 @@ def _pulling(problem: BodyCost, pull: float) -> np.ndarray:
 
 
 def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
-    """Return the bodies and terms whose consistency costs most: name, and the distance without that constraint."""
+    """Return the bodies and terms whose constraint costs most: name, and the distance without this constraint."""
     model = information.dynamics.model
     found = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
     found += [

@@ -275,7 +275,7 @@ def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarr
 
 
 def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return curvature⁻¹ target by Cholesky, scaled to a unit diagonal.
+    """Return x of `curvature` x = `target` by Cholesky, after scaling `curvature` to a unit diagonal.
 
     What rounding leaves indefinite gets the least ridge of `RIDGES` that helps; a step by it still leads downhill.
 

@@ -64,7 +64,7 @@ class IdentificationFolder:
 
     @property
     def torques(self) -> list[Path]:
-        """Paths of measured and predicted torques on unseen motion, if there is any."""
+        """Paths of measured and predicted torques on unseen motion; empty without such motion."""
         return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
 
     @property

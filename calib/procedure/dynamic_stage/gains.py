@@ -1,4 +1,4 @@
-"""Drive gains that convert currents to torques: stated, from the file, or identified with a known payload."""
+"""Drive gains that convert currents to torques: from the options or the file, or identified with a known payload."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ class FoundGains:
 
     @property
     def own(self) -> tuple[int, ...]:
-        """Joints (from 0) without an identified gain, whose torques are in separate units."""
+        """Joints (from 0) without an identified gain, whose torques stay in amperes."""
         return () if self.found is None else self.found.own
 
     def for_motion(self, motion: Motion, own: FileSettings) -> np.ndarray | None:
@@ -129,8 +129,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
     )
     apart = [f"joint {j + 1}" for j in sorted(found.own)]
     own = (
-        f"this motion does not identify the gain of {', '.join(apart)}: torques there are in the joint's own "
-        "amperes and omitted from totals",
+        f"this motion does not identify the gain of {', '.join(apart)}: torques of such a joint stay in A and "
+        "are omitted from totals; record richer motion, or give the gain",
     )
     notes = (note, *(own if apart else ()), *_unsure(found))
     options = replace(options, settings=replace(options.settings, apart=tuple(found.own)))
@@ -160,14 +160,14 @@ def _identify(
 def _case(
     name: str, chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion], carried: tuple[str, ...]
 ) -> Case:
-    """Return the currents of a recording on the command line, or of a file in the folder of the options file."""
+    """Return the case of currents, from a given recording or from a file in the folder of the options file."""
     path = next((path for path in motions if path == name or Path(parse_cut(path)[0]).name == parse_cut(name)[0]), None)
     if path is not None:
         return make_case(name, motions[path], carried=carried)
     beside = Path(options.source).parent / name if options.source else Path(name)
     where = str(beside) if Path(parse_cut(str(beside))[0]).exists() else name
     if not Path(parse_cut(where)[0]).exists():
-        raise UsageError(f"{options.source}: gain_identification names {name}, neither a given nor an existing file")
+        raise UsageError(f"{options.source}: gain_identification names {name}, neither a given recording nor a file")
     own = options.file_settings(where)
     motion = make_motion(read_recording(where, Joints(chain.joint_names), own.recording), own.filter)
     return make_case(name, motion, carried=carried)

@@ -32,7 +32,7 @@ MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque,
 
 @dataclass(frozen=True)
 class TiltEffect:
-    """Parameter that a base tilt of 1 mrad changes most, and this change in its sigmas of torque noise."""
+    """Parameter that a base tilt of 1 mrad changes most, and the change, in sigmas from torque noise."""
 
     parameter: str
     sigmas: float
@@ -189,9 +189,9 @@ def summary(carried: GeometryUncertainty) -> str:
     if count == 0:
         return f"the geometry's uncertainty changes no sigma by more than {100 * NOTHING:g} %: no propagation needed"
     over = [name for name, yes in zip(carried.names, carried.dominated) if yes]
-    more = f"; it exceeds the torque noise's part in {len(over)}: {', '.join(over)}" if over else ""
-    rest = f"; in the other {p - count} propagation changes nothing" if count < p else ""
-    return f"the geometry's uncertainty raises {count} of {p} sigmas by more than {100 * NOTHING:g} %{more}{rest}"
+    more = f"; for {len(over)} it contributes more than torque noise: {', '.join(over)}" if over else ""
+    rest = f" and leaves {p - count} unchanged" if count < p else ""
+    return f"the geometry's uncertainty raises {count} of {p} sigmas by more than {100 * NOTHING:g} %{rest}{more}"
 
 
 def _tilt(carried: GeometryUncertainty) -> TiltEffect:

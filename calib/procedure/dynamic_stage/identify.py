@@ -33,7 +33,7 @@ REPEAT = 0.5  # share of states met in training from which on a validation file 
 
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
-    """Findings of an identification that the verdict needs besides the recordings; stored in its folder.
+    """Findings of an identification that the verdict needs in addition to the recordings; stored in its folder.
 
     Attributes:
         rests: its parameters that rest on a prior.
@@ -133,7 +133,7 @@ def errors_of(
     expected: dict[str, torque_errors.TorqueIntervals] = {}
     if errors is not None:
         for case in inputs.unseen or inputs.cases[:1]:
-            say(f"errors to expect of {case.name}")
+            say(f"estimating the errors of {case.name}")
             expected[case.name] = torque_errors.intervals(errors, dynamics, case, predictions[case.name])
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     stated = {name: one.coverage() for name, one in expected.items()}
@@ -178,7 +178,7 @@ def assess(
     verdict = judging.with_duration(
         judging.with_prior(Verdict.of(figures, [*odd, *rules]), findings.rests), found.excitation
     )
-    say("tracking with the model fed forward")
+    say("simulating tracking with the model as feedforward")
     relative = inputs.unit != TORQUE
     amperes = [finding("torques-relative", unit=without_gains(inputs.unit))] if relative else []
     replays, failure = {}, ""
@@ -275,5 +275,5 @@ def _carry(
     carried = geometry_uncertainty.propagate(found, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:
         return carried, None
-    say("the same on the nominal geometry")
+    say("identification on the nominal geometry")
     return carried, geometry_uncertainty.compare(found, carried, inputs.robot.nominal, inputs.cases)

@@ -82,7 +82,7 @@ class IdentificationInputs:
 
     @property
     def chain(self) -> Any:
-        """Identified arm; for other robots the actuated joints, with names and limits like an arm's."""
+        """Identified arm; for other robots, their actuated joints with names and limits."""
         return self.robot.chain
 
     def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:

@@ -85,7 +85,7 @@ class ConstraintMetrics:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JudgedMetrics:
-    """Results of a model on recordings, as stored in both files.
+    """Results of a model on recordings, as stored in both JSON files.
 
     Attributes:
         verdict, reason: of the model.
@@ -186,7 +186,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
 
 
 def _error_density(found: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return the errors' density (rows,) [N² m² s or N² s]: ∫ ωᵀω / density dt is what a motion tells.
+    """Return the errors' density (rows,) [N² m² s or N² s]: a motion's information is ∫ ωᵀω / density dt.
 
     It is their variance over the independent rows per second.
     """

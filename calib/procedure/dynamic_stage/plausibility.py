@@ -132,7 +132,7 @@ def _off(ratio: np.ndarray | np.floating) -> float:
 
 
 def _limits(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Compare torques with the joints' limits: what is a thousand times too large or too small is in another unit."""
+    """Yield findings on torques a thousand times too large or too small for the joints' limits: another unit."""
     known = np.isfinite(each.limits)
     if not known.any():
         return
@@ -151,7 +151,7 @@ def _limits(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 
 
 def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Compare measured velocities with the slopes of the positions."""
+    """Compare measured velocities with the differentiated positions."""
     min_off, min_common_off, min_sigmas = 0.05, 0.02, 5.0  # at a joint; at all joints alike (our choice)
     ratio = each.speed
     known = np.flatnonzero(np.isfinite(ratio))
@@ -174,7 +174,7 @@ def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 
 
 def _against(clock: ClockRatio | None, usual: float) -> str:
-    """Return ``stamps`` or ``velocities``: whichever disagrees with the ratio of inertias to masses; or nothing."""
+    """Return ``stamps`` or ``velocities``: whichever disagrees with the ratio of inertias to masses; "" if neither."""
     if clock is None:
         return ""
     rods_sigma = 0.17  # relative, of a robot's inertias over masses from its lengths (our choice)

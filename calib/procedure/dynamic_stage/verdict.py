@@ -34,7 +34,7 @@ SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb frict
 
 @dataclass(frozen=True)
 class Resting:
-    """Base parameters whose values come from a prior, not from the motion.
+    """Base parameters whose values are determined by a prior, not by the motion.
 
     Attributes:
         names: theirs.
@@ -246,7 +246,7 @@ def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
 
 
 def _slow_bias(cases: Sequence[Case], found: Identification) -> list[Finding]:
-    """Return the finding that rows near standstill, where friction can have any value, bias Coulomb friction.
+    """Return the finding that rows near standstill, where friction is undetermined, bias the Coulomb friction.
 
     Few such rows are remarked upon where they change it by more than its sigma. Where a joint's friction is richer,
     they are modelled, not cut.

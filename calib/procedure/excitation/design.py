@@ -1,4 +1,4 @@
-"""Designing exciting motions: a robot's regressor and limits handed to the package `trajectories`.
+"""Designing exciting motions: the package `trajectories` gets a robot's regressor and limits.
 
 Its goals: ``raw=35``, ``normalised=6``: condition numbers; ``wrist=0.1``, ``joint6=0.1``: mean torque;
 ``coverage=0.1``: speeds; ``duration=12``: the period [s], where ``--shortest`` leaves it free. ``logdet`` and
@@ -52,7 +52,7 @@ SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
 def objectives_of(
     settings: ExcitationSettings, condition: Excitation, given: ExcitationInputs
 ) -> tuple[tuple[Objective, float], ...]:
-    """Return the objectives and their weights: the aim of the settings, or both condition numbers with equal weights.
+    """Return the objectives and their weights: as set, or both condition numbers with equal weights.
 
     Args:
         condition: see `read_goals`.
@@ -120,7 +120,7 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
 def _objective(
     name: str, value: float, given: ExcitationInputs, condition: Excitation, shortest: float | None
 ) -> tuple[Objective, float]:
-    """Return the objective of a goal's name, and the value that it has to reach."""
+    """Return the objective that a goal names, and the value that the objective has to reach."""
     text, chain = f"{name}={value:g}", given.chain
     if name in SCALINGS:
         require(value > 1, f"goal '{text}': expected a condition number above 1", UsageError)
@@ -431,7 +431,7 @@ def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, 
 
 
 def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
-    """Return the family of motions, and one of fewer harmonics for the first stage of the search."""
+    """Return the family of motions, and a family of fewer harmonics for the first stage of the search."""
     fixed = {j: value for j, value in given.locked.items() if value is not None}
     resonance, most = given.limits.resonance, settings.harmonics
     if most is None:

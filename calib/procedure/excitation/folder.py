@@ -100,7 +100,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
 
 def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:
-    """Write t, q, v, a and, if known, tau in SI units, one row per controller sample, after the limits as comments."""
+    """Write t, q, v, a and, if known, tau in SI units, one row per controller sample; comments state the limits."""
     bounds.check(track)
     parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
     header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
@@ -236,7 +236,7 @@ def plan_lines(planned: Planned) -> list[str]:
 
 @dataclass(frozen=True)
 class _PlanMargin:
-    """Margin to a limit: of the joint closest to it, and of each joint as a share of the limit."""
+    """Margin to a limit: of the joint closest to the limit, and of each joint as a share of the limit."""
 
     margin: float
     unit: str

@@ -1,4 +1,4 @@
-"""Inputs of an excitation: model to identify, loads, limits, locked joints, and earlier motions that count."""
+"""Inputs of an excitation: model to identify, loads, limits, locked joints, and earlier motions to include."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -158,7 +158,7 @@ def read_model(
     options: IdentificationSettings | None = None,
     loads: Sequence[str] = (),
 ) -> ExcitedModel:
-    """Return the model to excite: of an identification's folder, or the robot's own inertias and stated friction.
+    """Return the model to excite: from an identification's folder, or from the robot's inertias and the given friction.
 
     Args:
         folder: of an identification; its torque rows count, and its payloads that `loads` names.
@@ -205,7 +205,7 @@ def _designable(rows: TorqueRows) -> bool:
 
 
 def _stated(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
-    """Return the ten parameters of each payload, and notes on what is assumed about them."""
+    """Return the ten parameters of each payload, and notes on assumptions about the payloads."""
     result, notes = [], []
     for label, load in ({} if options is None else options.payloads).items():
         if load.mass is None:
@@ -357,7 +357,7 @@ def identifiable(
 def _selected(
     found: IdentifiableColumns, model: ExcitedModel, settings: ExcitationSettings, folder: Path | None
 ) -> IdentifiableColumns:
-    """Return the identifiable columns that the settings ask for: names, or those an identification found essential.
+    """Return the identifiable columns that the settings request: by name, or the essential ones of an identification.
 
     Raises:
         UsageError: for an unknown parameter, or ``essential`` without a folder.

@@ -284,7 +284,7 @@ def read_motion_limits(
 
 
 def located(error: NothingFeasible) -> NothingFeasible:
-    """Return the error, extended by the place in the limits file where the violated limit can be changed."""
+    """Return the error with the place added at which the limits file states the violated limit."""
     if error.constraint not in STATED_IN:
         return error
     place = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
@@ -359,7 +359,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class _PoseLimit:
-    """A constraint of pose selection, applied along a motion."""
+    """A constraint of pose selection, applied to the postures of a motion."""
 
     of: PoseConstraint
     name: str
@@ -380,7 +380,7 @@ class _PoseLimit:
 
 
 def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionConstraint]:
-    """Return the constraints: workspace of the tip and of named points, and the other ones of poses."""
+    """Return the constraints: workspace of the tip and of named points, and all other constraints of poses."""
     radius, (lowest, highest) = stated.target.axis_distance, stated.target.heights
     result: list[MotionConstraint] = []
     if radius is not None or lowest is not None:

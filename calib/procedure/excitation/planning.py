@@ -1,4 +1,4 @@
-"""Planning a motion: a path through waypoints, timed by the package `trajectories` on the best model there is.
+"""Planning a motion: a path through waypoints, which `trajectories` times with the best dynamic model available.
 
 Waypoints are joint values, or places of the tool by inverse kinematics: a CSV, a row per waypoint, in order, with the
 robot's joints, or the tip's place ``x y z`` in the robot's base frame and its orientation ``qx qy qz qw`` (or ``r11``
@@ -95,7 +95,7 @@ def read_waypoints(
 def _reached(
     goal: Goal, target: np.ndarray, near: np.ndarray, others: np.ndarray, targets: Targets, k: int
 ) -> np.ndarray:
-    """Return joint values (n,) at a target (1, 4, 4): solved from the present pose, else the nearest of many tries."""
+    """Return joint values (n,) at a target (1, 4, 4), solved from the present pose or else by many tries."""
     q = inverse.nearest(goal, target, near[None], inverse.reach(goal, target, near[None]))
     left = inverse.differences(goal, q, target)
     if np.abs(left).max() <= MAX_ERROR:
@@ -262,7 +262,7 @@ def _check_places(path: JointPath, known: MotionLimits) -> None:
 def _law(
     chain: Chain, folder: Path | None, payloads: Sequence[str], drives: Tables | None, known: MotionLimits
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
-    """Return the dynamics: identified model, or the robot's inertias with stated drives; None if neither is given."""
+    """Return the dynamics: identified model, or the robot's inertias and given drives; None without both."""
     if folder is not None:
         require(drives is None, "model and drives both state drive parameters; leave one of them out", UsageError)
         law, unsure = _identified(chain, folder, payloads)
@@ -302,12 +302,12 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
 
 
 def _guarded(bounds: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
-    """Return the limits, the torque limits reduced by a margin (n,)."""
+    """Return the limits with each torque limit reduced by a margin (n,)."""
     if (margin >= bounds.torque).any():
         j = int(np.argmax(margin / bounds.torque))
         raise UsageError(
-            f"{chain.joint_names[j]}: the model's torque is uncertain by {margin[j]:.3g} along this motion, its limit "
-            f"is {bounds.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
+            f"{chain.joint_names[j]}: the margin for torque uncertainty, {margin[j]:.3g}, reaches the torque limit, "
+            f"{bounds.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
         )
     return replace(bounds, torque=bounds.torque - margin)
 

@@ -45,7 +45,7 @@ class Playback:
 
 
 def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
-    """Return the setpoints of a designed motion: approach, periods and rehearsal, as the settings say."""
+    """Return the setpoints of a designed motion: approach, periods and rehearsal, as set."""
     model, limits, chain = given.model, given.limits, given.chain
     period = family.period * found.factor
     count = round(period * settings.rate)  # a period holds a whole number of the controller's samples
@@ -61,7 +61,7 @@ def play(family: Family, found: SearchResult, given: ExcitationInputs, settings:
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
-    """Return the track with predicted torques, of the load with which each is largest; as is if parameters lack."""
+    """Return the track with predicted torques, largest over the loads; unchanged if parameters are unknown."""
     if dynamics.values is None:
         return track
     parts, model = [], dynamics.exact
@@ -74,7 +74,7 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
-    """Return a note if a track exceeds the torque limits; a slower motion can, if inertia forces lifted the arm."""
+    """Return a note if a track exceeds the torque limits; even slower motion can, without inertia forces that help."""
     if track is None or track.tau is None:
         return ()
     share = (np.abs(track.tau) / limits.torque).max(axis=0)

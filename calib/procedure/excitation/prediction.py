@@ -1,4 +1,4 @@
-"""Predicted σ of parameters and torques that a motion will identify, before anything is moved.
+"""Predicted σ of the parameters and torques that a motion identifies, before the robot moves.
 
 With Y one sample's regressor and σ_j the error of joint j's torque that no parameter explains, a log of R independent
 rows per joint leaves the base parameters with the covariance
@@ -44,7 +44,7 @@ TASK_STATES = 400  # states of the typical task: anywhere within the joint limit
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """Predicted σ from a log of a motion.
+    """σ predicted for a log of a motion.
 
     Attributes:
         seconds: of motion; rows_per_joint: independent ones.
@@ -153,7 +153,7 @@ def _root(W: np.ndarray) -> np.ndarray:
 
 
 def _torque_sigma(given: ExcitationInputs, task: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the σ of predicted torques (n,) of the load for which each is largest, and their share of the limits."""
+    """Return the σ of each joint's predicted torque (n,), largest over the loads, and the rms of σ / torque limit."""
     squares = np.mean(np.sum((task @ root) ** 2, axis=2), axis=0)
     torque = np.sqrt(squares[given.model.exact.limited].max(axis=0))
     return torque, float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))

@@ -1,4 +1,4 @@
-"""Settings of designing and planning motions: one default each, for the commands, the guided run and scripts alike."""
+"""Settings of designing and planning motions: the same defaults for commands, guided run and scripts."""
 
 import re
 from dataclasses import dataclass

@@ -316,7 +316,7 @@ def prediction(out: Path) -> ExportedPrediction | None:
 
 
 def mark(out: Path, found: Verdicts) -> list[str]:
-    """Write verdicts other than pass at the head of the exported files, and the use of each file into a README.txt.
+    """Write verdicts other than pass at the head of the exported files, and the use of each file into README.txt.
 
     Args:
         out: the folder of the export.

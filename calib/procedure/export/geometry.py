@@ -75,7 +75,7 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 
 
 def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
-    """Return the chain of a URDF with the joints and the tip of another chain, as far as the URDF has their names."""
+    """Return the chain of a URDF with another chain's joints and tip, if the URDF has these names."""
     named = chain.joint_names if chain.joint_names[0] in tree.joints else None
     return urdf.build(tree, *urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
 
@@ -141,7 +141,7 @@ def ur_kinematics(robot: CalibratedChain) -> str:
 
 
 def flange_note(robot: CalibratedChain) -> str:
-    """Return a remark on the assumed position of UR's flange, if a fixed joint follows the last joint."""
+    """Return a remark on where UR's flange is assumed, if a fixed joint follows the last joint."""
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
@@ -198,7 +198,7 @@ def wrist_offset(nominal: Chain) -> float:
 
 
 def _template(nominal: Chain) -> str:
-    """Return a URDF of a nominal arm in UR's frames, its six lengths taken from the arm's axes at q = 0.
+    """Return a URDF of a nominal arm in UR's frames, with the six lengths of the arm's axes at q = 0.
 
     d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of
     axis 4 over axis 6; d6 distance of the last joint's frame from axis 5, or of the tip where that frame is on axis 5
@@ -267,7 +267,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
         if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
-            refuse_robot(where, f"the origin of joint '{name}' is not a rotation")
+            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),
             "orientation": dict(zip("xyzw", turn.tolist())),

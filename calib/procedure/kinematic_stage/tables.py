@@ -140,7 +140,7 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
 
 
 def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
-    """Return the robust weight of each fitted residual by file, row and tool (position or orientation: the smaller)."""
+    """Return the robust weight by (file, row, tool): the smaller of the position weight and the orientation weight."""
     fit, result = outcome.selection.fit, {}
     for piece in fit.pieces:
         for i, w in zip(piece.part.index, piece.weight):

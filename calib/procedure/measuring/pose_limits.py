@@ -279,7 +279,7 @@ def _collision(
             if floor is None or table.floor is not None:
                 raise
             model, shapes, notes = place(None)
-            notes = (*notes, f"the floor is NOT checked: every posture is below {floor:g} m; set floor in [collision]")
+            notes = (*notes, f"floor NOT checked: all postures reach below {floor:g} m; set its height in [collision]")
             floor = None
     if model.excluded:
         pairs = listing((" with ".join(pair) for pair in model.excluded), 3)

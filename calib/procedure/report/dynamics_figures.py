@@ -54,10 +54,10 @@ def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutco
 
 
 def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
-    """Return the chart of the residuals' autocorrelations below the band, for the file that decides the verdict."""
+    """Return the autocorrelations of residuals low-passed to the identification band, for the file of the verdict."""
     name = next(iter(outcome.validation or outcome.fit))
     found = {**outcome.fit, **outcome.validation}[name]
-    title = f"{name}: autocorrelation of the residuals at {found.rate:.3g} Hz, dashed: white noise"
+    title = f"{name}: autocorrelation of the residuals at {found.rate:.3g} Hz, dashed: limits for white noise"
     return autocorrelations(found.whiteness, _rows(outcome), title)
 
 
@@ -198,7 +198,7 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
         *(text(row.parameter, one, k, (3, 0), along="center") for k, (row, one) in enumerate(zip(rows, size))),
     ]  # fmt: skip
     labels = [f"{row.element} ({small(row.sigma or 0.0, row.unit, digits=2)})" for row in rows]
-    title = f"{int((size > MIN_SHIFT).sum())} of {len(rows)} geometric errors have an effect"
+    title = f"{int((size > MIN_SHIFT).sum())} of {len(rows)} geometric errors shift parameters noticeably"
     limits = 0.0, 1.25 * float(size.max(initial=MIN_SHIFT))
     panel = Panel(layers, title, "shift [σ of torque noise]", xlim=limits, ynames=labels)
     return Chart([panel], 0.7 + 0.19 * len(rows), width=HALF_WIDTH)
@@ -248,7 +248,7 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     name, looked = next(iter((unseen.validation or unseen.fit).items()))
     drawn = autocorrelations(looked.whiteness, unseen.rows, "Residuals", width)
     shares = f"Unexplained share of each torque, on the training motion and on {where}."
-    rest = f"Autocorrelation of the residuals below the band on {name}; dashed: white noise."
+    rest = f"Autocorrelation of residuals, low-passed to the identification band, {name}; dashed: white noise limits."
     return [picture(errors, shares), picture(drawn, rest)]
 
 

@@ -192,7 +192,7 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
 
 
 def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
-    """Return the chart of cross-validated errors of the models tried, up to the one without further gain.
+    """Return the chart of cross-validated errors of the models tried, up to the first without improvement.
 
     Args:
         steps: models with such an error; the last one kept, without a note, is the model chosen.
@@ -209,7 +209,7 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
     if noise:
         layers.append(level(1e3 * noise, INK, ":", words="instrument"))
     limits = 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max()
-    ends = (f"{steps[k].model.removeprefix('+ ')} is the last step with a gain: {errors[k]:.3g} mm" for k in last)
+    ends = (f"{steps[k].model.removeprefix('+ ')} is the last to reduce the error: to {errors[k]:.3g} mm" for k in last)
     panel = Panel(
         layers, next(ends, ""), "model, parameters", "cross-validated error [mm]", ylim=limits, log="y",
         xnames=[f"{step.model}\n{step.parameters}" for step in steps], grid="y",

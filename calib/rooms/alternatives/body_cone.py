@@ -1,4 +1,4 @@
-"""Base parameters of physically consistent bodies: some standard parameters behind them have pseudo-inertias P_i >= 0.
+"""Base parameters of physically consistent bodies: those of standard parameters with pseudo-inertias P_i >= 0.
 
     { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not identify of χ is free
 
@@ -31,7 +31,7 @@ class _Plane:
 
 @dataclass(frozen=True, eq=False)
 class BodyCone(Frozen):
-    """Convex cone of the base parameters that physically consistent bodies and drives can have.
+    """Convex cone of all base parameters that belong to physically consistent bodies and drives.
 
     Attributes:
         transform: T (b, P) of the standard parameters, ten by body, then the drives' terms.

@@ -185,7 +185,7 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
 
 
 def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
-    """Return the triangles of all rows present, one group per joint, rows weighted by (N, n)."""
+    """Return the R factors (QR) of all rows that are not missing, one group per joint, weighted by `weights` (N, n)."""
     root = np.sqrt(weights)
     total = empty(data.names, data.units, data.target.shape[1])
     for start in range(0, len(data.target), CHUNK):

@@ -140,7 +140,7 @@ class TorqueErrors:
     def note(self) -> str:
         """What they are, as the end of a sentence; empty where there are none."""
         parts = [
-            (self.memory, f"friction with memory of {self.memory:.0%} of Fc"),
+            (self.memory, f"friction hysteresis (presliding), {self.memory:.0%} of Fc"),
             (self.warming, f"friction falling by {self.warming:.0%} as it warms up"),
             (self.ripple, f"ripple of {self.ripple:.1%} of the torque"),
             (self.cable, f"cables of {self.cable:.1%} of the limits"),

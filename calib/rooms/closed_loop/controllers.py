@@ -37,7 +37,7 @@ class Reference:
             object.__setattr__(self, name, frozen(shaped(getattr(self, name), np.shape(self.q), name)))
         if len(self.t) != len(self.q) or len(self.t) < 2:
             raise CalibError(
-                f"{len(self.t)} times, {len(self.q)} positions: a reference needs as many of each, two at least"
+                f"{len(self.t)} times, {len(self.q)} positions: a reference needs equal numbers, at least 2"
             )
 
     @property
@@ -46,7 +46,7 @@ class Reference:
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
-        """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration, (4, N, n)."""
+        """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration as one array (4, N, n)."""
         torque = np.zeros_like(self.q) if ahead is None else shaped(ahead, self.q.shape, "torque ahead")
         return np.array([self.q, self.v, torque, self.a])
 
@@ -81,7 +81,7 @@ def cascade(
         reset: Ti (n,) [s]; infinite for a plain P-P cascade.
     """
     if share != 1.0 and np.isfinite(reset).any():
-        raise CalibError("a cascade with an integral requires the whole reference velocity: share = 1")
+        raise CalibError("a cascade with integral action needs the full reference velocity: set share = 1")
     position, velocity = np.asarray(position, dtype=float), np.asarray(velocity, dtype=float)
     ki = velocity * position / np.asarray(reset, dtype=float)
     kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
@@ -110,7 +110,7 @@ def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
 
 
 def stated_controller(loop: LoopSettings, n: int) -> Controller:
-    """Return the controller of n joints that the settings [loop] state.
+    """Return the controller of n joints that the table [loop] describes.
 
     Raises:
         UsageError: where the length of a list is not the number of joints.

@@ -45,7 +45,7 @@ MAX_GAIN_RATIO = 1.25  # of distances from the reference, recorded and simulated
 
 @dataclass(frozen=True)
 class _RoundEstimator:
-    """Estimator of one iteration, from the triangles of [Z W y].
+    """Estimator of one iteration, from the R factors of [Z W y].
 
     Attributes:
         name: name in options and files.
@@ -135,7 +135,7 @@ class Instrumental:
 
     @property
     def off(self) -> np.ndarray:
-        """Joints, from 0, with wrong stated gains: the recorded tracking error differs from the simulated one."""
+        """Joints (from 0) whose given gains are wrong: recorded and simulated tracking errors differ."""
         estimate, simulated = self.fit.estimate, self.problem.data.factors[:, :, : len(self.names)]
         sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
@@ -242,7 +242,7 @@ def identify_instrumental(
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """Richer friction of a model: terms, and the standard parameters (p,) by which loads are known; None: no terms."""
+    """Richer friction of a model: its terms, and the standard parameters (p,) from which joint loads are computed."""
 
     terms: tuple[DriveTerm, ...]
     model: IdentificationModel
@@ -278,7 +278,7 @@ class _Fixed:
         return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
 
     def plant(self, old: Plant, found: _Found) -> Plant:
-        """Return the simulated robot with an estimate; without motor torques it keeps the J that it starts with."""
+        """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
         own, b = found.fit.estimate.values, self.base.b
         values = np.concatenate([self.base.to_standard(own[:b]), own[b:]])
         regular = old.parameters[len(values) :] * (not self.model.torque_rows.with_motors)
@@ -287,7 +287,7 @@ class _Fixed:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Data of one iteration: rows, instruments, their triangles, the estimate, and its residuals' inflation."""
+    """Data of one iteration: rows, instruments, R factors, estimate, and variance inflation of the residuals."""
 
     observed: Sequence[ObservationRows]
     simulated: Sequence[np.ndarray]
@@ -298,7 +298,7 @@ class _Found:
 
 
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
-    """Return the estimate with instruments from simulated runs; `tau`: variance inflation, from the last round."""
+    """Return the estimate with instruments from simulated runs; `tau` is the variance inflation of the last round."""
     columns = task.base.kept
     moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
     simulated = [task.friction.added(observe(task.model, columns, case, task.decimator), case).matrix for case in moved]
@@ -361,12 +361,12 @@ def _result(
 
 
 def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None) -> Plant:
-    """Return the robot of the first simulation: joint inertias J only, no gravity; J are its last n parameters."""
+    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
     if inertia is None:
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
         if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
-            raise UsageError("no regular inertia follows from these gains; state the inertia (n,) [kg m²]")
+            raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
     n = model.bodies.n
     extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
     values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
@@ -393,7 +393,7 @@ def _loaded(plant: Plant, case: Case) -> Plant:
 def _simulate_new(
     task: _Fixed, found: _Found, old: Plant, std: np.ndarray, tau: float
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
-    """Return the simulations with the new parameters, or, if they fail, with smaller steps towards these.
+    """Return the simulations with the new parameters or, if these fail, with smaller steps from the old ones.
 
     Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
     """
@@ -420,7 +420,7 @@ def _simulate_new(
 def _stack(
     observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True
 ) -> Instruments:  # fmt: skip
-    """Return the triangles of [Z W y], one group per torque row; without `measured`, the cheaper ones of [Z 0 y]."""
+    """Return the R factors of [Z W y], one group per torque row; without `measured`, those of [Z 0 y] (cheaper)."""
     first, count = observed[0], observed[0].target.shape[1]
     problem = instrumental_variables.unseen(first.names, first.units, count)
     for rows, z in zip(observed, simulated, strict=True):
@@ -433,7 +433,7 @@ def _stack(
 
 
 def _simulated(problem: Instruments) -> Triangles:
-    """Return the triangles of [Z y], selected from those of [Z W y]."""
+    """Return the R factors of [Z y], selected from those of [Z W y]."""
     return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
 
 

@@ -1,4 +1,4 @@
-"""Instrumental variables: estimates that stay right where the noise of y reaches W through the feedback of the robot.
+"""Instrumental variables: consistent estimates although the noise of y reaches W through the robot's feedback.
 
 The instruments Z (r, p), one per column, are the observation matrix of a noise-free simulation. All that IV needs is in
 the R factor of [Z W y], so that the triangles of `triangles` serve here too:
@@ -58,7 +58,7 @@ class InstrumentStrength:
 
 @dataclass(frozen=True, eq=False)
 class Instruments:
-    """Triangles of [Z W y]; the first p columns are the instruments."""
+    """R factors of [Z W y]; the first p columns are the instruments."""
 
     data: Triangles
 
@@ -67,12 +67,12 @@ class Instruments:
         return self.data.names[len(self.data.names) // 2 :]
 
     def least_squares(self) -> Triangles:
-        """Return the triangles of [W y] alone, for `linear.ols` and `linear.wls`."""
+        """Return the R factors of [W y] alone, for `linear.ols` and `linear.wls`."""
         p = len(self.names)
         return self.data.select(np.arange(p, 2 * p))
 
     def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
-        """Return one group's triangles [A b; 0 ‖ρ‖] with the IV estimate and its covariance as least-squares solution.
+        """Return one group's R factor [A b; 0 ‖ρ‖] with the IV estimate and its covariance as least-squares solution.
 
         ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
         section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
@@ -99,7 +99,7 @@ def instrument(
     units: Sequence[str] | None = None,
     before: Instruments | None = None,
 ) -> Instruments:
-    """Return the triangles of [Z W y], added to those of earlier rows if `before` is given.
+    """Return the R factors of [Z W y], added to those of earlier rows if `before` is given.
 
     Args:
         instruments: Z (r, p), one column for each of W.
@@ -118,7 +118,7 @@ def instrument(
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
-    """Return triangles of [Z W y] without rows, for columns of W with these names and units."""
+    """Return empty R factors of [Z W y], for columns of W with these names and units."""
     return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
 
 
@@ -222,7 +222,7 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
-    """Return the triangle (p + 1, p + 1) of min ‖P_Z (y - W x)‖, two-stage least squares; its solution is `iv`.
+    """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖, two-stage least squares; its solution is `iv`.
 
     Constraints enter IV through it: `constrained.minimise` with Q = Wᵀ P_Z W, which is positive definite, and not with
     Zᵀ W, which need not be.
@@ -241,7 +241,7 @@ def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
     require_rank(
         factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0), names,
-        "the instruments do not distinguish them: dependent columns of W, or another simulated motion",
+        "the instruments do not distinguish them: W has dependent columns, or the simulated motion differs",
     )  # fmt: skip
     return retriangulate(factor[:p, p:])
 

@@ -47,7 +47,7 @@ FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 @njit(**JOINED)
 def _body(tree, body, i, amount, rate, work):
-    """Write pose, velocity, twist and acceleration (at zero joint acceleration) of body i from its parent's."""
+    """Write pose, velocity, twist and acceleration (at zero joint acceleration) of body i from those of its parent."""
     p, kind, scale = tree[i, 0], tree[i, 1], body[i, 22]
     a, b, c = body[i, 0], body[i, 1], body[i, 2]
     d, e, f = body[i, 3], body[i, 4], body[i, 5]
@@ -194,7 +194,7 @@ def _factorise(matrix):
 
 @njit(**JOINED)
 def substitute(matrix, vector):
-    """Overwrite vector (n,) with M⁻¹ vector, M factorised."""
+    """Overwrite vector (n,) with M⁻¹ vector; M is given factorised."""
     n = vector.shape[0]
     for i in range(n):
         total = vector[i]
@@ -210,7 +210,7 @@ def substitute(matrix, vector):
 
 @njit(**JOINED)
 def seen(acts, t, motion):
-    """Return the argument of act t from a motion (n,): the weighted sum over joints."""
+    """Return the argument of friction term t: the weighted sum of a motion (n,) over the joints."""
     total = 0.0
     for k in range(motion.shape[0]):
         total += acts[t, 8 + k] * motion[k]
@@ -225,9 +225,9 @@ def _stop(memory, t, place, width):
 
 @njit(**JOINED)
 def act(code, acts, t, memory, q, v):
-    """Return the value of act t per unit parameter, and its slopes by position and rate, without load dependence.
+    """Return friction term t's torque per unit parameter and its derivatives with respect to position and velocity.
 
-    Values of `calib.dynamics.shape_kernels.shape` at the act's arguments.
+    Load dependence is ignored: values of `calib.dynamics.shape_kernels.shape` at the term's arguments.
     """
     place = seen(acts, t, q)
     state = _stop(memory, t, place, acts[t, 1]) if code in (STOP, PRESLIDING) else 0.0
@@ -291,7 +291,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
 
 @njit(**OPTIONS)
 def stiffness(kinds, acts, loads, v, matrix, unit):
-    """Return a bound [1/s] of the fastest decay rate by smoothed signs near standstill, with M factorised.
+    """Return a bound [1/s] on the fastest decay rate that smoothed signs cause near standstill; M is factorised.
 
     The trace of M⁻¹ D, D the steepest slopes of the signs in reach (not the local ones: a step that enters the band
     must not overshoot it): never below the largest eigenvalue. Springs of friction with memory count by four times
@@ -334,14 +334,14 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
 
 @njit(**OPTIONS)
 def _unstressed(kinds, acts, q, memory):
-    """Reset the memory of friction to unstressed at q (n,)."""
+    """Reset the hysteresis state of friction to unstressed at positions q (n,)."""
     for t in range(kinds.shape[0]):
         memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
 
 
 @njit(**JOINED)
 def _remember(kinds, acts, q, memory):
-    """Update the memory of friction to positions q (n,)."""
+    """Update the hysteresis state of friction to positions q (n,)."""
     for t in range(kinds.shape[0]):
         if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
             place = seen(acts, t, q)
@@ -350,7 +350,7 @@ def _remember(kinds, acts, q, memory):
 
 @njit(**OPTIONS)
 def set_parameters(values, order, entries, shares, owners, body, linear, acts):
-    """Write parameters (p,) into body, linear and acts, whose other entries are unchanged.
+    """Write parameters (p,) into the arrays body, linear and acts (friction terms); keep all other entries.
 
     order (B, 10): the standard parameter behind each of a body; entries (E, 3): row and column of `linear`, parameter;
     shares (E,): their weights; owners (T,): the parameter of each act.
@@ -493,7 +493,7 @@ def command(gains, aim, speed, seen, rate, integral, period, wish):
 
 @njit(**OPTIONS)
 def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish):
-    """Replace the acceleration wish (n,) by the torque M(q) (wish + ahead) + c(q, v) + g(q) of the model."""
+    """Replace the commanded acceleration a (n,) by the model's torque M(q) (a + ahead) + c(q, v) + g(q)."""
     n = wish.shape[0]
     wanted = wish + ahead
     for j in range(n):

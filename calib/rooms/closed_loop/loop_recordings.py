@@ -52,7 +52,7 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoops:
-    """Parts of recordings without gaps, each with its closed loop.
+    """Gap-free parts of recordings, each paired with its closed control loop (reference and controller).
 
     Attributes:
         pairs: each part and its loop.
@@ -70,7 +70,7 @@ class ClosedLoops:
 def close_loops(
     bodies: Bodies, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
 ) -> ClosedLoops:
-    """Return the closed loops of recordings whose motions contain `q_ref`.
+    """Return the closed control loops of recordings whose motions contain `q_ref`.
 
     Args:
         bodies: the model's.
@@ -176,7 +176,7 @@ def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: fl
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
-    """Return the control periods per sample, not always whole; without `rate`, for a controller of at least `min_rate`.
+    """Return the control periods per sample, not always an integer; without `rate`, the controller's is >= `min_rate`.
 
     Raises:
         UsageError: where the control rate is below the motion's.
@@ -207,7 +207,7 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
 def _controller(
     loop: LoopSettings, longest: tuple[Case, Reference]
 ) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
-    """Return the controller, stated or identified from the longest part, its identification, and notes."""
+    """Return the controller (stated, or identified from the longest part), its identification result, and notes."""
     case, reference = longest
     n = case.motion.n
     if loop.controller != "identify":
@@ -277,7 +277,7 @@ def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
 
 
 def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) -> np.ndarray:
-    """Return simulated positions (N, n), or their slopes (N, n, ...), low-passed like the recorded ones.
+    """Return simulated positions (N, n), or their derivatives (N, n, ...), low-passed like the recorded positions.
 
     Args:
         cutoff: (n,) of another of its filters [Hz].

@@ -44,7 +44,7 @@ def replay(
     chain: Chain, dynamics: Dynamics, case: Case, predicted: np.ndarray, controller: Controller | None = None,
     rate: float | None = None,
 ) -> Replay:  # fmt: skip
-    """Return the tracking errors on a recorded motion with nothing, CAD and the model fed forward.
+    """Return the tracking errors on a recorded motion with three feedforwards: none, the CAD model, and the model.
 
     Args:
         chain: whose inertias are the CAD's, where it has any.
@@ -116,7 +116,7 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 
 
 def _possible(robot: Plant, reference: Reference, min_eigenvalue: float = 0.05) -> tuple[Plant, np.ndarray]:
-    """Return the robot with motor inertia added until M(q) is positive definite, and that inertia (n,).
+    """Return the robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
 
     The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `min_eigenvalue`.
 
@@ -154,7 +154,7 @@ def track(
     inputs: IdentificationInputs, dynamics: Dynamics, predictions: Mapping[str, np.ndarray],
     controller: Controller | None = None,
 ) -> tuple[dict[str, Replay], str]:  # fmt: skip
-    """Return replays of unseen recordings (else of a training recording) by name, or why there are none.
+    """Return the replays by name, of unseen recordings or else of a training recording, or the reason for none.
 
     Args:
         predictions: case name → torques by the model.

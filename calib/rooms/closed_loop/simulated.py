@@ -32,7 +32,7 @@ class LoopEstimate(MethodEstimate):
     instrumental: Instrumental | None = None
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
-        """Return triangles on which least squares gives this estimate, with std and inflation (g,), for tests."""
+        """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
         if (own := self.instrumental) is None:
             return super().testable()
         return own.problem.testable(own.fit, own.std), np.ones(1), np.array([own.inflation])
@@ -147,7 +147,7 @@ class LoopTest:
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
-    """Return the result of instrumental variables on the problem of an estimate whose loop is stated.
+    """Return the result of instrumental variables for an estimate whose closed loop is described in the options.
 
     An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
     """
@@ -191,7 +191,7 @@ def _biased(found: Instrumental) -> list[Finding]:
 
 
 def _blurred(found: Instrumental, loops: ClosedLoops) -> list[Finding]:
-    """Return the finding on joints whose Coulomb sign is dominated by velocity noise, which instruments cannot cure."""
+    """Return the finding on joints whose Coulomb sign is mainly velocity noise, which instruments cannot correct."""
     if not found.estimator.measured:
         return []
     noise, max_blur = loops.pairs[0][0].motion.velocity_noise(), 3.0  # widths of the sign (our choice)
@@ -205,7 +205,7 @@ SIGMAS = 5.0  # of both together, by which a parameter differs surely (our choic
 
 
 def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
-    """Return the disagreement of an output-error estimate with the recorded torques; None if they agree.
+    """Return the disagreement of an output-error estimate with the recorded torques; None if both agree.
 
     Args:
         problem: of both.
@@ -244,7 +244,7 @@ def _factors(problem: IdentificationProblem, own: np.ndarray, other: np.ndarray)
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
-    """Return the loop test of an estimate, as the core stores and prints it."""
+    """Return the results of an estimate's loop test, in the form that is stored and printed."""
     test = compare_with_loop(problem, estimate)
     taken = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     return LoopResults(

@@ -56,7 +56,7 @@ class Plant:
         for one in self.terms:
             if any(x <= 0.0 for name, x in zip(one.form.settings, one.settings) if name in ("v0", "rest")):
                 raise CalibError(
-                    f"term '{one.name}': an exact sign cannot be integrated; state a smoothing v0 of about 0.01 rad/s"
+                    f"term '{one.name}': sign(v) without smoothing cannot be simulated; give v0, about 0.01 rad/s"
                 )
 
     @property
@@ -222,7 +222,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return each parameter's place in the output of `packed`: order, entries, shares, owners of `loop_kernels`."""
+    """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into the output of `packed`."""
     n, first = plant.bodies.n, plant.inertial
     order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
@@ -241,7 +241,7 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def packed(plant: Plant) -> Packed:
-    """Return the arrays tree, body, linear, kinds and acts in the layout of the kernels."""
+    """Return the robot model as arrays in the layout of the kernels: tree, body, linear, kinds and acts."""
     bodies, n = plant.bodies.count, plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
     links = np.column_stack([parents, plant.bodies.kinds, plant.bodies.coordinates]).astype(np.int64)
@@ -267,7 +267,7 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 
 
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
-    """Return the linear terms (n, 2 n + 1), and the acts: row, code, amount, seven settings, weights (n,).
+    """Return the linear terms (n, 2 n + 1), and the friction terms: row, code, amount, seven settings, weights (n,).
 
     `ramp`: of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated.
     """
@@ -304,8 +304,8 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
         )
     if status == loop_kernels.STIFF:
         return CannotSimulate(
-            f"{place}friction at rest is too stiff for the control period, by more than "
-            f"{loop_kernels.MAX_STEPS} steps: "
+            f"{place}friction at rest is too stiff: integrating a control period takes more than "
+            f"{loop_kernels.MAX_STEPS} steps; "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
     return Diverged(f"the loop diverged at {time:.4g} s: {LOWER}", None)

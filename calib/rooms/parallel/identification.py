@@ -45,11 +45,11 @@ Recorded = str | Path | Recording
 
 
 class ParallelDynamics(DynamicsModel):
-    """Identified dynamics of a parallel robot: what `calib.identify_dynamics` returns of one."""
+    """Identified dynamics of a parallel robot, as `calib.identify_dynamics` returns them."""
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the rows (N, rows) of a motion q, v, a (N, n) of the actuated joints without payload.
+        """Return the torques of all rows (N, rows) for a motion q, v, a (N, n) of the actuated joints, without payload.
 
         Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
         their power [W]: as the model was identified.

@@ -77,7 +77,7 @@ class ParallelFit(Judged):
 
     @property
     def robot(self) -> ParallelMechanism:
-        """The calibrated robot: what identification, excitation and planning take."""
+        """The calibrated robot, as input of identification, excitation and planning."""
         return ParallelMechanism(self.found.known, self.nominal.source)
 
     @property
@@ -87,7 +87,7 @@ class ParallelFit(Judged):
 
     @property
     def verdict(self) -> Verdict:
-        """Pass, marginal or fail, with the reason: by the rules of the module, whose limits are the catalogue's."""
+        """Pass, marginal or fail, with the reason (rules: see the module; limits: catalogue of findings)."""
         kinds = {"contradictions": (np.ones(self.own.shape[2], dtype=bool), "mrad (or mm)")}
         figures, rules = [], [finding("readings-alone")]
         if self.measured:
@@ -122,7 +122,7 @@ class ParallelFit(Judged):
 
     @property
     def judged(self) -> Mapping[str, np.ndarray]:
-        """Errors of unseen rows by name, or of the fitted rows without unseen ones."""
+        """Errors of the unseen rows by name or, without unseen rows, of the fitted rows."""
         return self.unseen or {"fitted": self.own}
 
     @checked
@@ -312,7 +312,7 @@ def _parts(known: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> np.ndarray:
-    """Return the errors of both robots (2, m, k): platform coordinates, or the encoders' contradictions."""
+    """Return the errors (2, m, k) of nominal and calibrated robot: platform coordinates, or `contradictions`."""
     readings, coordinates = _parts(nominal, rows)
     if coordinates is None:
         return np.array([contradictions(known, readings) for known in (nominal, calibrated)])

@@ -35,7 +35,7 @@ class ParallelMechanism:
 
     @property
     def chain(self) -> ParallelRobot:
-        """The actuated joints in the form of an arm."""
+        """The robot in place of a serial `Chain`: names, limits and number of the actuated joints."""
         return self.known.robot
 
     def write(self, folder: Path) -> None:

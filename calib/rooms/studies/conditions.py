@@ -54,12 +54,14 @@ from calib.identification.methods.registry import METHODS, method_named
 ROBOTS = ("tx40", "rv2sq")
 MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
 TRIAL = 1
-"""Raised whenever the trials of all methods come out otherwise: no row from before then counts.
+"""Number raised whenever the trials of all methods change: rows with a lower number do not count.
 
 Where one method changes, its `calib.identification.methods.method.Method.version` is raised."""
 
 _Few = Spread(words="a value, or a list of them")
-Robots = Annotated[tuple[Annotated[str, OneOf(ROBOTS, "known robots only; for recordings: calib compare")], ...], _Few]
+Robots = Annotated[
+    tuple[Annotated[str, OneOf(ROBOTS, "simulated robots only; for recordings: calib compare")], ...], _Few
+]
 Wholes = Annotated[tuple[Annotated[int, Whole(1, 100)], ...], _Few]
 Cutoffs = Annotated[tuple[Annotated[float, Real(least=0, words="0 or more, Hz without a unit")], ...], _Few]
 Mismatches = Annotated[tuple[Annotated[str, OneOf(MISMATCHES)], ...], _Few]
@@ -129,7 +131,7 @@ class Condition:
 
     @property
     def digest(self) -> str:
-        """Key of its rows in the store: the same for conditions that differ in name alone."""
+        """Key of the condition's rows in the store; conditions that differ only in name have the same key."""
         content = {key: value for key, value in asdict(self).items() if key not in ("name", "resimulated")}
         return hashlib.sha256(json.dumps([TRIAL, content], sort_keys=True).encode()).hexdigest()[:16]
 

@@ -79,7 +79,7 @@ class ComparedMethod:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Per block of time (k, rows): squares of errors and of torques, in the band and as recorded."""
+    """Sums per block of time (k, rows): squared errors and squared torques, in the band and as recorded."""
 
     error: np.ndarray
     size: np.ndarray
@@ -146,17 +146,19 @@ def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> li
     notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
     notes += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
-        notes.append("none to take: all unseen recordings repeat the training motion; give another with --validate")
+        notes.append(
+            "no method recommended: all unseen motion repeats the training motion; give another with --validate"
+        )
     elif repeated:
         notes.append(f"excluded from the ranking: {', '.join(repeated)}")
     judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
     if found and found[0].unseen >= NO_MODEL:
         notes.append(
-            f"none to take: error of the best {found[0].unseen:.3g} % on unseen motion, no model {NO_MODEL:g} %: "
+            f"no method recommended: best unseen error {found[0].unseen:.3g} %, without a model {NO_MODEL:g} %: "
             "add training motion"
         )
     elif judged_one is not None:
-        notes.append(f"none to take: the model of {judged_one.name} fails in calib identify, see the reason below")
+        notes.append(f"no method recommended: the model of {judged_one.name} fails in calib identify, reason below")
     return list(dict.fromkeys(notes))
 
 
@@ -314,7 +316,7 @@ def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     good = [one for one in found if not one.failure]
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "
-        f"as good: within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
+        f"methods are as good within {MAX_SIGMAS:g} standard errors of the difference, or {MAX_SHARE:.0%}, of the best"
     )
     if good:
         yield table("Methods", COLUMNS, good, note, lambda one: one.chosen)

@@ -153,7 +153,7 @@ def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
         own = {method.method: method for method in one.methods}
         lines.append((one.condition.name, *(_median_cell(own.get(name)) for name in names)))
     note = (
-        f"Median over trials [%]; a trial without an estimate counts as ∞. * the one to take; (n) of fewer than "
+        f"Median over trials [%]; a trial without an estimate counts as ∞. *: recommended; (n): n runs, fewer than "
         f"{MIN_DATA_SETS} runs."
     )
     return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=range(1, len(names) + 1))
@@ -174,7 +174,7 @@ def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
         if why := one.why_none:
             found.setdefault(why, []).append(one.condition.name)
     return [
-        f"none to take on {'all' if 1 < len(names) == len(conditions) else ', '.join(names)}: {why}"
+        f"no method recommended for {'all' if 1 < len(names) == len(conditions) else ', '.join(names)}: {why}"
         for why, names in found.items()
     ]
 

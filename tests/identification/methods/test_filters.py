@@ -83,7 +83,7 @@ def test_what_a_filter_cannot_follow_is_a_status():
     assert found.status in (EstimateStatus.CANNOT_BE_SIMULATED, EstimateStatus.DIVERGED) and found.failure is not None
     exact = tuple(replace(one, settings=(0.0,)) if one.shape == "sign" else one for one in problem.model.terms)
     found = METHODS["ekf"].estimate(replace(problem, model=replace(problem.model, terms=exact)))
-    assert found.status is EstimateStatus.CANNOT_BE_SIMULATED and "exact sign" in str(found.failure)
+    assert found.status is EstimateStatus.CANNOT_BE_SIMULATED and "without smoothing" in str(found.failure)
 
 
 def test_a_filter_wants_motor_torques():

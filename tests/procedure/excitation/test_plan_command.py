@@ -201,7 +201,7 @@ def test_an_uncertain_model_keeps_torque_free(room, capsys):
     assert (np.abs(careful.track.tau) <= careful.limits.torque).all()
     files.write_table(room / "model" / "covariance.csv", ("name", "Ia2"), [("Ia2", 1e4)])
     assert plan("--model", "model") == 2
-    assert "is uncertain by" in capsys.readouterr().err
+    assert "the margin for torque uncertainty" in capsys.readouterr().err
 
 
 def test_a_payload_on_board_takes_longer(room):

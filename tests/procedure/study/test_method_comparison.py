@@ -110,7 +110,7 @@ def test_what_identify_fails_is_not_to_be_taken(robot: Path, tmp_path: Path, cap
     words = [str(robot), str(train), "--validate", str(other)]
     assert run(["compare", *words, "--methods", "wls,ols"]) == 1
     shown = capsys.readouterr().out
-    assert "take │" not in shown and "none to take" in shown
+    assert "take │" not in shown and "no method recommended" in shown
     compared = shown[shown.index("verdict: fail") :].splitlines()[0].partition(": ")[2].partition(": ")[2]
     name, _, reason = compared.partition(": ")
     out = ["--method", name, "--friction", "standard", "--no-plots", "--out", str(tmp_path / "out")]

@@ -198,7 +198,7 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
 
 
 def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:
-    """Return the platform coordinates (N, r) of postures, from home: position, roll-pitch-yaw about the base's axes."""
+    """Return the platform coordinates (N, r) of postures, relative to home: position, roll-pitch-yaw in base axes."""
     home = known.robot.home
     turned = posture.pose[:, :3, :3] @ home[:3, :3].T
     angles = Rotation.from_matrix(turned).as_euler("xyz")
@@ -241,7 +241,7 @@ def twists(
 
 
 def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return J_p^inv (N, n, r): readings' rates by the twist's independent parts (A_p with B_p = -1, eqs 5, 15)."""
+    """Return J_p^inv (N, n, r), which maps the twist's independent parts to encoder rates (eqs 5, 15; B_p = -1)."""
     D, _ = twists(known, links)
     return np.concatenate([one.inverse @ (one.carried @ D) for one in links], axis=1)[:, known.robot.actuated]
 
@@ -370,7 +370,7 @@ def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
 
 
 def _leg_rcond(one: LegLinks, home: LegLinks) -> np.ndarray:
-    """Return reciprocal conditions (N,) of a leg's Jacobian, lengths in units of its longest lever at home."""
+    """Return reciprocal conditions (N,) of a leg's Jacobian; lengths are scaled by its longest lever at home."""
     moved = np.linalg.norm(home.full[0, :3], axis=0)
     turns = np.linalg.norm(home.full[0, 3:], axis=0) > 0.5
     length = max(float(moved[turns].max(initial=0.0)), 1e-6)
@@ -379,7 +379,7 @@ def _leg_rcond(one: LegLinks, home: LegLinks) -> np.ndarray:
 
 
 def _platform_rcond(known: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Return reciprocal conditions (N,) of J_p^inv, translations and rotations in units of their largest at home."""
+    """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are scaled by their maxima at home."""
     turns, size = known.robot.selected > 2, np.linalg.norm(home[0], axis=0)
     scale = np.where(turns, size[turns].max(initial=0.0), size[~turns].max(initial=0.0))
     scaled = rows / scale / np.linalg.norm(home[0] / scale, axis=1)[:, None]
@@ -387,13 +387,13 @@ def _platform_rcond(known: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> n
 
 
 def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return 1 / (|J| |J⁻|) (N,) in Frobenius norms: between the reciprocal condition and a part of it."""
+    """Return 1 / (|J| |J⁻|) (N,) in Frobenius norms, a lower bound of the reciprocal condition number."""
     size = np.linalg.norm(J, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
     return np.where(np.isfinite(size), 1.0 / np.maximum(size, 1e-300), 0.0)
 
 
 def _determinants(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return signs (N, L + 1) of the legs' minors, and of the platform's where it has as many actuators as freedoms."""
+    """Return the signs (N, L + 1) of the legs' minors, and of the platform's determinant if J_p^inv is square."""
     signs = [np.sign(np.linalg.det(one.jacobian[:, minor])) for one, minor in zip(links, known.minors)]
     last = np.zeros(len(links[0].gap))
     if not known.robot.redundant:

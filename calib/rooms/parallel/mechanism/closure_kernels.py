@@ -16,7 +16,7 @@ KIND, SCALE, REVOLUTE = 1, 12, 1
 
 @njit(**OPTIONS)
 def invert(A, out):
-    """Write A⁻¹ (n, n) by Gauss and Jordan with row pivots; A is lost. A zero pivot becomes tiny: huge entries."""
+    """Write A⁻¹ (n, n) by Gauss and Jordan with row pivots, overwriting A; a zero pivot is made tiny."""
     n = A.shape[0]
     for i in range(n):
         for j in range(n):
@@ -135,7 +135,7 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
 
 @njit(**OPTIONS)
 def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, gap, lever):
-    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as of `one_leg` with N before."""
+    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as in `one_leg`, with a leading axis N."""
     frame = np.empty((4, 6 + 3 * q.shape[1]))
     for s in range(q.shape[0]):
         one_leg(

@@ -165,7 +165,7 @@ def contradictions(known: ClosedRobot, readings: np.ndarray) -> np.ndarray:
 def _observed(
     known: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray | None, parameters: Sequence[LoopParameter]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals (m n or m (n - r),) and their observation Jacobian by the parameters: r ≈ W δg."""
+    """Return residuals (m n or m (n - r),) and their Jacobian with respect to the parameters: r ≈ W δg."""
     robot = known.robot
     posture = known.place(coordinates) if coordinates is not None else known.locate(readings)
     links = leg_links(robot, posture)

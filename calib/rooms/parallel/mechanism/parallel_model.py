@@ -59,7 +59,7 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
 
 
 def energy_columns(pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return kinetic and potential energy (N, 10) per unit of each standard parameter; arguments as above."""
+    """Return kinetic and potential energy (N, 10) per unit of each standard parameter; see `wrench_regressor`."""
     R = pose[:, :3, :3]
     u, w = (np.einsum("nji,nj->ni", R, x) for x in (twist[:, :3], twist[:, 3:]))
     result = np.empty((len(R), 10))
@@ -112,7 +112,7 @@ class ParallelModel:
 
     @property
     def n(self) -> int:
-        """Actuated joints: what is recorded."""
+        """Number of actuated joints, whose motion is recorded."""
         return self.known.robot.n
 
     @cached_property
@@ -173,7 +173,7 @@ class ParallelModel:
         self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
-        """Return the rows' torques, forces or power (N, rows) of parameters (p,), without the regressor."""
+        """Return the torques, forces or power (N, rows) for parameters (p,), computed without the regressor."""
         motion = self.moved(q, v, a)
         return self._on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
 
@@ -182,7 +182,7 @@ class ParallelModel:
         return of_readings(self.known, self.known.locate(q), np.asarray(v, dtype=float), np.asarray(a, dtype=float))
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return W (N, r, p) on the platform's coordinates; its memory is ordered (p, r, N)."""
+        """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
         robot, J = self.known.robot, motion.jacobians
         out = np.zeros((self.p, robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
@@ -235,7 +235,7 @@ class ParallelModel:
         return own[present].sum(axis=0)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the energies h (N, p) at the encoders' q, v (N, n), as `IdentificationModel.energy_columns`."""
+        """Return the energy regressor h (N, p) at encoder q, v (N, n), like `IdentificationModel.energy_columns`."""
         return self.energies(self.moved(q, v, np.zeros_like(v)), carried)
 
     def energies(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
@@ -250,7 +250,7 @@ class ParallelModel:
         return out.T
 
     def _fill_platform(self, out: np.ndarray, own: np.ndarray, carried: Collection[str] | None) -> None:
-        """Write the platform's ten columns, and the same for each payload on board."""
+        """Write the ten columns of the platform, and ten columns for each payload on board."""
         for first, label in zip(range(self.legs[-1][2].stop, self.inertial, 10), (None, *self.payloads)):
             if label is None or carried is None or label in carried:
                 out[first : first + 10] = own
@@ -284,7 +284,7 @@ class ParallelModel:
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Draw states: the platform uniform in its box, its twist and the derivative within ±3."""
+        """Draw random states: the platform uniform in its box, its twist and the twist's derivative within ±3."""
         robot = self.known.robot
         posture = self.known.place(rng.uniform(robot.lower, robot.upper, (count, robot.r)))
         motion = of_platform(self.known, posture, *rng.uniform(-RATE, RATE, (2, count, robot.r)))
@@ -300,7 +300,7 @@ class ParallelModel:
         return np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
 
     def _on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
-        """Return the regressor rows (N, rows, p) from those on the platform's coordinates."""
+        """Return the regressor (N, rows, p) of the torque rows from the one in platform coordinates, W (N, r, p)."""
         if self.torque_rows.name == PLATFORM:
             return W
         if self.torque_rows.name == POWER.name:
@@ -337,7 +337,7 @@ def make_parallel_model(
     known: ClosedRobot, sets: Sequence[str] = (), v0: float = V0, rows: TorqueRows | None = None,
     payloads: Sequence[str] = (), passive: str = "",
 ) -> ParallelModel:  # fmt: skip
-    """Return the model of a robot with drive terms on its actuated joints, and friction of the passive ones.
+    """Return the model of a robot with drive terms on its actuated joints, and friction of its passive joints.
 
     Args:
         sets: names out of `calib.dynamics.drives.standard`, one text per actuated joint or one for all; none: Ia Fv Fc

@@ -91,7 +91,7 @@ class Leg(Frozen):
 
     @property
     def bodies(self) -> int:
-        """Number of the leg's links that are separate bodies: the last one of a rigid end is the platform."""
+        """Number of the leg's links that are separate bodies; the last link of a rigid end is the platform."""
         return self.chain.n - (self.end == "rigid")
 
 
@@ -163,7 +163,7 @@ class ParallelRobot(Frozen):
 
     @property
     def redundant(self) -> bool:
-        """Whether it has more actuators than freedoms."""
+        """Whether the robot has more actuators than freedoms."""
         return self.n > self.r
 
     @cached_property
@@ -207,7 +207,7 @@ class ParallelRobot(Frozen):
         return str(max(leg.chain.n for leg in self.legs) + 1)
 
     def with_legs(self, legs: tuple[Leg, ...]) -> ParallelRobot:
-        """Return the robot with other legs: another geometry."""
+        """Return the robot with its legs replaced, e.g. by calibrated ones."""
         return replace(self, legs=legs)
 
 

@@ -15,7 +15,7 @@ from calib.rooms.parallel.mechanism.closure import ClosedRobot, LegLinks, Postur
 
 @dataclass(frozen=True, eq=False)
 class LoopJacobians:
-    """Jacobians at N postures, by the independent parts v (r,) of the platform's twist.
+    """Jacobians at N postures, with respect to the independent parts v (r,) of the platform's twist.
 
     Attributes:
         joints: (N, n_t, r) J_t: rates of all joints of the tree.
@@ -62,7 +62,7 @@ def loop_jacobians(known: ClosedRobot, posture: Posture) -> LoopJacobians:
 def of_platform(
     known: ClosedRobot, posture: Posture, rate: np.ndarray, change: np.ndarray, jacobians: LoopJacobians | None = None
 ) -> LoopMotion:
-    """Return the motion of postures from the platform's motion.
+    """Return velocities and accelerations at postures from those of the platform.
 
     Args:
         rate, change: (N, r) independent parts of its twist, and their derivatives.
@@ -80,7 +80,9 @@ def of_platform(
 
 
 def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
-    """Return the motion of postures from the encoders' motion, for redundant encoders by least squares (eqs 16, 18).
+    """Return velocities and accelerations at postures from those of the encoders (eqs 16, 18).
+
+    All joints and the platform; with redundant encoders, by least squares.
 
     Args:
         v, a: (N, n) of the actuated joints.
@@ -94,7 +96,7 @@ def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarr
 
 
 def _attachment_bias(one: LegLinks, twist: np.ndarray) -> np.ndarray:
-    """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); no angular part."""
+    """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); its angular part is zero."""
     result = np.zeros(one.gap.shape)
     turn = twist[:, 3:]
     result[:, :3] = cross(turn, cross(turn, one.lever))
@@ -137,7 +139,7 @@ def preload_directions(known: ClosedRobot, jacobians: LoopJacobians) -> np.ndarr
 
 
 def overconstraint(known: ClosedRobot, jacobians: LoopJacobians, torques: np.ndarray) -> np.ndarray:
-    """Return c (N, n - r) [N m or N] of actuator torques (N, n): what of them does no work."""
+    """Return c (N, n - r) [N m or N] of actuator torques (N, n): their part that does no work."""
     torques = shaped(torques, (len(jacobians.readings), known.robot.n), "torques of the actuators")
     return np.einsum("nac,na->nc", preload_directions(known, jacobians), torques)
 
@@ -145,7 +147,7 @@ def overconstraint(known: ClosedRobot, jacobians: LoopJacobians, torques: np.nda
 def distributed(
     known: ClosedRobot, jacobians: LoopJacobians, forces: np.ndarray, preload: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Return actuator torques (N, n) that give forces (N, r) on the platform's coordinates, with overconstraint c.
+    """Return actuator torques (N, n) that produce forces (N, r) in platform coordinates, with overconstraint c.
 
     Args:
         preload: c, (N, n - r) or one for all [N m or N]; 0: the torques of least norm.

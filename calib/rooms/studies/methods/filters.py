@@ -168,7 +168,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
-    """Return the spread of a belief after its parameter block is replaced by a covariance."""
+    """Return a belief's spread (covariance or root) with its parameter block replaced by that of a covariance."""
     spread = np.array(belief.spread)
     spread[first:, first:] = np.linalg.cholesky(parameters) if belief.root else parameters
     return spread
@@ -176,7 +176,7 @@ def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Stepping:
-    """One step of the robot for a filter: n joints, the plant's number of parameters, columns among them."""
+    """One step of the robot for a filter, with n joints and the plant's parameters, of which `columns` are states."""
 
     made: Stepper
     kind: Filter
@@ -217,7 +217,7 @@ class _Stepping:
             spread[:, :n], spread[:, n : 2 * n] = q, v
             noise = self._noise(gain, len(tau) * period, torque, spread.shape[1])
             return predicted(spread, noise, self.kind, narrower)
-        raise CannotSimulate(f"the filter's parameters give no robot that can be simulated: {failure}", before.mean)
+        raise CannotSimulate(f"a robot with the filter's parameters cannot be simulated: {failure}", before.mean)
 
     def _values(self, states: np.ndarray) -> np.ndarray:
         """Return the plant's parameters (K, p) of states (K, L)."""
@@ -234,20 +234,20 @@ class _Stepping:
 
 
 _ASSUMES = (
-    "torque noise by the residuals of least squares, position noise by the spectrum, both white; "
+    "torque noise as in the residuals of least squares, position noise as in the spectrum, both white; "
     "the robot has the model's friction"
 )
 EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
     _KalmanFilter(
         ("sr" if root else "") + rule, _ASSUMES, Filter(rule, bool(root)), source=source,
         description="the same, square-root form" if root else description,
-        tunes=("first covariance of the parameters", "rate of the filter", *(["α = 0.1"] if rule == "ukf" else [])),
+        tunes=("initial covariance of the parameters", "rate of the filter", *(["α = 0.1"] if rule == "ukf" else [])),
     )
     for rule, description, *sources in (
         ("ekf", "extended Kalman filter, parameters as states", "Gautier & Poignet 2001",
          "Kaminski, Bryson & Schmidt 1971"),
-        ("ukf", "unscented Kalman filter, the same", "Julier & Uhlmann 2004", "van der Merwe & Wan 2001"),
-        ("cdkf", "central-difference Kalman filter, the same", "Nørgaard, Poulsen & Ravn 2000",
+        ("ukf", "unscented Kalman filter, parameters as states", "Julier & Uhlmann 2004", "van der Merwe & Wan 2001"),
+        ("cdkf", "central-difference Kalman filter, parameters as states", "Nørgaard, Poulsen & Ravn 2000",
          "van der Merwe & Wan 2001"),
     )
     for root, source in enumerate(sources)

@@ -56,7 +56,7 @@ class Belief:
 
     @property
     def deviations(self) -> np.ndarray:
-        """(L, L) lower triangular S.
+        """Lower triangular root S (L, L) of the covariance.
 
         Raises:
             Diverged: where the covariance is no longer positive definite.

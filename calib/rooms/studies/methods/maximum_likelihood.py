@@ -99,7 +99,7 @@ class _Recording:
 
 @dataclass(frozen=True, eq=False)
 class _NoisyStates:
-    """All samples: matrix (M, n, p), target and rows in use (M, n), recordings, and columns that have slopes."""
+    """All samples: matrix (M, n, p), target and rows in use (M, n), recordings, and differentiable columns."""
 
     model: IdentificationModel
     columns: np.ndarray
@@ -229,7 +229,7 @@ def _step(task: _NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
 
 
 def _change(task: _NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
-    """Return W(x + error) - W(x) (M, n, p) at the kept samples, error (M, 3, n); zero for columns without slopes."""
+    """Return W(x + error) - W(x) (M, n, p) at the kept samples, error (M, 3, n); zero where there is no derivative."""
     out = np.zeros_like(task.matrix[part.own])
     smooth = np.flatnonzero(task.smooth)
     for start in range(0, len(part.q), BLOCK):
@@ -254,9 +254,9 @@ def _packed(problem: IdentificationProblem, found: _Round, noise: np.ndarray) ->
 
 ML = _MaximumLikelihood(
     "ml",
-    "positions have white noise of the level that each log's spectrum shows, torques of the level that is left; both "
-    "small enough for the torque to be linear in them",
-    description="maximum likelihood: positions noisy too, noise levels estimated",
+    "positions have white noise (level from each log's spectrum), so have torques (level from the residuals); both are "
+    "small enough to linearise the torque",
+    description="maximum likelihood with noisy positions, noise levels estimated",
     source="Olsen, Swevers & Verdonck 2002; Leboutet et al. 2021",
     tunes=("tolerance 0.01 sigma", "40 rounds"),
 )

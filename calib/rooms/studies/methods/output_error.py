@@ -94,7 +94,7 @@ class _OutputError(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Compared signals: recordings in their loops, positions or torques; `count` of simulations."""
+    """Signals to compare, positions or torques of the recordings' control loops; `count` counts the simulations."""
 
     problem: IdentificationProblem
     robot: BelievedRobot
@@ -200,12 +200,12 @@ def _packed(
     return LinearFit(estimate, std, *condition_numbers(flat))
 
 
-_LOOP = "controller and reference as stated in the loop, the robot has the model's friction; "
+_LOOP = "controller and reference are those of [loop], the robot has the model's friction; "
 CLOE = _OutputError(
     "cloe", _LOOP + "measured torques are not used", False, source="Landau 1979; Leboutet et al. 2021",
-    description="closed-loop output error: simulated positions meet measured ones",
+    description="closed-loop output error: simulated positions are fitted to measured ones",
 )  # fmt: skip
 CLIE = _OutputError(
     "clie", _LOOP + "measured positions are not used", True, source="Leboutet et al. 2021",
-    description="closed-loop input error: simulated torques meet measured ones",
+    description="closed-loop input error: simulated torques are fitted to measured ones",
 )  # fmt: skip

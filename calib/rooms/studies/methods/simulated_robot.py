@@ -152,13 +152,13 @@ class BelievedRobot:
     plant: Plant
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Plant:
-        """Return the robot with parameters (p,), carrying the payloads of a case."""
+        """Return the robot with parameters (p,) and the payloads of a case."""
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         return replace(self.plant, parameters=parameters * self.carried(case))
 
     def carried(self, case: Case | None) -> np.ndarray:
-        """Return a factor per robot parameter: 0 for payloads that a case does not carry, otherwise 1."""
+        """Return a factor per robot parameter: 0 for payloads that are not attached in a case, otherwise 1."""
         if case is None:
             return np.ones(len(self.plant.parameters))
         return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
@@ -203,7 +203,7 @@ def start_of(
     inertia: np.ndarray,
     simulated: Callable[[np.ndarray], object],
 ) -> np.ndarray:
-    """Return initial parameters (p,): the stated ones, or the nearest to least squares that can be simulated.
+    """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
 
     Args:
         method: name of the one that simulates.

@@ -263,7 +263,7 @@ def _linearise(
 
 @njit(**OPTIONS)
 def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
-    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c), M factorised."""
+    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); M is given factorised."""
     n, c = out.shape
     for j in range(n):
         for m in range(c):
