@@ -146,9 +146,7 @@ def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> li
     notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
     notes += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
-        notes.append(
-            "no method recommended: all unseen motion repeats the training motion; give another with --validate"
-        )
+        notes.append("no method recommended: all unseen files repeat the training motion; give others with --validate")
     elif repeated:
         notes.append(f"excluded from the ranking: {', '.join(repeated)}")
     judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
