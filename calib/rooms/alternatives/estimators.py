@@ -18,7 +18,7 @@ COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our ch
 
 
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
-    """Return the scaled TLS fit: moving columns have noise of `COLUMN_NOISE` times their rms, y that of its residuals.
+    """Return the scaled TLS fit: noise of moving columns: `COLUMN_NOISE` times their rms; of y: its residuals.
 
     The common level is the smallest singular value's; the ratio of the noises, which no single recording identifies, is
     our choice.
@@ -51,7 +51,7 @@ class _ConstrainedLeastSquares(Method):
     free: LeastSquares
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate under the problem's constraints; its covariance takes binding ones as equalities.
+        """Return the estimate under the problem's constraints; its covariance treats active constraints as equalities.
 
         Raises:
             UsageError: for constraints that contradict each other.

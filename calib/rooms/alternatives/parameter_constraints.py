@@ -167,7 +167,7 @@ def constraints_of(problem: IdentificationProblem) -> Constraints:
 def hold(
     fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated: bool
 ) -> tuple[LinearFit, Held]:
-    """Return a fit under constraints, with binding ones as equalities in its covariance, and those constraints.
+    """Return a constrained fit, whose covariance treats active constraints as equalities, and these constraints.
 
     Args:
         fit: the free estimate.

@@ -408,7 +408,7 @@ def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -
 
 @dataclass(frozen=True, eq=False)
 class PlatformRegressor:
-    """Rows on the platform's coordinates, and actuator torques, as functions of x, v, a with slopes by differences.
+    """Regressor in platform coordinates and actuator torques as functions of x, v, a; gradients are by differences.
 
     Attributes:
         model: of the robot.
@@ -434,7 +434,7 @@ class PlatformRegressor:
     def regressor_gradient(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · W (N, r, b) by x, v, a, each (N, r)."""
+        """Return the gradients of Σ weights · W (N, r, b) with respect to x, v, a, each (N, r)."""
         return self.slopes(x, v, a, self._columns, weights)
 
     def torques(self, motion: LoopMotion) -> np.ndarray:
@@ -448,7 +448,7 @@ class PlatformRegressor:
         return motion.v[:, self.model.known.robot.actuated]
 
     def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
-        """Return coordinates clipped to the robot's box: a search may leave it.
+        """Return coordinates clipped to the robot's box, since a search may leave the box.
 
         `spare_share`: of the box's width, beyond it (our choice).
         """
@@ -462,7 +462,7 @@ class PlatformRegressor:
     def slopes(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray], weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of Σ weights · of(motion) by x, v, a; central differences, exact to rounding for v, a.
+        """Return the gradients of Σ weights · of(motion) in x, v, a by central differences (exact in v, a).
 
         Args:
             of: the motion of N samples -> values (N, ...); weights: of the same shape.
