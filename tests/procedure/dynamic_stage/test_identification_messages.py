@@ -39,7 +39,7 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_command", lambda: stop)
+    monkeypatch.setattr(cli, "command_tree", lambda: stop)
     monkeypatch.setattr(cli, "_spread", list)
     assert cli.run([command, "folder"]) == 130
     assert words in capsys.readouterr().err
@@ -49,7 +49,7 @@ def test_a_second_ctrl_c_ends_as_the_first_would(monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_command", lambda: stop)
+    monkeypatch.setattr(cli, "command_tree", lambda: stop)
     monkeypatch.setattr(cli, "_complain", stop)  # as it comes while the first is told
     before = signal.getsignal(signal.SIGINT)
     try:
