@@ -1,5 +1,6 @@
 """Robots for the planning tests: the LWR4+ with its drives, and a cart whose fastest motion is known in closed form."""
 
+import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -7,10 +8,13 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import brentq
 
-from calib.dynamics import drives
+from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
+from calib.identification.model_file import to_table
+from calib.identification.prediction import Dynamics
+from calib.robot import description
 from calib.robot.library import load
 from calib.rooms.cells.known_robots import truth
 from trajectories.timing.limits import TimingLimits
@@ -32,12 +36,30 @@ def read_setpoints(path: Path) -> dict[str, np.ndarray]:
 
 
 @cache
-def lwr(viscous: float = 1.0) -> PathDynamics:
-    """Return the arm with Ia, Fv, Fc of the truth, viscous friction times a factor."""
+def identified(viscous: float = 1.0) -> Dynamics:
+    """Return the arm's model with Ia, Fv, Fc of the truth, viscous friction times a factor."""
     known = truth("lwr4plus")["drives"]
     amounts = np.column_stack([known["Ia"], viscous * np.array(known["Fv"]), known["Fc"]]).ravel()
     model = IdentificationModel(bodies_of(CHAIN), drives.standard(["Ia Fv Fc"] * 7))
-    return of_standard(model, np.concatenate([standard_parameters(CHAIN), amounts]))
+    return Dynamics(model, np.concatenate([standard_parameters(CHAIN), amounts]))
+
+
+@cache
+def lwr(viscous: float = 1.0) -> PathDynamics:
+    return of_standard(identified(viscous).model, identified(viscous).values)
+
+
+@cache
+def base_of_lwr() -> base.Base:
+    return base.find(identified().model)
+
+
+def write_model(folder: Path, **changed: float) -> None:
+    """Write what `calib identify` writes of the arm's model, without its covariance; `changed`: values by name."""
+    model, values = identified().model, identified().values
+    values = np.array([changed.get(name, value) for name, value in zip(model.names, values)])
+    description.write(folder / "robot.toml", CHAIN)
+    (folder / "dynamics.json").write_text(json.dumps(to_table(Dynamics(model, values), base_of_lwr())))
 
 
 def limits(**changed) -> TimingLimits:

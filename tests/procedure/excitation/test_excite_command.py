@@ -14,13 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from differences import check
-from planned import read_setpoints
+from planned import CHAIN, base_of_lwr, identified, read_setpoints, write_model
 
 from calib.data.recordings.recording_files import read_recording
-from calib.dynamics import base, drives
-from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError
+from calib.folders import write_covariance
 from calib.identification.identify_options import parse_options
 from calib.procedure.excitation import coefficients, design
 from calib.procedure.excitation import folder as motion_folder
@@ -28,7 +26,6 @@ from calib.procedure.excitation.inputs import identifiable, read_inputs, read_mo
 from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.kinematics import forward
-from calib.robot.library import load
 from trajectories.basis import SampledMotion
 from trajectories.design.objectives import condition_numbers
 from trajectories.design.search import StartSearch
@@ -69,7 +66,7 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
         assert (Path("e") / name).stat().st_size > 5000
     t, q, v, a = read_setpoints(Path("e/trajectory.csv")).values()
     assert q.shape == (1601, 7) and np.allclose(np.diff(t), 0.01)
-    chain = load("lwr4plus")
+    chain = CHAIN
     assert (q < chain.upper).all() and (q > chain.lower).all() and (np.abs(a) < 12).all()
     assert (np.abs(v) <= 0.9 * np.array([joint.velocity for joint in chain.joints])).all()
     tool = forward(chain, q)[:, :3, 3]
@@ -91,10 +88,10 @@ def check_playback(q: np.ndarray, stands: np.ndarray, metrics: dict) -> None:
     assert np.abs(np.diff(run["q"], axis=0) * 100 - (run["v"][1:] + run["v"][:-1]) / 2).max() < 0.01
     once = len(lead["q"]) + 1600
     assert len(slow["q"]) == 3 * (once - 1) + 1 and np.allclose(slow["q"][::3], run["q"][:once], atol=1e-9)
-    assert (np.abs(run["tau"]) <= [joint.effort for joint in load("lwr4plus").joints]).all()
+    assert (np.abs(run["tau"]) <= [joint.effort for joint in CHAIN.joints]).all()
     message = json.loads(Path("e/trajectory.json").read_text())
     points = np.array([point["positions"] for point in message["points"]])
-    assert np.allclose(points, run["q"], atol=1e-8) and message["joint_names"] == list(load("lwr4plus").joint_names)
+    assert np.allclose(points, run["q"], atol=1e-8) and message["joint_names"] == list(CHAIN.joint_names)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +144,7 @@ def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
 
 
 def test_the_columns_told_with_a_joint_held_are_all_there_are():
-    chain = load("lwr4plus")
+    chain = CHAIN
     dynamics = read_model(chain, None, "Fv Fc off", read_motion_limits(None, chain))
     rng = np.random.default_rng(3)
     q, v, a = rng.uniform(-2, 2, (3, 400, 7))
@@ -329,54 +326,26 @@ def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, ch
         design.excite("lwr4plus", few, limits=limits)
 
 
-def identified(folder: Path, spoil: str = "") -> None:
-    """Write what `calib identify` writes of the LWR4+'s model."""
-    chain = load("lwr4plus")
-    terms = drives.standard(["Ia Fv Fc off"] * 7)
-    model = IdentificationModel(bodies_of(chain), terms)
-    values = np.concatenate([standard_parameters(chain), np.tile([1.0, 5.0, 6.0, 0.1], 7)])
-    found = base.find(model)
-    folder.mkdir()
-    table = {
-        "gravity": [0, 0, -9.81],
-        "bodies": dict(zip(model.bodies.names, values[:70].tolist())),
-        "terms": [
-            {
-                "name": one.name, "shape": one.shape, "acts": [[r, [list(p) for p in m]] for r, m in one.acts],
-                "settings": list(one.settings), "side": one.side, "linear": one.linear,
-                "value": float("nan") if one.name == spoil else float(value),
-            }
-            for one, value in zip(terms, values[70:])
-        ],
-    }  # fmt: skip
-    (folder / "dynamics.json").write_text(json.dumps(table))
-    rows = [",".join(["name", *found.names])]
-    for i, name in enumerate(found.names):
-        rows.append(",".join([name, *("0.01" if i == k else "0" for k in range(found.b))]))
-    (folder / "covariance.csv").write_text("\n".join(rows))
-
-
 def test_an_identified_model_predicts_torques_with_their_uncertainty(tmp_path):
-    identified(tmp_path / "m")
-    chain = load("lwr4plus")
-    dynamics = read_model(chain, tmp_path / "m", "", read_motion_limits(None, chain))
+    write_model(tmp_path / "m")
+    names, known = base_of_lwr().names, identified()
+    write_covariance(tmp_path / "m" / "covariance.csv", names, 0.01 * np.eye(len(names)))
+    dynamics = read_model(CHAIN, tmp_path / "m", "", read_motion_limits(None, CHAIN))
     assert dynamics.values is not None and dynamics.covariance is not None and dynamics.friction
-    assert len(dynamics.values) == len(dynamics.exact.names) == 69  # 43 + 28, less Ia1 and Ia2
-    assert np.allclose(dynamics.covariance, 0.01 * np.eye(69))
+    assert len(dynamics.values) == len(dynamics.exact.names) == 62  # 43 + 21, less Ia1 and Ia2
+    assert np.allclose(dynamics.covariance, 0.01 * np.eye(62))
     q, v, a = np.random.default_rng(0).normal(size=(3, 5, 7))
-    full = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * 7))
-    values = np.concatenate([standard_parameters(chain), np.tile([1.0, 5.0, 6.0, 0.1], 7)])
-    assert np.allclose(dynamics.exact.regressor(q, v, a) @ dynamics.values, full.regressor(q, v, a) @ values)
+    assert np.allclose(dynamics.exact.regressor(q, v, a) @ dynamics.values, known.model.torque(known.values, q, v, a))
 
 
 def test_nan_in_the_model_is_named(cell, calib):
-    identified(Path("m"), spoil="Fv3")
+    write_model(Path("m"), Fv3=np.nan)
     code, _, err = calib("excite", "lwr4plus", "--model", "m", "--out", "e", *QUICK)
     assert code == 2 and "parameter Fv3 of the model is not finite" in err
 
 
 def test_named_points_move_with_their_links():
-    chain = load("lwr4plus")
+    chain = CHAIN
     points = Points(chain, (0, 4), np.array([[0.0, 0.0, 0.0], [0.05, 0.1, -0.1]]))
     q = np.random.default_rng(0).normal(size=(1, 7))
     G = np.random.default_rng(1).normal(size=(1, 2, 3))
@@ -386,7 +355,7 @@ def test_named_points_move_with_their_links():
 
 def test_collision_distances_are_kept_with_a_slope(tmp_path):
     (tmp_path / "l.toml").write_text("[collision]\nradius = 0.05\nfloor = -0.3\n")
-    chain = load("lwr4plus")
+    chain = CHAIN
     limits = read_motion_limits(tmp_path / "l.toml", chain)
     (clearance,) = (one for one in limits.constraints if one.name == "clearance")
     q = 0.5 * np.random.default_rng(3).normal(size=(1, 7))
@@ -407,14 +376,14 @@ def test_the_design_is_for_the_model_that_will_be_identified():
     """Both torque rows, runs without and with the payload: 102 columns, and both loads keep the torque limits."""
     options = parse_options(PAYLOAD).settings
     goals = ("raw=300", "joint6=0.02")
-    found = design.excite("lwr4plus", replace(SHORT, goals=goals), options=options)
+    found = design.excite("lwr4plus", replace(SHORT, goals=goals, outlook=False), options=options)
     exact, tau = found.inputs.model.exact, found.playback.run.tau
     assert len(exact.names) == 102 and exact.loads == ((), ("load",)) and found.condition.raw < 300
     assert [name for name, *_ in found.goals] == ["cond raw", "torque slack of joints 6"]
     margin = found.proof.worst["torque"]
     assert margin.margin > 0 and (np.abs(tau) < found.inputs.limits.torque).all()
-    few = design.excite("lwr4plus", replace(SHORT, columns=("ZZ1R", "Fvm1,Ia1")), options=options)
-    assert few.inputs.columns.names == ("ZZ1R", "Ia1", "Fvm1")
+    few = read_inputs("lwr4plus", replace(SHORT, columns=("ZZ1R", "Fvm1,Ia1")), options=options)
+    assert few.columns.names == ("ZZ1R", "Ia1", "Fvm1")
     other = parse_options({"rows": "power", "payload": {"load": {}}}).settings
     notes = " ".join(read_inputs("lwr4plus", SHORT, options=other).model.notes)
     assert "rows = 'power'" in notes and "NOT checked: torques with payload 'load'" in notes

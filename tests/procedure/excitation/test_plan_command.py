@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from planned import CHAIN, WAYPOINTS, lwr, read_setpoints
+from planned import CHAIN, WAYPOINTS, lwr, read_setpoints, write_model
 from without_figures import run
 
 from calib import files
-from calib.dynamics import drives
 from calib.dynamics.bodies import STANDARD
 from calib.errors import CalibError
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation import planning
 from calib.procedure.excitation.planning import read_waypoints
 from calib.procedure.excitation.settings import PlanSettings
-from calib.robot import description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
 from calib.rooms.cells.known_robots import truth
@@ -35,21 +33,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     known = truth("lwr4plus")["drives"]
     amounts = {key: known[key] for key in ("Ia", "Fv", "Fc")}
     files.write(tmp_path / "drives.toml", "[drives]\n" + "".join(f"{key} = {amounts[key]}\n" for key in amounts))
-    folder = tmp_path / "model"
-    description.write(folder / "robot.toml", CHAIN)
-    law = lwr()
-    terms = [
-        {
-            "name": one.name, "shape": one.shape, "acts": one.acts, "settings": one.settings, "side": one.side,
-            "linear": one.linear, "value": amounts[one.name[:-1]][int(one.name[-1]) - 1],
-        }
-        for one in drives.standard(["Ia Fv Fc"] * 7)
-    ]  # fmt: skip
-    table = {
-        "kind": "motor", "gravity": list(CHAIN.gravity), "payloads": [],
-        "bodies": dict(zip(law.bodies.names, law.inertial.tolist())), "terms": terms,
-    }  # fmt: skip
-    files.write_json(folder / "dynamics.json", table)
+    write_model(tmp_path / "model")
     return tmp_path
 
 
