@@ -14,7 +14,7 @@ from calib.api.rendering import Progress, optional, progress_shown, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
-from calib.errors import UsageError, as_ours, require
+from calib.errors import as_ours
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
@@ -152,8 +152,9 @@ def design_excitation(
         before = None if after is None else stack.enter_context(saved(after))
         crew = stack.enter_context(opened(workers))
         if stage is not None:
-            require(options is None and after is None, "options and after are for serial arms only", UsageError)
-            return stage.run(settings, model=place, limits=optional(limits), map=crew.map, progress=progress)
+            return stage.run(
+                settings, model=place, limits=limits, options=options, after=after, map=crew.map, progress=progress
+            )
         designed = design.excite(
             cast(Any, robot), settings, model=place, limits=optional(limits), base=base, tip=tip,
             options=None if options is None else _read(options).settings, after=before,

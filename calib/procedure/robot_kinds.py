@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -108,7 +109,17 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
     for key, value in (("base", base), ("tip", tip)):
         if value:
             raise UsageError(f"{key} '{value}' is a link of a URDF; a {found.kind} has no such links")
-    return replace(stages[verb], run=partial(stages[verb].run, found))
+    return replace(stages[verb], run=partial(_run, stages[verb].run, found))
+
+
+def _run(run: Callable[..., Any], found: Mechanism, *args: Any, **given: Any) -> Any:
+    """Return the result of a command; raise UsageError for an argument that is given but only serial arms have."""
+    known = signature(run).parameters
+    for key in given.keys() - known.keys():
+        if given[key] is not None:
+            instead = found.instead.get(key, "leave it out")
+            raise UsageError(f"{key} is for serial arms only, not for a {found.kind}; {instead}")
+    return run(found, *args, **{key: value for key, value in given.items() if key in known})
 
 
 def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:

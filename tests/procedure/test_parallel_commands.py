@@ -176,7 +176,7 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
         (("fit", "dualv", "passive.csv"), "passive joint"),
         (("fit", "dualv", "three.csv"), "'motor1' is missing"),
         (("excite", "dualv", "--lock", "motor1"), "lock is for serial arms"),
-        (("excite", "dualv", "--options", "options.toml"), "are for serial arms only"),
+        (("excite", "dualv", "--options", "options.toml"), "options is for serial arms only"),
         (("plan", "dualv", "--waypoints", "empty.csv"), "neither the platform's coordinates (x, y, rz)"),
         (("plan", "dualv", "--waypoints", "outside.csv"), "waypoint 2: joint 1 at 0.3"),
         (("plan", "dualv", "--waypoints", "way.csv", "--shorten", 5), "shorten is for serial arms"),

@@ -167,7 +167,6 @@ def excite_parallel(
     settings: ExcitationSettings,
     *,
     model: Path | None = None,
-    limits: Path | None = None,
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelExcitation:
@@ -182,10 +181,6 @@ def excite_parallel(
         UsageError: for options that only serial arms know.
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
-    if limits is not None:
-        raise UsageError(
-            "a limits file is for serial arms only; state effort, lower and upper in the parallel robot's file"
-        )
     made, values = read_model(robot, model, settings.drives)
     return design_parallel(robot, made, values, settings, map=map, progress=progress)
 

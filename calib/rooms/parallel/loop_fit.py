@@ -187,8 +187,8 @@ class ParallelFit(Judged):
         """Return the same fit with a verdict on additional unseen files, without refitting."""
         validate = _paths(unseen)
         proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
-        for name, rows in _read_unseen(self.nominal.chain, self.rows, validate).items():
-            proofs[name] = _errors(self.nominal.known, self.found.known, rows)
+        for path, rows in zip(validate, _read(self.nominal.chain, validate, self.rows.shape[1])):
+            proofs[f"{path.name}, unseen"] = _errors(self.nominal.known, self.found.known, rows)
         return replace(self, unseen=proofs, files=(*self.files, *validate))
 
 
@@ -204,27 +204,25 @@ def fit_parallel(
     *,
     settings: FitSettings | None = None,
     options: FitOptions | None = None,
-    poses: object = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelFit:
     """Return the geometric calibration of a parallel robot from measured files, with a verdict on unseen rows.
 
     Args:
         settings: holdout, tolerance and seed; the others are for serial arms.
-        options: ``fix`` alone; poses: None, since none are chosen for parallel robots.
+        options: ``fix`` alone.
 
     Raises:
         UsageError: for options that only serial arms know.
         MeasurementError: for columns that are missing, or rows that no posture reaches.
         Unidentifiable: for readings alone of a robot without redundant encoders.
     """
-    if poses is not None:
-        raise UsageError("no predicted accuracy: pose selection does not support parallel robots")
     say, settings, known = progress or (lambda words: None), settings or FitSettings(), robot.known
     measured, validate = _paths(measured), _paths(validate)
     held = _held(known, settings, options or FitOptions())
-    rows = _stacked([read_rows(path, known.robot) for path in measured], measured)
-    unseen = _read_unseen(known.robot, rows, validate)
+    tables = _read(known.robot, (*measured, *validate))
+    rows = np.concatenate(tables[: len(measured)])
+    unseen = {f"{path.name}, unseen": own for path, own in zip(validate, tables[len(measured) :])}
     if settings.tolerance is not None and not (rows.shape[1] > known.robot.n and (known.robot.selected < 3).any()):
         raise UsageError("a tolerance needs a measured platform position; none was measured")
     if settings.holdout:
@@ -289,20 +287,13 @@ def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tup
     return options.fix
 
 
-def _stacked(parts: Sequence[np.ndarray], paths: Sequence[Path]) -> np.ndarray:
-    bare = min(range(len(parts)), key=lambda k: parts[k].shape[1])
-    if any(own.shape[1] > parts[bare].shape[1] for own in parts):
-        raise UsageError(f"{paths[bare]} has no platform coordinates, but other files have them; fit them separately")
-    return np.concatenate(parts)
-
-
-def _read_unseen(robot: ParallelRobot, rows: np.ndarray, paths: Sequence[Path]) -> dict[str, np.ndarray]:
-    """Return the rows of unseen files by name, with the same columns as the fitted rows."""
-    unseen = {f"{path.name}, unseen": read_rows(path, robot) for path in paths}
-    for name, own in unseen.items():
-        if own.shape[1] != rows.shape[1]:
-            refuse_option(name, "platform coordinates must be in both this file and the fitted files, or in neither")
-    return unseen
+def _read(robot: ParallelRobot, paths: Sequence[Path], width: int = 0) -> list[np.ndarray]:
+    """Return the rows of each file, all with the same columns: `width` of them, or as many as the first file has."""
+    tables = [read_rows(path, robot) for path in paths]
+    for path, rows in zip(paths, tables):
+        if rows.shape[1] != (width or tables[0].shape[1]):
+            refuse_option(path, "platform coordinates must be in all fitted and unseen files, or in none")
+    return tables
 
 
 def _parts(known: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

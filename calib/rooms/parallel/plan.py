@@ -113,8 +113,6 @@ def plan_parallel(
     settings: PlanSettings = DEFAULT_PLAN,
     *,
     model: Path | None = None,
-    limits: Path | None = None,
-    drives: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelPlan:
     """Return the fastest motion of a parallel robot through the waypoints of a file.
@@ -129,10 +127,6 @@ def plan_parallel(
     """
     say, known = progress or (lambda words: None), robot.known
     refuse_unread(settings, DEFAULT_PLAN, READ)
-    if limits is not None or drives is not None:
-        raise UsageError(
-            "limits and drives files are for serial arms only; state velocity and effort in the parallel robot's file"
-        )
     law = _law(robot, model, settings.payloads)
     bounds = actuator_bounds(known)
     kept = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)

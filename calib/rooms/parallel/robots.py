@@ -20,8 +20,11 @@ INSTEAD = {
     "choosing poses": "choose poses manually, spread over its workspace",
     "calib.read_poses": "calib.fit_geometry takes its files",
     "compensation": "use the calibrated robot.toml in its controller",
+    "limits": "state velocity, effort, lower and upper in its file",
+    "drives": "identify a model with its drives, and name it",
+    "poses": "pose selection does not support it",
     "export": "a URDF cannot contain closed loops: use its robot.toml and dynamics.json",
-}  # of the verbs that there are not
+}  # of commands and arguments that there are not
 
 
 @dataclass(frozen=True, eq=False, repr=False)

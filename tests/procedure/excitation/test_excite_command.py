@@ -376,7 +376,7 @@ def test_the_design_is_for_the_model_that_will_be_identified():
     """Both torque rows, runs without and with the payload: 102 columns, and both loads keep the torque limits."""
     options = parse_options(PAYLOAD).settings
     goals = ("raw=300", "joint6=0.02")
-    found = design.excite("lwr4plus", replace(SHORT, goals=goals, outlook=False), options=options)
+    found = design.excite("lwr4plus", replace(SHORT, goals=goals, samples=60, outlook=False), options=options)
     exact, tau = found.inputs.model.exact, found.playback.run.tau
     assert len(exact.names) == 102 and exact.loads == ((), ("load",)) and found.condition.raw < 300
     assert [name for name, *_ in found.goals] == ["cond raw", "torque slack of joints 6"]
