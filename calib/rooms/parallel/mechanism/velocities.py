@@ -69,12 +69,13 @@ def of_platform(
         jacobians: of the postures, where they are known already.
     """
     found = jacobians or loop_jacobians(known, posture)
-    v, twist = times(found.joints, rate), times(found.platform, rate)
+    v = np.einsum("ntr,nr->nt", found.joints, rate)
+    twist = np.einsum("nkr,nr->nk", found.platform, rate)
     shifts, starts = [], known.robot.starts
     for one, a, b in zip(found.links, starts, starts[1:]):
         shifts.append(_end_bias(one, v[:, a:b]) - _attachment_bias(one, twist))
     _, still = twists(known, found.links, shifts)
-    turning = still + times(found.platform, change)
+    turning = still + np.einsum("nkr,nr->nk", found.platform, change)
     accelerations = [times(one.inverse, times(one.carried, turning) - shift) for one, shift in zip(found.links, shifts)]
     return LoopMotion(posture, found, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
 
@@ -92,14 +93,17 @@ def of_readings(known: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarr
     rate = times(back, v)
     still = of_platform(known, posture, rate, np.zeros_like(rate), found)
     change = times(back, a - still.a[:, known.robot.actuated])
-    return replace(still, a=still.a + times(found.joints, change), change=still.change + times(found.platform, change))
+    turned = still.change + np.einsum("nkr,nr->nk", found.platform, change)
+    return replace(still, a=still.a + np.einsum("ntr,nr->nt", found.joints, change), change=turned)
 
 
 def _attachment_bias(one: LegLinks, twist: np.ndarray) -> np.ndarray:
     """Return the attachment's acceleration (N, c) at ṫ = 0: ω × (ω × lever); its angular part is zero."""
     result = np.zeros(one.gap.shape)
     turn = twist[:, 3:]
-    result[:, :3] = cross(turn, cross(turn, one.lever))
+    result[:, :3] = (
+        turn * np.einsum("ni,ni->n", turn, one.lever)[:, None] - one.lever * np.sum(turn**2, axis=1)[:, None]
+    )
     return result
 
 
