@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Workers:
-    """Runner of many tasks; created by `workers`.
+    """Runs many tasks in parallel, created by `workers`.
 
     Attributes:
         here: whether they work in this process's current folder.
@@ -50,7 +50,7 @@ class Workers:
                 yield number, result if error is None else error
 
     def map(self, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
-        """Yield results in order like the builtin; after Ctrl-C the results available, then KeyboardInterrupt.
+        """Yield results in the order of the tasks, like the builtin; after Ctrl-C the available results, then raise.
 
         Raises:
             TaskLost: in place of a lost result.
@@ -91,7 +91,7 @@ class Workers:
 
 @contextmanager
 def workers(where: str | int | None = None) -> Iterator[Workers]:
-    """Yield workers; end them and their running tasks when the block ends.
+    """Yield workers for parallel tasks; at the end of the block they are stopped, with their running tasks.
 
     Args:
         where: None, 1 or "1" for this process; a number of local processes; or the address of a Dask scheduler, e.g.

@@ -85,13 +85,13 @@ class _Cluster:
         yield self.under_way.pop(future.key)[0], result, raised
 
     def _failed(self, error: Exception) -> Exception:
-        """Return the exception to use as result if Dask, not the task, raised."""
+        """Return the exception that stands for a task's result where Dask failed, not the task."""
         from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
         if isinstance(error, KilledWorker):
             return Died(f"it ended {error.allowed_failures + 1} of the cluster's workers, the largest number allowed")
         self._said(lambda: None)
-        failed = CalibError(f"a Dask worker could not run its task: {error}; install this version of the toolkit there")
+        failed = CalibError(f"a Dask worker could not run its task ({error}); install this toolkit's version there")
         failed.__cause__ = error
         return failed
 

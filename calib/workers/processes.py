@@ -1,6 +1,6 @@
-"""Local processes that run tasks: spawned, one task at a time, so that a crash loses one task only.
+"""Execution of tasks by local processes: each is spawned and runs one task at a time, so that a crash loses one task.
 
-Common part of local processes and a cluster: starting tasks, collecting answers, repeating lost tasks.
+`streamed` and `run_call` serve local processes and a cluster: start tasks, collect results, repeat lost tasks.
 """
 
 import os
@@ -27,11 +27,11 @@ Stream = Callable[[Callable, Iterable[tuple], Callable[[int], bool]], Generator[
 
 
 class Died(Exception):
-    """Placeholder for the result of a task whose process died."""
+    """Stands for the result of a task whose process died while running the task."""
 
 
 class NotBegun(Exception):
-    """Placeholder for the result of a task whose process died before it received the task."""
+    """Stands for the result of a task whose process died before it received the task."""
 
 
 class Crew(Protocol):
@@ -49,7 +49,7 @@ class Crew(Protocol):
     def begin(self, number: int, call: bytes) -> None: ...
 
     def ended(self) -> Iterable[Answer]:
-        """Wait for tasks to end, and return their answers."""
+        """Return the answers of the tasks that ended, after waiting for one at least."""
         ...
 
     def settled(self) -> Iterable[Answer]:
@@ -69,9 +69,9 @@ class _Task:
 
 
 def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator[Answer]:
-    """Yield answers as they arrive; a task starts when a worker is free and `near` accepts its number."""
+    """Run tasks and yield their answers as they arrive; a task starts when a worker is free and `near(number)`."""
     if not crew.busy.acquire(blocking=False):
-        raise RuntimeError("these workers are busy: end one `map` or `completed` before the next")
+        raise RuntimeError("these workers are busy; let one `map` or `completed` end before the next")
     upcoming, begun = enumerate(tasks), 0
     under_way, again, found = dict[int, _Task](), deque[int](), deque[Answer]()
     try:
@@ -245,7 +245,7 @@ class Processes:
         )
 
     def settled(self) -> Iterator[Answer]:
-        """Return the answers of tasks ended by Ctrl-C; pass Ctrl-C on if only this process received it."""
+        """Return the answers of tasks ended by Ctrl-C; interrupt worker processes that did not receive it."""
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
             until = time.monotonic() + patience
@@ -295,7 +295,7 @@ def _serve(pipe: connection.Connection) -> None:
 
 
 def _unheard(unraisable: Any) -> None:
-    """Suppress the message on a Ctrl-C inside a library's callback, which cannot raise it; another one follows."""
+    """Suppress the message of a Ctrl-C inside a library's callback, which cannot raise KeyboardInterrupt."""
     if not isinstance(unraisable.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
 

@@ -38,7 +38,7 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield a generator's values; BLAS has one thread inside the generator, the caller's number in between."""
+    """Yield a generator's values, with one BLAS thread inside the generator and the caller's number outside."""
     ended = object()
     with closing(steps):
         while True:

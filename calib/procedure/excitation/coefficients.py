@@ -1,4 +1,4 @@
-"""``trajectory.toml``, the coefficients of an exciting motion, and that motion in a log (`calib recall`).
+"""Files ``trajectory.toml`` (coefficients of an exciting motion), and detection of that motion in a log.
 
 ::
 
@@ -66,7 +66,7 @@ class _JointTable:
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """The content of ``trajectory.toml``; other keys are ignored."""
+    """Content of ``trajectory.toml``; keys that are not fields here are ignored."""
 
     family: Annotated[str, OneOf(("fourier", "bspline"))]
     period: Positive
@@ -106,7 +106,7 @@ class Periodic:
 
 
 def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]:
-    """Return the content of ``trajectory.toml`` for a motion; `limits` are lines on the limits it respects."""
+    """Return the content of ``trajectory.toml`` for a motion; `limits`: text lines on its limits."""
     fourier = motion.kind == "fourier"
     head: dict[str, Any] = {
         "robot": robot, "family": motion.kind, "period": motion.period, "rate": motion.rate, "repeat": motion.repeat,
@@ -122,7 +122,7 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
 
 
 def read(folder: Path) -> Periodic:
-    """Read the motion from the folder of `calib excite`.
+    """Return the periodic motion stored in a folder of `calib excite`.
 
     Raises:
         UsageError: if the file is missing or damaged.
@@ -147,7 +147,7 @@ def read(folder: Path) -> Periodic:
     try:
         found.orders(np.zeros(1))
     except (ValueError, IndexError, BadInput) as error:
-        raise UsageError(f"{path} is damaged ({error}): was it edited?") from error
+        raise UsageError(f"{path} is damaged ({error}); write it again with calib excite") from error
     return found
 
 
@@ -157,7 +157,7 @@ HEADERS = {"effort": "tau", "tau_link": "tau_link", "tau_motor": "tau_motor", "q
 
 @dataclass(frozen=True, eq=False)
 class AveragedMotion:
-    """Periods of a motion in a log, averaged.
+    """Average of the periods of a designed motion in a log.
 
     Attributes:
         motion: that was looked for; file: the log.
@@ -178,7 +178,7 @@ class AveragedMotion:
 
 
 def inputs(folder: Path, log: str) -> list[str | Path]:
-    """Return the input files of `find`, which outputs must not overwrite."""
+    """Return the files that `find` reads; no output may overwrite them."""
     return [folder, folder / NAME, folder / METRICS, log]
 
 
@@ -244,7 +244,7 @@ def lines(averaged: AveragedMotion) -> list[str]:
 
 
 def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:
-    """Return the longest part without gaps, resampled to a whole number of samples per period."""
+    """Return rate and series of the longest part without gaps, with a whole number of samples per period."""
     own = 1.0 / float(np.median(np.diff(recording.t)))
     rate = max(1, round(period * own)) / period
     sampled = resample(recording, rate=rate)

@@ -75,7 +75,7 @@ def objectives_of(
 
 
 def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, given: ExcitationInputs) -> Excitation:
-    """Return the predicted σ of a typical task's torques, or of the parameters, as an objective.
+    """Return the objective that minimises the predicted σ of the torques of a typical task, or of the parameters.
 
     Rows are weighted by the torque errors that earlier motions state, or else by the torque limits.
 
@@ -98,7 +98,7 @@ def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, gi
 
 
 def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
-    """Return the goals of the settings, soft ones first.
+    """Return the goals stated in the settings: first the soft goals, then the hard goals.
 
     Args:
         condition: what a condition number is of: columns, rows, what is known already.
@@ -176,7 +176,7 @@ class DesignCondition:
     normalised_before: float | None = None
 
     def table(self) -> dict[str, float]:
-        """Return the entry of ``metrics.json``."""
+        """Return the values as the entry ``condition_number`` of ``metrics.json``."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -191,7 +191,7 @@ class _DesignSetting:
 
 @dataclass(frozen=True)
 class _LimitMargin:
-    """Margin to a limit, as a share of the limit."""
+    """Distance of a motion from a limit, as a share of the limit."""
 
     share: float
 
@@ -213,7 +213,7 @@ Search = Callable[..., SearchResult]
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """A designed motion and the verification of its limits.
+    """A designed exciting motion, with its inputs, goals reached, and verified margins to the limits.
 
     Attributes:
         inputs, settings: of the design.
@@ -339,7 +339,7 @@ def search_motion(
 
 
 def _missed(problem: ExcitationProblem, found: SearchResult, given: ExcitationInputs) -> tuple[str, ...]:
-    """Return a note on each goal that the motion misses by more than a hundredth."""
+    """Return a note for each goal that the motion misses by more than 1 %."""
     words = [
         f"goal {goal.objective.name} is missed: {value:.4g} for {goal.goal:.4g}"
         for goal, value in zip(problem.goals, found.values)
@@ -392,7 +392,7 @@ def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) 
 def _searched(
     problem: ExcitationProblem, goals: list[AttainmentGoal], starts: int, search: Search, say: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Search for a motion; with goals, a first run proposes those of the condition numbers."""
+    """Return the motion found and the problem solved; a first search sets the goals of the condition numbers."""
     if not goals or any(isinstance(one.objective, Excitation) for one in goals):
         problem = replace(problem, goals=tuple(goals))
         return search(problem, starts=starts), problem
@@ -431,7 +431,7 @@ def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, 
 
 
 def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
-    """Return the family of motions, and a family of fewer harmonics for the first stage of the search."""
+    """Return the family of motions, and for the first search stage a family of fewer harmonics or None."""
     fixed = {j: value for j, value in given.locked.items() if value is not None}
     resonance, most = given.limits.resonance, settings.harmonics
     if most is None:

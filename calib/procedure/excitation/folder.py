@@ -39,12 +39,12 @@ MESSAGES = 100.0  # points per second of the ROS message, whose controllers inte
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error, before any work, if a folder cannot take a designed motion or contains one of its inputs."""
+    """Raise an error if a folder contains other results or input files, so that no designed motion can be written."""
     check_target(out, ALL, DESIGN, "excitation", inputs)
 
 
 def check_plan_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error, before any work, if a folder cannot take a planned motion or contains one of its inputs."""
+    """Raise an error if a folder contains other results or input files, so that no planned motion can be written."""
     check_target(out, ALL, PLAN, "plan", inputs)
 
 
@@ -108,7 +108,7 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
 
 
 def _write_besides(played: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
-    """Write the setpoints of approach and rehearsal, if requested."""
+    """Write ``approach.csv`` and ``rehearsal.csv`` if the motion has an approach and a rehearsal."""
     for name, track in (("approach.csv", played.approach), (REHEARSAL, played.rehearsal)):
         if track is not None:
             _write_setpoints(track, bounds, folder / name)

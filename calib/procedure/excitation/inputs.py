@@ -73,13 +73,13 @@ class IdentifiableColumns:
 
     @property
     def kept(self) -> np.ndarray | slice:
-        """Index of the columns."""
+        """Index of the identifiable columns among all columns of the model."""
         return slice(None) if self.columns is None else self.columns
 
 
 @dataclass(frozen=True, eq=False)
 class PriorMotions:
-    """Information from earlier motions, recorded or designed.
+    """Information matrix of earlier motions, recorded or designed.
 
     Attributes:
         names: of the files or folders.
@@ -94,7 +94,7 @@ class PriorMotions:
     sigmas: np.ndarray | None = None
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
-        """Return the information per sample, if `count` samples represent `duration` seconds of new motion."""
+        """Return the information (b, b) per sample of a new motion of `duration` seconds and `count` samples."""
         return self.information * (count / duration)
 
 
@@ -139,7 +139,7 @@ def read_inputs(
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
     """
-    require(after is None or model is None, "after: this folder is the model, too; leave the model out", UsageError)
+    require(after is None or model is None, "after: its folder is also the model; leave --model out", UsageError)
     model = model or after
     chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
@@ -171,7 +171,7 @@ def read_model(
     """
     if folder is not None:
         if options is not None:
-            raise UsageError(f"model {folder}: states rows, drives and payloads itself; leave the options out")
+            raise UsageError(f"model {folder}: already states rows, drives and payloads; leave the options out")
         return _identified(chain, folder, loads)
     notes = []
     if options is not None and not _designable(options.torque_rows):
@@ -200,7 +200,7 @@ def read_model(
 
 
 def _designable(rows: TorqueRows) -> bool:
-    """Return whether rows contain the bodies and have derivatives."""
+    """Return whether a motion can be designed for torque rows: they depend on the bodies and are differentiable."""
     return rows.has_bodies and rows.projection is None
 
 
@@ -277,7 +277,7 @@ def excited_model(
     notes: Sequence[str] = (),
     base: Base | None = None,
 ) -> ExcitedModel:
-    """Return the model to excite, for the search with a smooth Coulomb sign, from an identification model.
+    """Return the base model to excite, with a smoothed Coulomb sign for the search, from an identification model.
 
     Args:
         loads: payload labels of each run.
@@ -346,7 +346,7 @@ def identifiable(
     sigmas = np.where(still, np.inf, 1.0 if sigmas is None else sigmas)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
-        f"locked: {', '.join(chain.joint_names[j] for j in locked)}; torques of locked joints are not used "
+        f"locked: {', '.join(chain.joint_names[j] for j in locked)}; their torques are not used "
         f"(stiction); {len(kept)} of {len(names)} "
         f"columns are identifiable ({len(gone)} are regrouped or have no effect: {', '.join(gone[:12])}"
         f"{', ...' if len(gone) > 12 else ''})"

@@ -105,7 +105,7 @@ class MotionBounds:
         return "all joints" if len(names) == len(self.joints) else ", ".join(names)
 
     def lines(self) -> list[str]:
-        """Return the limits of the motion as text, a line per kind, for the heads of files."""
+        """Return the limits as text lines for file headers: velocity, acceleration, torque."""
         result = []
         for order, kind in enumerate(("velocity", "acceleration", "torque"), 1):
             by_size: dict[str, list[Joint]] = {}
@@ -130,7 +130,7 @@ class MotionBounds:
             if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
                 raise UsageError(
                     f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, above "
-                    f"{limit[j]:.4g}; it is not written; state a limit {self.place.format(EXAMPLES[kind])}"
+                    f"{limit[j]:.4g}; so the motion is not written; state a limit {self.place.format(EXAMPLES[kind])}"
                 )
 
 
@@ -215,7 +215,7 @@ class MotionLimits:
         return next(own, BoxLimit(0, -free, free))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
-        """Yield each violated constraint on positions, a message, and the index of the worst of N states."""
+        """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
                 continue
@@ -229,7 +229,7 @@ class MotionLimits:
 def read_motion_limits(
     given: Tables | None, chain: Chain, source: Path | None = None, given_way: bool = False, predicted: bool = False
 ) -> MotionLimits:
-    """Return the limits of a motion from limits file and robot; defaults are those of poses (`limits_of`).
+    """Return the limits of a motion from the limits file and the robot; defaults are those of pose selection.
 
     Args:
         given: the file, or its tables; None for the robot's own limits and the defaults alone.
@@ -284,7 +284,7 @@ def read_motion_limits(
 
 
 def located(error: NothingFeasible) -> NothingFeasible:
-    """Return the error with the place added at which the limits file states the violated limit."""
+    """Return the error, with the table of the limits file that states the violated limit added to its message."""
     if error.constraint not in STATED_IN:
         return error
     place = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
@@ -292,7 +292,7 @@ def located(error: NothingFeasible) -> NothingFeasible:
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:
-    """Raise an error if torque limits (n,) would be checked with physically inconsistent masses or inertias.
+    """Raise an error if torques are limited but the robot's masses or inertias are physically inconsistent.
 
     Raises:
         UsageError: naming them.
@@ -307,7 +307,7 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
 def _bounds(
     chain: Chain, robot: str, stated: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
 ) -> MotionBounds:
-    """Return the bounds of a motion's joints; accelerations without any limit get a default one.
+    """Return the bounds of speed, acceleration and torque; an acceleration without limit gets a default limit.
 
     Args:
         sizes: (n,) largest velocities, accelerations, torques.
@@ -324,7 +324,7 @@ def _bounds(
 
 
 def _unchecked(path: str | None) -> str:
-    """Return the hazards that no limit checks."""
+    """Return a note on hazards that are not checked, with advice on the limits file."""
     if path is None:
         return "collisions and floor are NOT checked: state obstacles and floor in a limits file"
     return f"collisions are NOT checked: {path} has no [collision]; add it, with floor = … at least"

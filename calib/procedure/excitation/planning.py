@@ -248,7 +248,7 @@ def _read_drives(given: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
 
 
 def _check_places(path: JointPath, known: MotionLimits) -> None:
-    """Raise an error if a path violates workspace or clearance (limits file) at one of 500 places.
+    """Raise an error if one of 500 points of a path violates the workspace or clearance of the limits file.
 
     Raises:
         UsageError: with the violated constraint, the place, and the excess.
@@ -256,7 +256,7 @@ def _check_places(path: JointPath, known: MotionLimits) -> None:
     s = np.linspace(0, path.length, 500)
     still = np.zeros((len(s), path.n))
     for _, words, k in known.broken(SampledMotion(s, path(s), still, still, still)):
-        raise UsageError(f"{words} at {s[k] / path.length:.0%} of the path; move or add waypoints")
+        raise UsageError(f"{words}, after {s[k] / path.length:.0%} of the path; move or add waypoints")
 
 
 def _law(
@@ -286,7 +286,7 @@ def _law(
 
 
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
-    """Return an identified model including the attached payloads, and its uncertainty."""
+    """Return the dynamics of an identified model with the given payloads, and its uncertainty or None."""
     refuse_currents(folder, "a motion plan")
     arm, dynamics = read_dynamics(folder)
     require(arm.n == chain.n, f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}", UsageError)

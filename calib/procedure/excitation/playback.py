@@ -74,7 +74,7 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
-    """Return a note if a track exceeds the torque limits; even slower motion can, without inertia forces that help."""
+    """Return a note if the torques of a track exceed their limits."""
     if track is None or track.tau is None:
         return ()
     share = (np.abs(track.tau) / limits.torque).max(axis=0)
@@ -87,7 +87,7 @@ def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Ch
 def approach_to(
     start: Sequence[float] | None, goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
 ) -> tuple[Setpoints | None, tuple[str, ...]]:
-    """Return the approach from a pose to the start of a motion, a straight line in joint space, and notes.
+    """Return setpoints of a straight approach in joint space to the start of a motion, and notes on violated limits.
 
     Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
 
@@ -121,7 +121,7 @@ def approach_to(
 
 
 def check_start(start: Sequence[float] | None, chain: Chain, known: MotionLimits) -> np.ndarray | None:
-    """Return the joint values (n,) of a start; raise an error if wrong in number or beyond the joint limits."""
+    """Return the start as an array (n,); raise an error for a wrong number of values or a violated joint limit."""
     if start is None:
         return None
     limits, here = known.positions, np.asarray(start, dtype=float)

@@ -160,7 +160,7 @@ def _torque_sigma(given: ExcitationInputs, task: np.ndarray, root: np.ndarray) -
 
 
 def task_regressors(given: ExcitationInputs, seed: int) -> np.ndarray:
-    """Return the regressors (TASK_STATES, n, c) at random typical states."""
+    """Return the regressors (TASK_STATES, n, c) at random states of a typical task."""
     box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
     low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)
     speeds = np.array([joint.velocity for joint in given.chain.joints])
@@ -204,7 +204,7 @@ def _shortened(
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
-    """Return a motion of a shorter period; the search starts from the same path, shrunk to keep its speeds."""
+    """Return a motion of a shorter period, or None; the search starts from the same path, scaled to keep its speeds."""
     try:
         other = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
@@ -244,7 +244,7 @@ def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[
 
 
 def check_folder(folder: Path) -> None:
-    """Raise an error, before any work is done, if a folder contains no prediction."""
+    """Raise an error if a folder contains no prediction of `calib excite`."""
     require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 

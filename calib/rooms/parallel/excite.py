@@ -48,7 +48,7 @@ MOTION = (ROBOT, METRICS, PLANNED, coefficients.NAME, FIGURES)
 
 @dataclass(frozen=True, eq=False)
 class _ActuatorLimit(TwoSided):
-    """|τ| ≤ τ_max, or |q̇| ≤ v_max, of each actuator; a `trajectories.constraints.MotionConstraint`.
+    """Limit of each actuator's torque |τ| ≤ τ_max, or speed |q̇| ≤ v_max.
 
     Attributes:
         plan: takes platform coordinates to the robot's motion.
@@ -106,7 +106,7 @@ class ParallelExcitation(ExcitationDesign):
         return track.times, track.q, track.v, track.a
 
     def _actuators(self, track: Setpoints) -> Setpoints:
-        """Return the actuators' motion and torques of a platform motion."""
+        """Return the setpoints of the actuators (q, v, a, torques) for setpoints of the platform."""
         motion = self.plan.motion(track.q, track.v, track.a)
         own = self.robot.chain.actuated
         return Setpoints(
@@ -115,12 +115,12 @@ class ParallelExcitation(ExcitationDesign):
 
     @property
     def peaks(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) largest torque of each actuator [N m or N], (r,) largest acceleration of each coordinate."""
+        """Largest torque of each actuator (n,) [N m or N] and acceleration of each platform coordinate (r,)."""
         orders = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
         return np.abs(self.plan.torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the output folder of the command: one period at the controller's rate, and the actuators' series."""
+        """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
         from calib.procedure.report import motion_figures
 
         one, bounds = folder.one_period(self), self.inputs.limits.bounds
@@ -196,7 +196,7 @@ def design_parallel(
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelExcitation:
-    """Return a platform motion that excites the base parameters of a robot.
+    """Return a motion of the platform, optimised to identify the base parameters of a parallel robot.
 
     The determinant of the information is optimised, rows in units of what equal noise of all torques makes of them at
     home; `GUARD` of the torque limits stays free.
@@ -286,12 +286,12 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
             f"{path} contains no model of a parallel robot ({error!r}); give a folder of calib identify"
         ) from error
     if missing := [name for name in model.names[: model.inertial] if name not in known]:
-        raise RobotError(f"{path} is for another robot: it has no {missing[0]}")
+        raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
     return model, np.array([known.get(name, 0.0) for name in model.names])
 
 
 def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work, an output folder with other content, or one that contains an input file."""
+    """Raise an error if an output folder has other content or contains an input file."""
     check_target(out, MOTION, (METRICS, PLANNED), "motion", inputs)
 
 

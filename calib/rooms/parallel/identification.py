@@ -106,7 +106,7 @@ def identify_parallel(
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:
-    """Return the prediction errors of all recordings, with a verdict."""
+    """Return the prediction errors of a model on all recordings, with the verdict and its findings."""
     model, cases, unseen = found.dynamics.model, inputs.cases, inputs.unseen
     assert isinstance(model, ParallelModel)
     errors = errors_of(inputs, found.dynamics)
@@ -134,7 +134,7 @@ def _judged(
 def _driven_joints(
     model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case]
 ) -> tuple[str, ...]:
-    """Return the names of joints whose friction supplies more than a negligible share of the actuators' energy."""
+    """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
     joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
     friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.terms])
     values, taken, moved = np.where(friction, found.dynamics.values, 0.0), np.zeros(len(joints)), 0.0
@@ -149,7 +149,7 @@ def _driven_joints(
 
 
 def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
-    """Refuse settings and options that apply to serial arms only."""
+    """Raise an error for settings and options that apply to serial arms only."""
     read = {each.name for each in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     read = {each.name for each in fields(options)} - {"gain_pair", "cut_slow"}
@@ -169,7 +169,7 @@ def _of_arms(method: Method) -> bool:
 
 
 def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield findings on redundant encoders that contradict each other, and on unused columns."""
+    """Yield findings on contradictory redundant encoders, and on columns of passive joints that are not used."""
     robot = known.robot
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:
@@ -182,7 +182,7 @@ def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
 
 
 def _payloads(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield findings on the payloads, from recordings with and without them."""
+    """Yield findings on each payload: always or never attached in the recordings, or identified with negative mass."""
     masses = dict(zip(found.base.names, zip(found.fitted.estimate.values, found.fitted.estimate.sigma)))
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)

@@ -54,7 +54,7 @@ HEADER = ("name", "unit", "value", "sigma")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParallelFit(Judged):
-    """Result of a geometric calibration, and its files.
+    """Result of the geometric calibration of a parallel robot: estimate, calibrated robot, errors, verdict.
 
     Attributes:
         nominal: the robot before.
@@ -110,7 +110,7 @@ class ParallelFit(Judged):
 
     @property
     def measured(self) -> bool:
-        """Whether the platform was measured."""
+        """Whether the measurements contain platform coordinates."""
         return self.rows.shape[1] > self.nominal.chain.n
 
     @property
@@ -127,7 +127,7 @@ class ParallelFit(Judged):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the output folder of the command, all files or none."""
+        """Write the result folder of `calib fit`: either all files or none."""
         found = self.estimate
 
         def write(folder: Path) -> None:
@@ -193,7 +193,7 @@ class ParallelFit(Judged):
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse, before any work, an output folder with other content, or one that contains an input file."""
+    """Raise an error if an output folder has other content or contains an input file."""
     check_target(out, FIT, (METRICS, ROBOT), "fit", inputs)
 
 
@@ -259,7 +259,7 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
     readings = [table.numbers(joint.name, "angle" if joint.kind == "revolute" else "length") for joint in robot.joints]
     for name in table.header:
         if name in passive:
-            table.fail("is of a passive joint: its encoder cannot be used; remove the column", name)
+            table.fail("belongs to a passive joint, whose encoder cannot be used; remove the column", name)
         if name in COORDINATES and name not in robot.freedom:
             table.fail(f"is not a platform coordinate ({', '.join(robot.freedom)}); remove the column", name)
     measured = any(name in table for name in robot.freedom)
@@ -267,7 +267,7 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
 
 
 def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
-    """Return the platform coordinates (m, r) [m, rad] of a table.
+    """Return the platform coordinates (m, r) [m, rad] from the columns of a table.
 
     Raises:
         MeasurementError: naming the column that is missing.
@@ -277,7 +277,7 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
 
 
 def _held(known: ClosedRobot, settings: FitSettings, options: FitOptions) -> tuple[str, ...]:
-    """Return the names of fixed constants; refuse options that apply to serial arms only."""
+    """Return the names of fixed constants; raise an error for options that apply to serial arms only."""
     refuse_unread(settings, FitSettings(), READ)
     refuse_unread(options, FitOptions(), ("source", "fix"), options.source)
     names = [one.name for one in loop_parameters(known)]
@@ -326,5 +326,5 @@ def _cross_validated(known: ClosedRobot, rows: np.ndarray, held: Sequence[str], 
 
 
 def _rms(errors: np.ndarray) -> float:
-    """Return the rms length of rows (m, k)."""
+    """Return the root mean square of the row lengths of errors (m, k)."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))

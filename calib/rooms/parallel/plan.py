@@ -38,7 +38,7 @@ READ = ("payloads", "lines", "rate")  # of the settings
 
 @dataclass(frozen=True, eq=False)
 class _PlatformDynamics:
-    """Actuator torques along a path of the actuated joints; a `trajectories.timing.limits.Law`.
+    """Dynamics along a path of the actuated joints: actuator torques for time-optimal planning.
 
     Attributes:
         model: of the robot; values (p,) of its parameters.
@@ -89,7 +89,7 @@ class ParallelPlan(MotionPlan):
     coordinates: np.ndarray
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the output folder of the command."""
+        """Write the result folder of `calib plan`."""
         from calib.procedure.report import motion_figures
 
         def more(place: Path) -> None:
@@ -188,7 +188,7 @@ def _paths(known: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0
 
 
 def _of_actuators(known: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:
-    """Return the path of the actuated joints along one of the platform's coordinates.
+    """Return the path of the actuated joints that corresponds to a path in platform coordinates.
 
     `places_per_span`: places per span of the path at which the actuators are solved for.
     """

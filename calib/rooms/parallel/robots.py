@@ -29,7 +29,7 @@ INSTEAD = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParallelMechanism:
-    """A parallel robot with its loops closed, and its file."""
+    """A parallel robot whose loops close at home, and the file that describes it."""
 
     known: ClosedRobot
     source: Path
@@ -42,7 +42,7 @@ class ParallelMechanism:
         return self.known.robot
 
     def write(self, folder: Path) -> None:
-        """Write ``robot.toml``."""
+        """Write the robot as ``robot.toml`` into a folder."""
         parallel_robot.write(folder / ROBOT, self.known.robot, f"from {self.source}")
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:

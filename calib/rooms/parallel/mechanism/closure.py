@@ -153,7 +153,7 @@ _Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Postur
 
 
 def closed(robot: ParallelRobot) -> ClosedRobot:
-    """Return a robot with its loops closed at home, after a check of its freedoms.
+    """Return a robot with its loops closed at home; raise an error if its freedoms are not those named.
 
     Raises:
         RobotError: where a loop does not close there, home is singular, or the loops leave other freedoms than named.
@@ -247,7 +247,7 @@ def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
 
 
 def _check_postures(known: ClosedRobot, posture: Posture) -> None:
-    """Refuse postures at a singularity, or beyond one.
+    """Raise an error for postures at a singularity, or on another branch than home.
 
     Raises:
         NoPosture: naming the sample, the leg or the platform, and the type: 1 (a leg is stretched or folded), 2 (the
@@ -301,7 +301,7 @@ def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim,
 
 
 def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
-    """Return solutions near `start`; two steps suffice for a rough solution."""
+    """Return the postures near `start` that meet the targets, by Newton's method (two steps if `rough`)."""
     q, pose = np.array(start.q), np.array(start.pose)
     left = np.arange(len(q))
     max_steps = 60  # Newton steps
@@ -402,7 +402,7 @@ def _determinants(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
 
 
 def _best_rows(J: np.ndarray) -> np.ndarray:
-    """Return rows (n,) of J (c, n) whose determinant is far from zero."""
+    """Return the indices of n rows of J (c, n) whose determinant is far from zero."""
     pivots = np.asarray(scipy.linalg.qr(J.T, mode="r", pivoting=True)[-1])
     return np.sort(pivots[: J.shape[1]])
 
@@ -421,7 +421,7 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
         left = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
         if left != robot.r:
             robot.refuse(
-                f"its platform has {left} freedoms, but freedom names {robot.r} "
+                f"its platform has {left} freedoms, but the key 'freedom' lists {robot.r} "
                 f"({', '.join(robot.freedom)}); its free motions are {_motions(values[2][6 - left :])}"
             )
         if np.linalg.cond(values[2][6 - left :, robot.selected]) > 1e8:

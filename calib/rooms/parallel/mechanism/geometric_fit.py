@@ -74,7 +74,7 @@ class LoopFit:
 
 
 def loop_parameters(known: ClosedRobot) -> tuple[LoopParameter, ...]:
-    """Return the constants of a robot that can change while all loops stay closable."""
+    """Return the geometric constants of a robot that may change without opening a loop for good."""
     robot = known.robot
     links, jacobians = leg_links(robot, known.home), loop_jacobians(known, known.home)
     found = []

@@ -1,6 +1,4 @@
-"""Regressor rows and torques of motions in platform coordinates x(t), with gradients for motion design.
-
-The identification model of a parallel robot, with rows for platform coordinates, actuators or power.
+"""The identification model of a parallel robot, with rows for platform coordinates, actuators or power.
 
     platform   J_p^invᵀ τ = W χ      one row per freedom; unique, also with redundant actuators (eqs 24-28)
     motor      τ = W χ               one row per actuator, where there are as many as freedoms (eq. 14)
@@ -9,7 +7,8 @@ The identification model of a parallel robot, with rows for platform coordinates
     W = [J_tᵀ W_legs, Dᵀ W_platform, J_tᵀ W_drives]
 
 (Briot, Gautier & Krut 2013.) Bodies are numbered as there: joint j of leg k is jk, the platform comes after the legs'
-last joints, payloads on it after that. χ holds ten standard parameters of each, then the drives' terms.
+last joints, payloads on it after that. χ: ten standard parameters of each body, then the drives' terms.
+`PlatformRegressor` has the same rows as functions of platform coordinates x(t), with gradients for motion design.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -222,7 +221,7 @@ class ParallelModel:
         return result
 
     def leg_parameters(self, values: np.ndarray) -> list[np.ndarray]:
-        """Return the parameters of each leg's bodies, zero for a last link that is the platform."""
+        """Return the parameters of each leg's bodies; those of a last link that is the platform are zero."""
         return [
             np.append(values[columns], np.zeros(10 * bodies.count + columns.start - columns.stop))
             for bodies, _, columns in self.legs
@@ -337,7 +336,7 @@ def make_parallel_model(
     known: ClosedRobot, sets: Sequence[str] = (), v0: float = V0, rows: TorqueRows | None = None,
     payloads: Sequence[str] = (), passive: str = "",
 ) -> ParallelModel:  # fmt: skip
-    """Return the model of a robot with drive terms on its actuated joints, and friction of its passive joints.
+    """Return the identification model of a robot: bodies, drive terms of actuated joints, friction of passive joints.
 
     Args:
         sets: names out of `calib.dynamics.drives.standard`, one text per actuated joint or one for all; none: Ia Fv Fc
@@ -375,7 +374,7 @@ STEP = 1e-6  # of the differences by x
 
 
 def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
-    """Return the robot's motion along platform coordinates x (N, r) with derivatives v, a.
+    """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a.
 
     Args:
         near: (N,) postures to start Newton from; None: from home.
@@ -424,7 +423,7 @@ class PlatformRegressor:
     carried: Collection[str] | None = None
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
-        """Return the robot's motion along x, v, a (N, r), clipped to the robot's box."""
+        """Return the motion of all joints for x, v, a (N, r); x is clipped to the robot's box."""
         return along(self.model.known, self._reachable(x), v, a)
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
