@@ -126,7 +126,7 @@ class Freedom:
 
 
 def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
-    """Return the solutions of rows (e, C) · coefficients = values (e,), with an orthonormal null-space basis."""
+    """Return a solution of rows (e, C) · coefficients = values (e,), and an orthonormal basis of the null space."""
     if not len(rows):
         return Freedom(np.zeros(rows.shape[1]), np.eye(rows.shape[1]))
     particular = np.linalg.lstsq(rows, values, rcond=None)[0]

@@ -107,7 +107,7 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
-    """Return mean, rms, 95 % quantile and maximum of error magnitudes times `factor`; None without errors."""
+    """Return mean, rms, 95 % quantile and maximum of error magnitudes times `factor`; None for empty input."""
     if sizes is None:
         return None
     scaled = factor * sizes

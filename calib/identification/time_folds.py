@@ -80,7 +80,7 @@ class CrossValidation:
         inflation: (rows,) variance inflation: number of rows that count as one.
         group: (p,) ridge group of each column, -1 for none.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
-        regimes: products by regime of each torque row, see `calib.identification.time_folds`.
+        regimes: products by range of motion and torque row, see `calib.identification.time_folds`.
     """
 
     data: Triangles

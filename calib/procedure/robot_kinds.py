@@ -1,4 +1,4 @@
-"""Commands for robots other than serial arms: detecting the kind of robot, and the commands it supports."""
+"""Commands for robots other than serial arms: detection of the kind of robot, and its available commands."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class MechanismResult(Protocol):
     def verdict(self) -> Verdict: ...
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the same result folder as `calib fit` or `calib identify`."""
+        """Write the result folder in the form of `calib fit` or `calib identify`."""
         ...
 
     def with_unseen(self, unseen: Sequence[Any]) -> MechanismResult:
@@ -79,7 +79,7 @@ class MechanismResult(Protocol):
 
 
 def mechanism(robot: object) -> Mechanism | None:
-    """Return `robot`, or the robot with that name or file, if it is not a serial arm; otherwise None.
+    """Return the robot given as object, name or file if it is not a serial arm; otherwise None.
 
     Raises:
         RobotError: for a file that contradicts itself.
@@ -123,7 +123,7 @@ def _run(run: Callable[..., Any], found: Mechanism, *args: Any, **given: Any) ->
 
 
 def refuse_unread(settings: Any, plain: Any, read: Collection[str], where: object = "") -> None:
-    """Raise an error for settings that a stage does not use, unless they have the default value or are False.
+    """Raise an error for settings that a stage does not use, unless their values are default or False.
 
     Args:
         settings, plain: dataclasses of one type: the given values, and the defaults.

@@ -141,7 +141,9 @@ class Chain:
         max_number = 1e12  # of masses, moments and lengths [SI] (our choice)
         for what in ("tail", "inertias"):
             if (value := getattr(self, what)) is not None and not (np.abs(value) < max_number).all():
-                raise RobotError(f"'{self.name}': {what} contains a number that is not finite or beyond {max_number:g}")
+                raise RobotError(
+                    f"'{self.name}': {what} contains a number that is not finite or exceeds {max_number:g}"
+                )
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
         for what, names in (("joint", self.joint_names), ("element", self.names)):

@@ -305,6 +305,6 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
 def test_poses_chosen_without_constraints_say_what_they_keep_and_what_is_not_checked():
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
     assert "kept: 1 % of each joint's range to its limits, self-collision" in str(chosen)
-    assert "NOT checked: line of sight (the instrument's place is not known), walls" in str(chosen)
+    assert "NOT checked: line of sight (the instrument's position is not known), walls" in str(chosen)
     found = json.loads(json.dumps(chosen.to_dict()))
     assert found["random_baseline"] < found["value"] and 0.9 < found["efficiency"] <= 1.0

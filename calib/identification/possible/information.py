@@ -111,7 +111,7 @@ def read(folder: str | Path) -> Information:
     chain, dynamics = read_dynamics(folder)
     groups = read_table(folder).get("regrouping")
     if groups is None:
-        raise RobotError(f"{folder}/dynamics.json does not state how parameters regroup; identify again")
+        raise RobotError(f"{folder}/dynamics.json lacks the regrouping of parameters; identify again")
     with refused_as(
         RobotError,
         (OSError, KeyError, ValueError),

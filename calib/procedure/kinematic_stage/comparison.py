@@ -27,7 +27,7 @@ MARGIN = 3  # measured numbers per fitted parameter of a placement, below which 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Position errors on some rows, with their predicted σ and 95 % intervals.
+    """Position errors on a set of rows, with the predicted σ and 95 % intervals.
 
     Attributes:
         sigma: (m,) standard deviation of the tool position error, all axes together [m].
@@ -50,7 +50,7 @@ class Intervals:
 
     @property
     def record(self) -> IntervalCoverage:
-        """Coverage of the 95 % intervals, their median radius, and the number of rows that extrapolate."""
+        """Coverage and median radius of the 95 % intervals, and the number of rows that extrapolate."""
         return IntervalCoverage(
             coverage_percent=100.0 * self.covered,
             median_mm=1e3 * float(np.median(self.radius)),
@@ -152,7 +152,7 @@ def compare_unseen(
             words = "base and tool placement did not converge on these rows"
         elif numbers < MARGIN * fitted:
             thin = numbers, fitted
-            words = f"base and tool placement: {fitted} parameters fitted to {numbers} numbers of these rows"
+            words = f"base and tool placement: {fitted} parameters fitted to only {numbers} numbers of these rows"
     elif unseen.held_out:
         words = "those of the fit"
     else:
@@ -184,6 +184,6 @@ def iso9283_sentence(found: RepeatedPoses, min_poses: int = 5, min_cycles: int =
         f"(at most {found.repeatability_mm['max']:.3f}), AP {nominal:.3f} mm nominal, {calibrated:.3f} mm calibrated"
     )
     few = [f"{min_poses} poses"] * (found.poses < min_poses) + [f"{min_cycles} cycles"] * (least < min_cycles)
-    words += f"; the norm asks for {' and '.join(few)}" if few else ""
-    too_few = f"; too few poses to state an accuracy (makers take {usual_poses})"
+    words += f"; the norm requires {' and '.join(few)}" if few else ""
+    too_few = f"; too few poses to state an accuracy (makers use {usual_poses})"
     return words + (too_few if found.poses < usual_poses else "")

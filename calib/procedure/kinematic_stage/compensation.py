@@ -1,4 +1,4 @@
-"""Joint commands that place the tool of the real (calibrated) robot on nominal targets.
+"""Joint commands that bring the tool of the real (calibrated) robot to nominal targets.
 
 Frames are a convention: measurements from outside cannot separate the arm's base from the placement of the instrument,
 nor its flange from the placement of the target:
@@ -74,7 +74,7 @@ class Fitted:
 
     @property
     def placed(self) -> bool:
-        """Whether the fit states where the nominal robot stands."""
+        """Whether the fit contains the placement of the nominal robot."""
         return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(self.nominal.station_names)
 
     @property
@@ -147,7 +147,7 @@ def read(folder: str | Path) -> Fitted:
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
-    """Return the nominal and the calibrated arm in the frame of the targets, each with one station and one tool.
+    """Return the nominal and the calibrated arm in the frame of the targets, each with a single station and tool.
 
     Args:
         fitted: see `read`.
@@ -215,7 +215,7 @@ def compensate(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Commands:
-    """Return the joint commands that place the real tool on the targets.
+    """Return the joint commands that bring the real tool to the targets.
 
     The nominal robot says which configuration is meant; from there the calibrated one is led to the target, joints
     moving as little as they can. Where one would move by more than `MAX_CORRECTION`, the arm is near a singularity:
@@ -333,7 +333,7 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
 def _reason(
     chain: Chain, good: bool, beyond: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool
 ) -> str:
-    """Return why a target is not reached, or which joints of its command are outside the measured range; "" if none."""
+    """Return why a target is not reached, or which of its joint values are outside the measured range; else ""."""
     if good:
         names = [name for name, out in zip(chain.joint_names, beyond) if out]
         return sentence(finding("command-extrapolates", joints=names)) if names else ""
@@ -350,7 +350,7 @@ def _reason(
 def _predicted_sigmas(
     fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tool's sigmas (m, 2) from the parameters, and its expected errors (m, 2), see `Commands`.
+    """Return the tool's sigmas (m, 2) due to the parameters, and the tool's expected errors (m, 2), see `Commands`.
 
     Where the fit did not place the tool, it counts as known.
     """
@@ -372,7 +372,7 @@ def _predicted_sigmas(
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
-    """Return the finding on the frame of the targets, and the distance to the alternative frame."""
+    """Return the note on the frame of the targets, with the distance to the alternative frame."""
     if frame not in ("base", "nominal"):
         return finding("targets-in-station", station=frame)
     shift = turn = None
@@ -414,7 +414,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     fitted, targets = commands.fitted, commands.targets
     lost, count = int(np.sum(~commands.reached)), len(commands.q)
     if lost and (not partial or lost == count):
-        advice = "" if lost == count else "\nwith partial (--partial) the others are written and these rows stay empty"
+        advice = "" if lost == count else "\nwith partial (--partial), all other rows are written and these stay empty"
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         raise UsageError("\n  ".join([head, *_unreached(commands)]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names

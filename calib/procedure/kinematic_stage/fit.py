@@ -117,7 +117,7 @@ def run(
     asked, seed = wanted.model or options.model, wanted.seed
     if selection is not None:
         selection.check_robot(inputs.chain.joint_names)
-    say("placing the instrument and the tool")
+    say("estimating the placements of instrument and tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     climb = partial(
         select_model,
@@ -193,7 +193,7 @@ def _found_of(
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
-    """Return a finding if one station per file explains the files far better than the station they share."""
+    """Return a finding if separate stations explain the files far better than a common station."""
     own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []

@@ -77,7 +77,7 @@ class FitFolder:
         return read_record(Findings, _of_today(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
-        """Read the calibrated arm; return it with the nominal one, whose frames are fitted again to the fitted rows."""
+        """Read the calibrated and the nominal arm; frames of the nominal arm are refitted to the fitted rows."""
         found, cell, expected = self.findings(), installation.read(self.path), None
         chosen = replace(settings, loss=found.loss or settings.loss)
         if found.discrepancy is not None:
@@ -116,7 +116,7 @@ class ValidationFolder:
         return found.record
 
     def metrics(self) -> ValidationMetrics:
-        """Read numbers and verdict; in schema 1 the warnings do not include those of the fit."""
+        """Read numbers and verdict; in schema 1, warnings of the fit are not included."""
         return _read(ValidationMetrics, self.judged)
 
 
@@ -143,7 +143,7 @@ def _of_today(findings: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error if a fit must not be written to `out`: other results are there, or one of the inputs."""
+    """Raise an error if a fit must not be written to `out`: the folder contains other results, or an input file."""
     folders.check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 

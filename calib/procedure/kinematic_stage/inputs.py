@@ -117,7 +117,7 @@ def gather(
         return given
     name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
     return replace(
-        given, notes=(*given.notes, f"{name} has {count} deflection terms from an earlier fit; they stay unchanged")
+        given, notes=(*given.notes, f"{name} has {count} deflection terms of an earlier fit; these stay unchanged")
     )
 
 
@@ -155,7 +155,7 @@ def load_robot(
     base: str | None = None,
     tip: str | None = None,
 ) -> tuple[Chain, Path]:
-    """Return a robot's chain and its file; of a URDF, the chain with the joints of the measured table."""
+    """Return a robot's chain and its file; from a URDF, the chain that has the joints of the measured table."""
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
     source = resolve(robot)
@@ -192,7 +192,7 @@ def load_rigid(
 
 
 def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
-    """Refuse a table of joints in which revolute joints of the arm are missing: their positions would be unknown."""
+    """Refuse a table without columns of some revolute joints of the arm, since their positions would be unknown."""
     try:
         whole = load(source, base)
     except CalibError:  # the URDF does not say by itself where its arm ends
@@ -281,7 +281,7 @@ def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
 def _named(
     read: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
-    """Return the blocks to fit with station and tool names as --stations and --tools ask; all names are distinct.
+    """Return the blocks to fit with station and tool names from --stations and --tools; all names are distinct.
 
     Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
     """
@@ -304,7 +304,7 @@ def _named(
 
 
 def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return the name of a file's tool; from the second tool of its kind on with a number."""
+    """Return the name of a file's tool, with a number from the second tool of its kind on."""
     number = [each for each in carried if each[0] == own[0]].index(own) + 1
     return f"{own[0]} {number}" if number > 1 else own[0]
 
@@ -316,7 +316,7 @@ def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
 
 
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
-    """Return a validation block with the station and the tools of the fit."""
+    """Return a validation block that uses the station and the tools of the fit."""
     fit = [other for other in fit if other.carried == block.carried] or fit
     first = fit[0]
     if block.has_instrument:

@@ -16,7 +16,7 @@ SCHEMA = 3  # of metrics.json; 1 had no findings, 2 kept sentences in place of c
 
 @dataclass(frozen=True)
 class IntervalCoverage:
-    """Share of errors within the fit's 95 % interval, the interval's width, and the rows that extrapolate."""
+    """Share of errors within the fit's 95 % interval, interval width, and number of rows that extrapolate."""
 
     coverage_percent: float
     median_mm: float
@@ -56,7 +56,7 @@ class ComparedRows:
     reprojection_px: Mapping[str, float] = field(default_factory=dict)
 
     def judged(self, deliverable: str) -> ArmErrors:
-        """Return the errors of the deliverable that the verdict is about."""
+        """Return the errors of the deliverable (robot file) on which the verdict is based."""
         return self.calibrated if deliverable != "urdf" or self.urdf_alone is None else self.urdf_alone
 
 

@@ -57,7 +57,7 @@ def misfit(found: ModelSelection, reach: float) -> Finding | None:
 
 
 def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
-    """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; else None.
+    """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; otherwise None.
 
     Args:
         found: the selection of models with a loss that heeds every row.
@@ -151,7 +151,7 @@ def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
 
 
 def _scale(codes: tuple[str, str], one: Scale | None) -> list[Finding]:
-    """Return the first of two findings on a scale factor that is serious enough to report."""
+    """Return the finding on an implausible scale factor, the first of two that is serious enough to report."""
     if one is None:
         return []
     off = abs(one.factor - 1.0)

@@ -1,4 +1,4 @@
-"""Selection of the poses to measure, from a robot's observation Jacobian and with the package `poses`."""
+"""Selection of the poses to measure: the package `poses` gets a robot's observation Jacobian."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -94,7 +94,7 @@ class Chosen:
         return () if self.prediction is None else FIGURES if self.outlook.others else FIGURES[:1]
 
     def kept(self) -> list[str]:
-        """Return lines on the constraints that were checked, on those that were not, and on the run."""
+        """Return lines on the checked constraints, on the constraints not checked, and on the run."""
         lines = [f"kept: {', '.join(self.checked)}"] if self.checked else []
         lines += [f"NOT checked: {', '.join(self.unchecked)}"] if self.unchecked else []
         return [*lines, *ways(self.run, self.driven)]
@@ -206,7 +206,7 @@ def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> n
 def _outlook(
     seen: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, pool: Exchange, comparable: float
 ) -> PoseOutlook:
-    """Return the predicted accuracy with chosen poses q (m, n), with other numbers, and without line of sight."""
+    """Return the predicted accuracy with chosen poses q (m, n), with other pose counts, and without sight limits."""
     free, before = limits.space(seen, sight=False), pool.before
     stream = np.random.default_rng([search.seed, 2])
     typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
@@ -224,7 +224,7 @@ def _outlook(
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
-    """Return the files written next to a selection's CSV: the prediction, and figures by name."""
+    """Return the files written next to a selection's CSV: the prediction, and the figures by name."""
     figures = () if not plots else FIGURES if chosen is None else chosen.figures
     predicted = {} if chosen is not None and chosen.prediction is None else {"prediction": forecast.beside(out)}
     return predicted | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
@@ -245,11 +245,11 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(found: Selection) -> str:
-    """Return, as text, which poses an efficiency's bound covers, and how exact it is."""
+    """Return a text on the poses for which the bound of an efficiency holds, and on the bound's accuracy."""
     climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
     if not climbs:
         return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
-    return f"of all feasible poses, as found by {climbs} searches; the bound is at most {gap:.2g} % too high"
+    return f"of all feasible poses found by {climbs} searches; the bound is at most {gap:.2g} % too high"
 
 
 def record(chosen: Chosen) -> dict[str, Any]:
@@ -272,7 +272,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
     found = chosen.selection
     known = [] if chosen.existing is None else [("existing poses alone", f"{chosen.existing:.6g}")]
     return [
-        ("index", f"{found.index}" + (" (its ranking does not depend on units)" if found.index == "O1" else "")),
+        ("index", f"{found.index}" + (" (ranks pose sets independently of units)" if found.index == "O1" else "")),
         ("identifiable parameters", str(chosen.parameters)),
         ("best of 1000 random sets", f"{found.random_baseline:.6g}"),
         *known,
@@ -291,7 +291,7 @@ def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
         return rows
     (index, blind), one = chosen.outlook.blind, chosen.outlook.poses
     words = (
-        f"index {chosen.outlook.comparable:.5g} instead of {index:.5g}, "
+        f"index {chosen.outlook.comparable:.5g} instead of {index:.5g} without it, "
         f"σ of the tool {1e3 * one.rms:.3g} instead of {1e3 * blind.rms:.3g} mm"
     )
     return [*rows, ("cost of line of sight", words)]

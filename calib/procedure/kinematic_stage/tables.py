@@ -1,4 +1,4 @@
-"""Tables of the fitted parameters and residuals: frames as placements, not as displacements from the nominal frame.
+"""Tables of fitted parameters and residuals; frames are given as placements, not as changes from nominal.
 
 The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In the table stand T's own position and
 rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
@@ -44,7 +44,7 @@ class EstimateTable:
     covariance: np.ndarray
 
     def rows(self) -> list[tuple[str, str, float, float, float, float | None]]:
-        """Return name, unit, nominal, value, σ and RSD [%] of each row; no RSD at a value of 0."""
+        """Return name, unit, nominal, value, σ and RSD [%] of each row; RSD is empty for a value of 0."""
         sigma = np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
         numbers = zip(self.names, self.units, self.nominal, self.values, sigma)
         return [
@@ -180,7 +180,7 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
 
 
 def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
-    """Write the errors of both arms at every validation row; of positions, also the error vectors.
+    """Write the errors of both arms at every validation row, and the error vectors of measured positions.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
     puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.

@@ -1,4 +1,4 @@
-"""Errors of both arms on fitted rows and validation rows, and the verdict from them.
+"""Errors of both arms on fitted rows and validation rows, and the verdict that follows from the errors.
 
 `assess` returns the same result for a new fit and for one read from its folder.
 
@@ -30,7 +30,7 @@ RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")  # no rigid geometry ex
 
 @dataclass(frozen=True)
 class _Proof:
-    """Errors that the verdict on the arms is based on: rms before and after [m], and their rows."""
+    """Errors on which the verdict on the arms is based: rms before and after [m], and the rows of these errors."""
 
     before: float
     after: float
@@ -150,7 +150,7 @@ def _worse(found: Sequence[_Proof], reach: float) -> list[Finding]:
 def _doubts(
     worst: _Proof, own: float, cross_validated: float | None, proofs: Mapping[str, Comparison], findings: Findings
 ) -> Iterator[Finding]:
-    """Yield the findings of the last group of rules, worst first."""
+    """Yield the remaining findings, worst first: no transfer, narrow intervals, small gain, outliers."""
     times = worst.after / max(own, 1e-300)
     shared = any(rows.shares_frames for rows in proofs.values())
     remedy = catalogue()["placed-elsewhere"].advice if shared else ""
@@ -268,7 +268,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, settings: Settings, w
 def judge_deliverables(
     fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, wanted: FitSettings
 ) -> dict[str, Verdict]:
-    """Return the verdict on each deliverable: robot.urdf alone, and with joint corrections if there are any."""
+    """Return the verdict on each deliverable: robot.urdf alone, and (if fitted) with joint corrections."""
     common = partial(judge, findings=findings, asked=wanted.model or "auto", tolerance=wanted.tolerance)
     if fit.alone is None:
         return {"urdf": common(fit, validation, cross_validated=findings.cross_validated)}
@@ -300,7 +300,7 @@ def _copies(inputs: Inputs) -> list[str]:
 
 
 def _noticed(name: str, each: Comparison, usual: float) -> Iterator[Finding]:
-    """Yield the findings on one set of validation rows.
+    """Yield the findings on one set of validation rows: moved instrument, doubtful rows, frames, intervals.
 
     Errors that look like another placement of the instrument than the `usual` nominal ones [m], rows that may be wrong
     measurements, a placement of base and tool that did not settle or took up most of the errors, and how many errors

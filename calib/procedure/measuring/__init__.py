@@ -1,4 +1,4 @@
-"""Measuring at selected poses: their limits, run and prediction; settings of a run (speed and dwell time)."""
+"""Measuring at selected poses: limits of poses, runs, predicted accuracy, and settings of a run."""
 
 from dataclasses import dataclass
 from typing import Annotated

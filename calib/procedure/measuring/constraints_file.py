@@ -169,7 +169,7 @@ class ObstacleTable(PlacedTable):
 
 
 def _span_or_margin(value: Any) -> Any:
-    """Check that a value is a range (two numbers or texts with units) or a single margin, and return it."""
+    """Return the value after a check that it is a range (two numbers or texts with units) or a single margin."""
     pair = isinstance(value, list | tuple) and len(value) == 2
     parts = value if pair else (value,)
     if not all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in parts):
@@ -189,7 +189,7 @@ Place = Annotated[Any, Checked(_place_or_unknown, {"anyOf": [{"type": "object"},
 @strict
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """Table ``[camera]``, see the module; with ``unknown`` keys the camera's view of the board is not checked."""
+    """Table ``[camera]``, see the module; if keys are ``unknown``, the camera's view of the board is not checked."""
 
     mounting: Annotated[str, OneOf((IN_HAND, TO_HAND, UNKNOWN))]
     lens: Name
@@ -202,7 +202,7 @@ class CameraTable:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Keys with the value unknown that the check of the camera's view needs."""
+        """Keys needed to check the camera's view whose value is ``unknown``."""
         names = ("mounting", "lens", "board", "carried", "stands")
         return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 

@@ -162,14 +162,14 @@ def limits_of(
 
 
 def _unchecked(stated: ConstraintsFile, absent: set[str], seen: bool) -> tuple[str, ...]:
-    """Return the names of the limits that are not checked, for poses (`seen`) or for motions."""
+    """Return the names of the limits that are not checked, for poses (if `seen`) or for motions."""
     table, collision = stated.instrument or InstrumentTable(), stated.collision or CollisionTable()
     placed = bool(table.stated)
     missing = {
         "margin to the joint limits (switched off)": "joint-margin" in absent,
         "self-collision (switched off)": "self-collision" in absent,
         "floor (switched off)": "floor" in absent and collision.floor is None,
-        "line of sight (the instrument's place is not known)": seen and not placed and "instrument" not in absent,
+        "line of sight (the instrument's position is not known)": seen and not placed and "instrument" not in absent,
         "cone of acceptance of the target (not known)": seen and placed and table.sight is None,
         "links in the line of sight (switched off)": seen and placed and "view" in absent,
         "walls of the cell (not known)": collision.box is None and "box" not in absent,
@@ -188,7 +188,7 @@ def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
 def _joints(
     spans: Mapping[str, Any], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return lower and upper joint limits (n,), and notes on stated ranges without effect."""
+    """Return lower and upper joint limits (n,), and notes on given ranges that have no effect."""
     notes = []
     lower, upper = (side.copy() for side in cell.chain.sampling_limits())
     limited = np.isfinite(cell.chain.lower) & np.isfinite(cell.chain.upper)
@@ -244,7 +244,7 @@ def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> lis
 
 
 def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
-    """Return the lines of sight: cone and range if stated, not blocked by the arm.
+    """Return the lines of sight: cone and range if given, and no link of the arm in between.
 
     An instrument with roll and pitch alone is a camera whose view these state.
     """

@@ -1,4 +1,4 @@
-"""Predicted accuracy of a set of poses, before anything is moved: σ of parameters and of the tool's position.
+"""Predicted accuracy of a set of poses before the robot moves: σ of parameters and of the tool's position.
 
 With W the whitened observation Jacobian of the poses, C = (WᵀW)⁻¹ is the covariance that the fit will state if the
 measurements are as noisy as said and the model is the geometry that the poses were chosen for; a tool's position then
@@ -101,7 +101,7 @@ def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, pos
 def by_count(
     seen: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
 ) -> tuple[Prediction, ...]:
-    """Return the predicted accuracy with `COUNTS` poses, chosen greedily among candidates (N, rows, p).
+    """Return the predicted accuracy with `COUNTS` poses each, chosen greedily among candidates (N, rows, p).
 
     Args:
         seen, typical: see `predicted`.
@@ -122,9 +122,9 @@ def by_count(
 
 
 def table(one: Prediction, others: tuple[Prediction, ...]) -> list[tuple[str, str]]:
-    """Return the rows (label, values) of a table: sigmas of tool and parameters, and with other numbers of poses."""
+    """Return the rows (label, values) of a table: sigmas of tool and parameters, also for other pose counts."""
     if not np.isfinite(one.rms):
-        return [("predicted σ of the tool's position", "none: not all parameters are identifiable from these poses")]
+        return [("predicted σ of the tool's position", "not available: these poses do not identify all parameters")]
     rows = [("predicted σ of the tool's position", f"{1e3 * one.rms:.3g} mm rms, {1e3 * one.worst:.3g} mm at 95 %")]
     worst = []
     for unit, words, shown in (("m", "lengths", "mm"), ("rad", "angles", "mrad")):

@@ -72,7 +72,7 @@ class Run:
 
     @property
     def found_ways(self) -> Ways:
-        """The collision-free paths, by the numbers of their two poses in input order."""
+        """The collision-free paths, keyed by the input numbers of start and end pose."""
         pairs = enumerate(pairwise(self.order))
         return {
             _pair(one, two): self.ways[k] if one < two else self.ways[k][::-1]
@@ -170,7 +170,7 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
-    """Return the fastest order if moves may pass other poses, and its paths; pairs without a path are left out."""
+    """Return the fastest order, in which moves may pass through other poses, and the paths between the poses."""
     direct = np.full(cost.shape, np.inf)
     for one, two in clear:
         direct[one, two] = direct[two, one] = cost[one, two]
@@ -220,7 +220,7 @@ def _pair(one: int, two: int) -> tuple[int, int]:
 
 
 def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
-    """Return (m, m) flags: straight moves clear at `PLACES` places (an estimate for ordering the poses)."""
+    """Return (m, m) flags: straight moves clear at `PLACES` places (an estimate, used to order the poses)."""
     one, two = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
     places = q[one] + share * (q[two] - q[one])
@@ -241,7 +241,7 @@ def lines(run: Run, settings: RunSettings) -> list[str]:
         found.append(f"{run.around} of {len(run.ways)} paths lead around an obstacle: also drive their via-points")
     if run.blocked:
         pairs = ", ".join(f"{k + 1} to {k + 2}" for k in run.blocked)
-        found.append(f"NO clear path was found from pose {pairs}: drive there by hand, or leave out the pose")
+        found.append(f"NO clear path was found from pose {pairs}: drive there by hand, or omit the pose")
     return found
 
 
@@ -275,7 +275,7 @@ def is_run(path: Path) -> bool:
 
 
 def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return a run's file as times (N,) [s] and joint values (N, n) [rad or m] at `rate` [Hz], for a rehearsal.
+    """Return times (N,) [s] and joint values (N, n) [rad or m] of a run's file at `rate` [Hz], for a rehearsal.
 
     Raises:
         MeasurementError: if a joint's column is missing.
@@ -295,7 +295,7 @@ def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _room(chain: Chain, limits: Any, velocity: np.ndarray) -> Room:
-    """Return the collision test of paths: half the clearance is required at places at most one clearance apart."""
+    """Return the collision test of paths: it requires half the clearance at places at most one clearance apart."""
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
 
@@ -313,7 +313,7 @@ MAX_STRAIGHT_TRIES, MAX_VIA_TRIES = 200, 4
 
 @dataclass(frozen=True, eq=False)
 class Exchange:
-    """Candidate poses that may replace others, and the index by which they are ranked.
+    """Candidate poses that may replace unreachable ones, and the observability index that ranks the candidates.
 
     Attributes:
         jacobian: q (m, n) -> whitened observation Jacobians (m, rows, p).
@@ -334,7 +334,7 @@ class Exchange:
         return observability(rows, self.index), float(log_det(flat.T @ flat)) / rows.shape[2]
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
-        """Return the candidates' numbers (N,), best first, by the index that each gives together with poses (m, n)."""
+        """Return the candidates' numbers (N,), best first, by the index of each together with poses (m, n)."""
         rows, trials = self._rows(q), self.jacobian(self.candidates)
         flat = rows.reshape(-1, rows.shape[2])
         matrices = flat.T @ flat + trials.transpose(0, 2, 1) @ trials
@@ -366,7 +366,7 @@ class Drivable:
 
     @property
     def words(self) -> str:
-        """Sentence on the replaced poses, counted from 1 in the order of the run; "" if none."""
+        """Sentence on the replaced poses, numbered from 1 in the order of the run; "" without replacements."""
         if not self.replaced:
             return ""
         numbers = ", ".join(f"{k}" for k, place in enumerate(self.run.order, 1) if place in self.replaced)

@@ -1,4 +1,4 @@
-"""Lines of sight from an instrument to its targets: cone of acceptance, range, and no link of the arm in between.
+"""Lines of sight from an instrument to its targets: limits on cone of acceptance, range, and links in between.
 
 With several targets (reflectors on one plate, each with a direction of its own) a pose counts if one of them is seen,
 and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
@@ -27,7 +27,7 @@ SEEN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _Behind:
-    """Constraint (m, `DISTANCES`) of links near a line of sight: `BEAM` minus the distances of the nearest links.
+    """Constraint (m, `DISTANCES`) that keeps links off a line of sight: `BEAM` minus the nearest links' distances.
 
     Attributes:
         arm: with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
@@ -67,7 +67,7 @@ class Sight:
     targets: tuple[tuple[PoseConstraint, ...], ...]
 
     def constraints(self) -> tuple[PoseConstraint, ...]:
-        """Return the constraints of a pose: all of a single target, or all of the best of several targets."""
+        """Return the constraints of a pose: of the only target, or of the best visible one of several targets."""
         if len(self.targets) == 1:
             return self.targets[0]
         return (PoseConstraint("line of sight to one of the targets", self._best, self._best_gradient),)
@@ -147,7 +147,7 @@ def sight_of(
 
 
 def _beside(arm: Any, chain: Chain, target: Target) -> np.ndarray:
-    """Return the indices of the links that can block the view: not those next to the target in every posture."""
+    """Return the indices of links that can block the view: all except those next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
     place = target(q)[1]
     distances = arm.beam(q, place, np.zeros((len(q), 3, chain.n)), place + 1e-6)[0]

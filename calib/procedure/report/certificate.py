@@ -1,4 +1,4 @@
-"""The certificate: a summary sheet, the sections it summarises, and notes common to all certificates.
+"""The certificate: a summary sheet, the sections summarised on it, and notes common to all certificates.
 
 It is written as HTML, one self-contained file for screen and print.
 """
@@ -41,11 +41,11 @@ CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
     "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
     "Quaternions are x y z w; roll-pitch-yaw is R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.",
-    "A station is the pose of the arm's base in the instrument's frame, a tool that of the target in the tip's frame.",
+    "A station is the pose of the arm's base in the instrument's frame, a tool the target's pose in the tip's frame.",
     "Nominal errors are those of the nominal arm with station and tool fitted on the same rows, so that only the "
     "arms are compared.",
-    "rms is the root mean square of the error vector's length over poses, not per axis; ± is its standard error over "
-    "sets of as many poses.",
+    "rms is the root mean square of the error vector's length over poses, not per axis; ± is its standard error "
+    "over sets of this many poses.",
 )
 LIMITATIONS = (
     "Sigmas are the uncertainty from measurement noise under the chosen model; they do not cover unmodelled "
@@ -95,7 +95,7 @@ def certificate(
 
 
 def _fitting(section: Section) -> Section:
-    """Return a section with its reason shortened to fit the first sheet; the full text becomes its first block."""
+    """Return a section with its reason shortened to fit the first sheet; its first block is the full reason."""
     short = shortened(section.reason, MAX_REASON_LETTERS)
     if short == section.reason:
         return section
@@ -108,15 +108,15 @@ def file_row(name: str, role: str, path: Path) -> FileRow:
 
 
 def unseen_role(role: str, seen: bool, judged: str) -> str:
-    """Return the role of a validation file: unseen or not by what is `judged`."""
+    """Return the role of a validation file, and whether the file was unseen by `judged` (fit or identification)."""
     return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
 
 
 def tolerance(millimetres: float | None, found: FitMetrics) -> str:
-    """Return a text on the condition of verdict pass, and on the rated deliverable."""
+    """Return a text on the condition for verdict pass, and on the deliverable to which it applies."""
     of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
     if not millimetres:
-        return f"not stated: pass means better than the nominal robot on unseen poses, or no gain possible{of}"
+        return f"none given: pass means better than the nominal robot on unseen poses, or no improvement possible{of}"
     return f"{millimetres:g} mm rms on unseen poses{of}"
 
 

@@ -1,4 +1,4 @@
-"""Figures as values: a `Chart` is a grid of `Panel`s, a panel some layers over two axes; `figure` draws them.
+"""Figures as values: a `Chart` is a grid of `Panel`s, a panel some layers over two axes; `figure` draws a chart.
 
 Layers are lines, bars, marked levels, words, coloured dots, heat maps, histograms and boxes: nine ways to show numbers.
 """
@@ -28,7 +28,7 @@ Layer = Callable[..., None]  # draws onto the axes of a panel, whose scales are 
 
 
 def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
-    """Return a drawing function as a maker of layers: it takes the same arguments without the axes.
+    """Return a function that makes a layer from a drawing function; its arguments are the same, without the axes.
 
     What it returns can be pickled, which the cache of drawn pictures needs.
     """
@@ -64,7 +64,7 @@ def bars(
     axes: Axes, values: Any, colours: Any = AFTER, upright: bool = False, shift: float = 0.0, thick: float = 0.7,
     base: float = 0.0, spread: Any = None, label: str = "",
 ) -> None:  # fmt: skip
-    """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half lengths of error bars."""
+    """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
     values = np.asarray(values, dtype=float)
     kind, error = (axes.bar, "yerr") if upright else (axes.barh, "xerr")
     errors: Any = {error: spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
@@ -77,7 +77,7 @@ def level(
     axes: Axes, at: float, colour: str = MARK, form: str = "--", upright: bool = False, words: str = "",
     height: float = 0.98,
 ) -> None:  # fmt: skip
-    """Draw a horizontal or vertical line across the panel, with a label; at a vertical line at the given height."""
+    """Draw a horizontal or vertical line across the panel, with a label (for a vertical line at the given height)."""
     (axes.axvline if upright else axes.axhline)(at, color=colour, linewidth=0.8, linestyle=form)
     right = not upright or axes.transAxes.inverted().transform(axes.transData.transform((at, at)))[0] < 0.6
     axes.annotate(

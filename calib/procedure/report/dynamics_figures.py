@@ -1,4 +1,4 @@
-"""Figures of the dynamics: of an identification's outcome, and of the files of its folder for a page."""
+"""Figures of the dynamics: from an identification's outcome, or from the files of its folder."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -62,7 +62,7 @@ def _autocorrelations(outcome: IdentificationOutcome) -> Chart:
 
 
 def _friction(outcome: IdentificationOutcome) -> Chart:
-    """Return the chart of friction over velocity: first file's torques minus the rigid model, and friction model."""
+    """Return the chart of friction over velocity: model, and torques of the first file minus the rigid-body model."""
     found, case = outcome.found, outcome.inputs.cases[0]
     model = found.dynamics.model
     terms = list(zip(model.columns, found.dynamics.values[model.inertial :]))
@@ -253,7 +253,7 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
 
 
 def _torques(unseen: UnseenReport) -> list[Picture]:
-    """Return the pictures of measured and predicted torques of unseen recordings, or else of fitted ones."""
+    """Return the pictures of measured and predicted torques of unseen (otherwise of fitted) recordings."""
     seen = "unseen" if unseen.validation else "fitted"
     result = []
     for curves in unseen.curves:
@@ -266,7 +266,7 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
 
 
 def _significance(found: DynamicReport) -> Picture:
-    """Return the picture of each parameter's distance from zero in sigmas; below two it is not significant."""
+    """Return the picture of each parameter's distance from zero in sigmas; values below two are not significant."""
     known = [row for row in found.estimate if row.sigma]
     share = np.array([max(abs(row.value) / max(row.sigma or 0.0, 1e-300), 0.1) for row in known])
     shown = bars(share, [AFTER if one > 2 else QUIET for one in share], upright=True, base=0.1)

@@ -155,7 +155,7 @@ def certificate_section(
     blocks.append(page.Text("The model", _model_sentences(metrics)))
     blocks.append(page.Text("What the motion identifies", _identifiability(found)))
     blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
-    note = "R marks parameters into which others are regrouped; complete table: 8-dynamics/estimate.csv."
+    note = "R marks parameters that include others by regrouping; complete table: 8-dynamics/estimate.csv."
     blocks += [*pictures("parameters"), page.table("Identified parameters", PARAMETERS, found.estimate, note)]
     if metrics.loop:
         blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
@@ -174,7 +174,7 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
 
 
 def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[page.KeyFigure]:
-    """Return the torque errors that decide the verdict, of the worst unseen recording."""
+    """Return the torque errors that decide the verdict: those of the worst unseen recording."""
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
@@ -227,7 +227,7 @@ def _of_all(row: Sequence[str]) -> bool:
 
 
 def _interval_table(unseen: UnseenReport) -> page.Table:
-    """Return the table of the predicted 95 % intervals' coverage, per row of unseen recordings; empty without any."""
+    """Return the table of the coverage of predicted 95 % intervals, per row of unseen recordings; may be empty."""
     groups = {}
     for name, one in unseen.validation.items():
         if (found := one.interval95) is not None:
@@ -241,7 +241,7 @@ def _interval_table(unseen: UnseenReport) -> page.Table:
 
 
 def _friction_table(metrics: ModelMetrics) -> page.Table:
-    """Return the table of friction models with their error on held-out time, of all rows and of each."""
+    """Return the table of friction models with their errors on held-out time, for all rows and for each row."""
 
     def shown(shares: Iterable[float], digits: int) -> str:
         return "".join(f"{x:.{digits}f}" if np.isfinite(x) else "–" for x in shares)
@@ -267,12 +267,12 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
         lines.append(
             f"ripple at joint {one.joint}, orders {', '.join(waves)} per turn: explains "
             f"{100 * one.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out time blocks; "
-            "not part of the covariance"
+            "not included in the covariance"
         )
     for step in metrics.ladder:
         if step.model == "+ coupling":
             at = step.kept_at_joints
-            lines += [f"joints {i} and {j} are coupled: a motor turns with both" for i, j in zip(at[::2], at[1::2])]
+            lines += [f"joints {i} and {j} are coupled: one motor turns with both" for i, j in zip(at[::2], at[1::2])]
     lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
     count, columns = metrics.parameters, metrics.counts
     base = count.standard - columns.without_effect - columns.regrouped
@@ -291,7 +291,7 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
 
 
 def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[page.Block]:
-    """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest ones."""
+    """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest effects."""
     found = metrics.geometry
     if found is None:
         return []
@@ -328,7 +328,7 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
         little = loop.largest_shift_sigma < MAX_SHIFT_SIGMAS
         said = "least squares is biased, significantly but slightly" if little else "least squares is biased"
     if not loop.explains:
-        said = "no result, since the simulated loop explains less than the model does"
+        said = "no result, since the simulated loop explains less of the torque than the model"
     if not loop.valid:
         said += ", but the instruments are unreliable"
     p = f"p = {test.p:.2g}" if test.p > 0.0 else "p < 1e-300"
@@ -366,8 +366,8 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[pa
     if first.inertia_added.any():
         shown = " ".join(f"{x:.2g}" for x in first.inertia_added)
         lines.append(
-            f"the identified model is physically inconsistent: simulated with motor inertia added, {shown} kg m² (kg); "
-            "compare the rows only relatively"
+            f"the identified model is physically inconsistent: simulation adds motor inertia, {shown} kg m² (kg); "
+            "compare only the rows with each other"
         )
         gain = ""
     default = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"

@@ -1,4 +1,4 @@
-"""The data of a fit's certificate: plain numbers in ``report.json``, from which it can be written again."""
+"""The data of a fit's certificate: plain numbers in ``report.json``, from which the certificate can be rebuilt."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class _CorrelationMatrix:
 
 @dataclass(frozen=True)
 class RowErrors:
-    """Sizes of errors on one set of rows.
+    """Error sizes on one set of rows.
 
     Attributes:
         name: of the set; ``fit``, or a validation file's.

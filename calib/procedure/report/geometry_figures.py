@@ -58,7 +58,7 @@ def residuals_by_joint(
     prismatic: Sequence[bool],
     nature: str = "position",
 ) -> Chart:
-    """Return the chart of errors over each joint value; a remaining trend is an unmodelled effect.
+    """Return the chart of errors over each joint value; a trend in the errors shows an unmodelled effect.
 
     Args:
         q: (m, n) [rad or m].
@@ -88,7 +88,7 @@ def residuals_by_joint(
 def error_map(
     points: np.ndarray, sizes: np.ndarray, words: str = "at most {} remain", expected: np.ndarray | None = None
 ) -> Chart:
-    """Return the map of remaining errors in the workspace, from above and from the side, and of expected errors.
+    """Return the maps of remaining errors in the workspace (from above and from the side) and of expected errors.
 
     Args:
         points: (m, 3) target positions in the arm's base [m].
@@ -143,7 +143,7 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
 
 
 def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
-    """Return the chart of calibrated minus nominal values with bars of two sigmas, lengths [mm] and angles [mrad].
+    """Return the chart of calibrated minus nominal values with bars of two sigmas; lengths in mm, angles in mrad.
 
     Args:
         rows: fitted parameters; those in other units are left out.
@@ -168,7 +168,7 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48) -> Chart:
 
 
 def singular_values(values: np.ndarray, rank: int) -> Chart:
-    """Return the chart of singular values of the scaled observation matrix, and of the gap after the rank.
+    """Return the chart of singular values of the scaled observation matrix, and of the gap below the identifiable ones.
 
     Args:
         values: (p,), falling.
@@ -228,7 +228,7 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
 
 
 def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: str) -> Chart:
-    """Return the chart of predicted σ over measuring effort, both logarithmic, with the present plan marked.
+    """Return the chart of predicted σ over measuring effort, both logarithmic; the present plan is marked.
 
     Args:
         others: pairs of effort and sigma; own: the same of the plan.
@@ -278,7 +278,7 @@ def captioned(report: Report) -> dict[str, Captioned]:
         nature = "position" if "position" in proof.calibrated else "distance"
         before, after = (np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated))
         chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature)
-        result["joints"] = chart, f"Errors against each joint, {label}: a trend is an unmodelled effect."
+        result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
         chart = error_map(np.array(proof.points), after, expected=np.array(proof.expected))
         below = "; below: radius expected to contain 95 % of the errors." if proof.expected else "."
         result["map"] = chart, f"Remaining position error over the workspace, {label}{below}"

@@ -102,7 +102,7 @@ def certificate_section(report: Report, drawn: Mapping[str, page.Picture]) -> pa
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks.append(_parameter_table(report))
     if metrics.outliers:
-        note = "Rows beyond 4 robust sigmas. They are part of the fit; a robust loss, if chosen, reduces their weight."
+        note = "Rows beyond 4 robust sigmas. The fit includes these rows; a robust loss reduces their weight."
         blocks.append(page.table("Outliers", OUTLIERS, metrics.outliers, note, most=MAX_OUTLIERS))
     blocks.append(page.Text("Notes", metrics.warnings))
     return page.Section("Geometry", blocks, metrics.verdict, metrics.reason, _key_figures(report))
@@ -149,7 +149,7 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
 
 
 def _left_out(metrics: FitMetrics) -> page.KeyFigure | None:
-    """Return the cross-validated errors of both arms; None if they did not decide the verdict (`validation.judge`)."""
+    """Return the cross-validated errors of both arms; None if other errors decided the verdict (`validation.judge`)."""
     found, nominal = metrics.findings, metrics.fit.nominal.main
     if found is None or found.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
         return None
@@ -210,7 +210,7 @@ def _ladder_table(metrics: FitMetrics) -> page.Table:
 
 
 def _counted(step: ModelStep) -> str:
-    """Return a model's number of parameters as text: of the geometry, plus joint corrections."""
+    """Return a model's number of parameters as text: geometric parameters plus joint corrections."""
     rigid = step.parameters - step.corrections
     return f"{rigid} + {step.corrections}" if step.corrections else str(rigid)
 
@@ -234,7 +234,7 @@ def _rms_words(rows: ComparedRows) -> str:
 
 
 def _parameter_table(report: Report) -> page.Table:
-    """Return the table of fitted parameters; if there are many joint corrections, without them."""
+    """Return the table of fitted parameters, without joint corrections if these are many."""
     shown = [row for row in report.parameters if len(report.parameters) <= MAX_ROWS or row.group != "deflection"]
     rows = []
     for row in shown:

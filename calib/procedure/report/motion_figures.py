@@ -1,4 +1,4 @@
-"""Figures of a designed or planned motion: q, v, a, τ with their limits, the tool's path, the search, and the front."""
+"""Figures of a designed or planned motion: q, v, a, τ with limits, tool path, search, and trade-offs of goals."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _history_figure(designed: Designed) -> Chart:
 
 
 def _front_figure(front: Front) -> Chart:
-    """Return the chart of trade-offs between two goals; open points are dominated by others."""
+    """Return the chart of trade-offs between two goals; open points are dominated by other points."""
     good = front.values[front.best]
     good, rest = good[np.argsort(good[:, 1])], front.values[~front.best]
     points = [line(good[:, 1], good[:, 0], "o-", size=4.0), line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
@@ -150,7 +150,7 @@ def _plan_figure(planned: Planned) -> Chart:
 
 
 def _profile_figure(planned: Planned) -> Chart:
-    """Return the chart of the speed along the path, and of the limit closest to being reached."""
+    """Return the chart of the speed along the path, and of the share reached of each limit."""
     above, below, start = [], [], 0.0
     for one in planned.timings:
         times = start + one.profile.times

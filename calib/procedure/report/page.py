@@ -57,7 +57,7 @@ def table(
     title: str, columns: Sequence[Column], records: Sequence[Any], note: str = "",
     strong: Callable[[Any], bool] = lambda record: False, most: int | None = None,
 ) -> Table:  # fmt: skip
-    """Return a table of records, a row for each up to `most`, with the `strong` ones in bold."""
+    """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""
     if most is not None and len(records) > most:
         note, records = f"{note} {len(records) - most} more in metrics.json.", records[:most]
     rows = [[column.of(record) for column in columns] for record in records]
@@ -120,7 +120,7 @@ Block = Table | Text | Pictures
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A number that decides a verdict.
+    """A number on which a verdict is based.
 
     Attributes:
         quantity: what it is.
@@ -140,7 +140,7 @@ class KeyFigure:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report; a judged one has a verdict (pass, marginal, fail), its reason and key figures."""
+    """A part of a report; a judged section has a verdict (pass, marginal, fail), a reason and key figures."""
 
     title: str
     blocks: Sequence[Block]

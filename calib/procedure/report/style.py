@@ -58,7 +58,7 @@ STYLE: Any = {
 
 @contextmanager
 def styled(quiet_titles: bool = False) -> Iterator[None]:
-    """Apply the common style within a context, and restore matplotlib's settings; quiet titles are small titles."""
+    """Apply the common style within a context, then restore matplotlib's settings; `quiet` makes titles small."""
     with matplotlib.rc_context(STYLE | ({"axes.titleweight": "normal", "axes.titlesize": 7.5} if quiet_titles else {})):
         yield
 
@@ -109,7 +109,7 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
 
 
 def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a long curve reduced to minimum and maximum of each of `POINTS` segments, which keeps all peaks.
+    """Return a long curve reduced to the minimum and maximum of each of `POINTS` segments; all peaks are kept.
 
     Args:
         t: (N,) [s].

@@ -1,4 +1,4 @@
-"""The certificate of a session: the results of both stages, read from the session's folders, on one page."""
+"""The certificate of a session: the results of geometry and dynamics, read from the session's folders, on one page."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,7 +84,7 @@ def _whole_report(session: Session) -> fit_report.Report:
 
 
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
-    """Return the notes on the files when they were read: training files, and those of the step `unseen`."""
+    """Return the notes made when the files were read: training files, and files of the step `unseen`."""
     lines = read_lines(session.path(f"{place}/{CHECKED}"))
     files_there = session.brought("validation" if place == "3-measured" else "unseen")
     said = read_state(session).notes(unseen)
@@ -133,13 +133,13 @@ def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str,
 
 
 def _instrument(session: Session, found: FitMetrics) -> str:
-    """Return a text on the instrument: kind of measurement (stated and used) and sigmas."""
+    """Return a text on the instrument: kind of measurement (as given, and as used) and sigmas."""
     instrument = session.settings.instrument
     said, turned = instrument.measures, found.fit.calibrated.orientation_deg is not None
     used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
     other = used.get((said, turned))
     measures = (
-        f"stated to measure {said}, but the files contain {other}; these were used" if other else f"measures {said}"
+        f"said to measure {said}, but the files contain {other}; these were used" if other else f"measures {said}"
     )
     stated = f"σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else "σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
@@ -147,13 +147,13 @@ def _instrument(session: Session, found: FitMetrics) -> str:
 
 
 def _named(paths: list[Path]) -> str:
-    """Return the file names as one text; no dates, since a file's date may be that of a copy."""
+    """Return the file names as one text, without dates, since copying changes a file's date."""
     return ", ".join(path.name for path in paths)
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """The content of ``selection.json``: how the poses were chosen, which limits were checked, and which not."""
+    """The content of ``selection.json``: how the poses were chosen, the checked limits, and the limits not checked."""
 
     words: str = "chosen by hand"
     checked: tuple[str, ...] = ()

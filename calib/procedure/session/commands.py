@@ -51,7 +51,7 @@ from calib.robot.tables import dumps
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
-    """Return two lines: the task at the robot, and the file to provide with its format."""
+    """Return two lines: the task at the robot, and the file to provide, with the file's format."""
     step, again = state.step.name, command_line("next", session.folder)
     if state.kind == WAITING and step in ("record", "predict"):
         task, file = _to_record(session, step)
@@ -227,7 +227,7 @@ def _limits(
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
-    """Run all steps that have their inputs, and return the step that waits, with instructions.
+    """Run all steps whose inputs exist, and return the step that waits for input, with instructions.
 
     Args:
         folder: of the session.
@@ -247,7 +247,7 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 
 def _ending(session: Session) -> tuple[str, ...]:
-    """Return the closing lines of a complete session; with verdict fail, the robot is for inspection only."""
+    """Return the closing lines of a complete session; with verdict fail, the exported robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
     level = session.verdicts().level
     if level == "fail":

@@ -120,7 +120,7 @@ def record(session: Session, say: Say) -> list[str]:
 
 
 def _check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
-    """Return start and end of the designed motion in a recording [s] (None: use all of it), and notes.
+    """Return start and end of the designed motion in a recording [s] (None: use the whole recording), and notes.
 
     Raises:
         MeasurementError: for wrong units or joint order, another motion, or reversed torques.
@@ -175,7 +175,7 @@ def check_motion(
 
 
 def _other_motion(recording: Recording, motion: DesignedMotion, found: Change | None) -> Finding:
-    """Return the finding that names what a recording contains instead of the designed motion."""
+    """Return the finding on what a recording contains instead of the designed motion."""
     if found is None and recording.duration < motion.period:
         return finding("motion-short", duration=recording.duration, period=motion.period)
     if found is None:
@@ -236,7 +236,7 @@ def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
     """Return training recordings and held-out recordings, as paths with time ranges (``log.csv@0:9``)."""
-    cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
+    cuts = read_json(session.path(CUTS), "calib redo recreates it", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")
     if not share:
@@ -302,7 +302,7 @@ def predict(session: Session, say: Say) -> list[str]:
 
 
 def _as_delivered(session: Session, found: Assessment) -> Verdict:
-    """Return the verdict on the exported robot; a model that cannot be exported is for prediction only."""
+    """Return the verdict on the exported robot; a model that cannot be exported gets the verdict prediction only."""
     from calib.procedure.export.delivery import Export, deliver
     from calib.procedure.export.delivery import prediction as prediction_of_export
 

@@ -1,4 +1,4 @@
-"""Parallel run of many sessions, one folder per robot; a session that fails does not stop the others."""
+"""Parallel run of many sessions, one folder per robot; a failed session does not stop the other sessions."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -64,7 +64,7 @@ class FleetRow:
 
 
 def folders_of(given: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Return the folders of sessions, given as folders or as their ``session.toml``, one or several.
+    """Return the folders of sessions, given as one or several folders or ``session.toml`` files.
 
     Raises:
         UsageError: for a duplicate, or an empty list.
@@ -107,7 +107,7 @@ def run_sessions(
 def run(
     folders: Sequence[Path], workers: AbstractContextManager[Workers], command: str, plots: bool = True
 ) -> Iterator[FleetRow]:
-    """Run every session and yield each outcome; workers on other machines need the folders at the same paths."""
+    """Run every session and yield each outcome; workers on other machines need the same folder paths."""
     with workers as crew:
         sent = folders if crew.here else [folder.absolute() for folder in folders]
         for number, outcome in crew.completed(partial(run_one, command=command, plots=plots), sent):
@@ -166,7 +166,7 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
-    """Yield a line for each incomplete session: the file it waits for, or the error."""
+    """Yield a line for each incomplete session: the missing file, or the error."""
     for one in outcomes:
         if one.state != DONE:
             yield f"{one.folder} {one.state}{' for ' if one.state == WAITS else ': '}{one.words}"

@@ -1,4 +1,4 @@
-"""A session: a folder with numbered, human-readable files, that may be moved, copied, opened and edited.
+"""A session: a folder with numbered, readable files; it may be moved and copied, and its files may be edited.
 
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
@@ -116,7 +116,7 @@ class Session:
 
     @property
     def links(self) -> dict[str, Any]:
-        """The arm's first and last link as given to `calib new`; None for those of the robot's file."""
+        """The arm's first and last link as given to `calib new`; None for the links of the robot's file."""
         return {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
 
     @property
@@ -125,7 +125,7 @@ class Session:
         return self.path(self.settings.robot.file)
 
     def brought(self, *kinds: str) -> list[Path]:
-        """Return the user's files of these kinds (`BROUGHT`), and then the folders with images or bags."""
+        """Return the user's files of the kinds in `BROUGHT`, followed by the folders with images or bags."""
         result = []
         for folder, prefix in (BROUGHT[kind] for kind in kinds):
             others = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
@@ -136,7 +136,7 @@ class Session:
         return result
 
     def files_brought(self, kind: str) -> list[Path]:
-        """Return the user's files of a kind, including those in folders, but not the toolkit's own corner files."""
+        """Return the user's files of a kind, including those in folders, but not the toolkit's corner files."""
         behind = (sorted(each for each in path.rglob("*") if each.is_file()) or [path] for path in self.brought(kind))
         return [each for paths in behind for each in paths if each.name != CORNERS]
 
@@ -147,12 +147,12 @@ class Session:
 
     @property
     def geometric(self) -> bool:
-        """Whether the session fits the geometry; otherwise it uses that of the robot's file."""
+        """Whether the session fits the geometry; otherwise it uses the geometry of the robot's file."""
         return self.settings.instrument.measures != NOTHING
 
     @property
     def fit(self) -> FitFolder:
-        """Folder of the fitted geometry; without a fit, the folder of the nominal robot."""
+        """Folder of the fitted geometry or, without a fit, of the nominal robot."""
         return FitFolder(self.folder / (IN_SESSION if self.geometric else AS_GIVEN))
 
     @property
@@ -167,7 +167,7 @@ class Session:
 
     @property
     def export(self) -> str:
-        """The folder of the export, relative to the session's."""
+        """The folder of the export, relative to the session's folder."""
         return EXPORT[self.dynamic]
 
     def write_state(self, state: StateFile) -> None:
@@ -229,7 +229,7 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
 
 
 def _no_session(folder: Path) -> str:
-    """Return the message for a folder that is not a session: its content, and the command to use."""
+    """Return the message for a folder that is not a session: what the folder contains, and the command to use."""
     identified = IdentificationFolder(folder).model.exists()
     if not identified and not FitFolder(folder).report.exists():
         return f"{folder} is not a session (no session.toml); make one with: {command_line('new', folder)}"

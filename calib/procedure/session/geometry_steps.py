@@ -1,4 +1,4 @@
-"""Steps of a session for the geometry, and its export; they call the functions of `calib fit` and `calib export`.
+"""Steps of a session for geometry and export, which call the functions of `calib fit` and `calib export`.
 
 A session asks for two sets of poses: optimised ones for the fit, and random ones for validation.
 """
@@ -63,7 +63,7 @@ HOW = "add [camera] to the limits file, see `calib formats constraints`"
 
 
 def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
-    """Choose poses as set in ``session.toml``; write them, the order to drive them in, and the predicted sigmas."""
+    """Choose poses as set in ``session.toml``; write the poses, the driving order, and the predicted sigmas."""
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
     sigmas = (instrument.sigma_position, instrument.sigma_orientation or SIGMA_ORIENTATION)
@@ -137,7 +137,7 @@ def chain_of(session: Session) -> Chain:
 
 
 def _options_of(session: Session) -> FitOptions:
-    """Return the fit options; files without a stated sigma get that of the instrument."""
+    """Return the fit options; files without a sigma get the sigma of the instrument."""
     instrument = session.settings.instrument
     options = read_options(session.named(session.settings.fit.options))
     position, turn = instrument.sigma_position, instrument.sigma_orientation
@@ -220,7 +220,7 @@ def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMe
         if block.kind == IMAGES:
             found.append(needed("image_words")(block))
         elif measures == IMAGES:
-            found.append("contains no images, although the instrument is a camera; it is fitted all the same")
+            found.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
         found += block.notes
         if planned is not None:
             found += [*check_against(planned, block), *lines_of(readback(planned, block))]
@@ -229,7 +229,7 @@ def _notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMe
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
-    """Return findings on measured minus planned joint values (m, n) [rad or m]; empty if all poses are others."""
+    """Return findings on measured minus planned joint values (m, n) [rad or m]; empty if no pose was planned."""
     distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(measured.q, p=np.inf))
     close = distance <= MAX_JOINT_DIFFERENCE
     if not close.any():
@@ -244,7 +244,7 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
 def drift(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
 ) -> list[Finding]:
-    """Return findings on drift, from poses measured again at the end and poses repeated within a block.
+    """Return findings on drift, from poses measured again at the end, and from poses repeated within a block.
 
     Args:
         chain: the nominal arm.
@@ -319,7 +319,7 @@ def validate(session: Session, say: Say) -> list[str]:
 
 
 def export(session: Session, say: Say) -> list[str]:
-    """Export the calibrated robot to all formats, with a verdict on each file and on the session."""
+    """Export the calibrated robot to all formats, and write a verdict on each file and on the session."""
     from calib.procedure.export.delivery import by_file, mark, prediction
 
     out = session.path(session.export)

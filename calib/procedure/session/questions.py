@@ -1,4 +1,4 @@
-"""Questions of `calib new`: the known instruments, the questions at a terminal, and the checks of the answers."""
+"""Questions of `calib new`: known instruments, questions at a terminal, and checks of the answers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -46,13 +46,13 @@ def instrument_named(name: str) -> InstrumentSection:
 
 
 def _measures(given: Answers) -> str:
-    """Return what the answered instrument measures; "" if it is not known."""
+    """Return what the instrument in the answers measures; "" if the instrument is unknown."""
     return INSTRUMENTS[given.instrument].measures if given.instrument in INSTRUMENTS else ""
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question at the terminal: name and default of its answer."""
+    """A question at the terminal: option name and default of the answer."""
 
     name: str
     default: str
@@ -63,7 +63,7 @@ class Question:
         return f"{self.name.replace('_', ' ')} ({described(Answers)[self.name]})"
 
     def open(self, given: Answers) -> bool:
-        """Return whether the question has no answer yet and applies to the earlier answers."""
+        """Return whether the question still needs an answer, given the earlier answers."""
         if getattr(given, self.name) not in (None, ()) or (self.name in CELL and given.limits is not None):
             return False
         camera, nothing = _measures(given) == IMAGES, _measures(given) == NOTHING
@@ -158,7 +158,7 @@ ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}
 
 
 def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, Any]:
-    """Return the content of a limits file, from the answers on the cell; empty if nothing is known.
+    """Return the content of a limits file, from the answers on the cell; empty without such answers.
 
     Every question may be answered by "unknown": the subject is then not checked, and the certificate says so. "none"
     means that it does not exist, so that nothing has to be checked.
@@ -242,7 +242,7 @@ def _file(read: str, text: str) -> str:
 
 
 def _turned(name: str, most: float, text: str, known: dict[str, str]) -> dict[str, list[float]]:
-    """Return a placement with z along the viewing direction: that of the camera, or opposite to the board's normal."""
+    """Return a placement with z along the viewing direction: the camera's, or opposite to the board's normal."""
     require(
         "mounting" in known,
         "it is not known whether the arm carries the camera or the board; give --mounting, too",

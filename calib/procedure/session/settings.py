@@ -258,7 +258,7 @@ def read_settings(path: Path) -> SessionSettings:
 
 
 def check_schema(path: Path, found: Any) -> None:
-    """Raise an error for a schema that this version cannot read.
+    """Raise an error for a schema number that this version cannot read.
 
     Raises:
         SessionError: with advice.
@@ -283,13 +283,13 @@ def default_keys(section: str) -> dict[str, Any]:
 
 
 def written(settings: SessionSettings) -> str:
-    """Return the text of ``session.toml`` with these settings, every key with its comment."""
+    """Return the text of ``session.toml`` with these settings, including a comment for every key."""
     head = [*(f"# {line}" for line in _HEAD), f"schema = {settings.schema}"]
     return "\n".join([*head, *_lines(settings)]) + "\n"
 
 
 def _lines(section: Any, place: str = "") -> Iterator[str]:
-    """Yield the lines of a section, the comments of its keys aligned in one column, its tables last."""
+    """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
     words, tables = described(type(section)), []
     for key in fields(section):
         value, about = getattr(section, key.name), words.get(key.name, "")

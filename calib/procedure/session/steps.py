@@ -80,7 +80,7 @@ class SessionStep:
     kept: tuple[tuple[str, ...], str] = ((), "")
 
     def inputs(self, session: Session) -> dict[Path, bool]:
-        """Return the files the step reads, and whether each may be missing."""
+        """Return the files that the step reads, and for each whether it may be missing."""
         names = self.reads.split()
         return {path: name.endswith("?") for name in names for path in _paths(session, name.rstrip("?"))}
 
@@ -97,7 +97,7 @@ class SessionStep:
 
 
 def _paths(session: Session, name: str) -> Iterator[Path]:
-    """Yield the paths of the files that one name in `SessionStep.reads` stands for."""
+    """Yield the paths of the files that a name in `SessionStep.reads` denotes."""
     left_out = () if session.geometric else FOLDERS["geometry"]
     left_out += () if session.dynamic else FOLDERS["dynamics"]
     if name in BROUGHT:
@@ -121,7 +121,7 @@ STEPS = (
         "select", "choose the poses to measure", geometry_steps.select, "robot:file poses:constraints",
         f"2-poses/{POSES} 2-poses/{WAYS} 2-poses/{UNSEEN} {SELECTION} {PREDICTED} {PREDICTION}",
         "robot instrument poses seed", "geometry",
-        kept=(("measured",), "files were already measured at these poses; `calib redo select` chooses new ones"),
+        kept=(("measured",), "these poses were already measured; `calib redo select` chooses new ones"),
     ),
     SessionStep(
         "measure", "check what was measured", geometry_steps.arrive,
@@ -140,7 +140,7 @@ STEPS = (
     SessionStep(
         "excite", "design the motions to record", dynamics_steps.excite, "fit/robot.toml dynamics:limits",
         "6-excitation/*/*", "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed", "dynamics",
-        kept=(("training", "unseen"), "files were already recorded with them; `calib redo excite` designs new motions"),
+        kept=(("training", "unseen"), "these motions were already recorded; `calib redo excite` designs new ones"),
     ),
     SessionStep(
         "record", "check what was recorded", dynamics_steps.record,
@@ -187,7 +187,7 @@ class State:
 
 
 def _steps_of(session: Session) -> tuple[SessionStep, ...]:
-    """Return the steps of a session; its settings may exclude a stage."""
+    """Return the steps of a session, without those of stages that the settings exclude."""
     left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric}
     return tuple(step for step in STEPS if not left_out.get(step.stage))
 
@@ -240,7 +240,7 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
     if gone:
         return State(step, STALE, f"{gone[0]} is missing")
     replaced = [name for name, mark in entry.outputs.items() if fingerprint(session.path(name)) != mark]
-    by_hand = f"; replaced by hand: {', '.join(replaced)}" if replaced else ""
+    by_hand = f"; replaced manually: {', '.join(replaced)}" if replaced else ""
     return State(step, DONE, f"{entry.finished[:16].replace('T', ' ')}{by_hand}")
 
 
@@ -252,7 +252,7 @@ def _missing(session: Session, step: SessionStep) -> str:
 
 
 def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
-    """Return the fingerprints of what a step depends on."""
+    """Return the fingerprints of the files and settings on which a step depends."""
     marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
     settings = asdict(session.settings)
     for setting in step.settings.split():
@@ -283,7 +283,7 @@ def _value(name: str, mark: str) -> Any:
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
-    """Run all steps up to the next one that waits for the user; return that one, or None at the end.
+    """Run all steps up to the next step that waits for the user; return this step, or None at the end.
 
     The session has to be locked.
     """

@@ -214,7 +214,7 @@ def _controller(
         return stated_controller(loop, n), None, ()
     motion = case.motion
     if not case.torque_rows.with_motors:
-        raise UsageError(f"[loop] controller = 'identify' needs motor torques, found rows = '{case.torque_rows.name}'")
+        raise UsageError(f"[loop] controller = 'identify' needs motor torques, not rows = '{case.torque_rows.name}'")
     band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
     found = identify_controller(
         reference, motion.q, case.target[:, -n:], motion.rate, band, (1, 2) if loop.integral else (0, 1), loop.integral

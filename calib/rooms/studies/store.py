@@ -174,7 +174,7 @@ def _read_journal(path: Path) -> tuple[list[TrialRow], int, int]:
 
 
 def _row(cells: Sequence[str]) -> TrialRow:
-    """Return the trial row described by the cells of a line.
+    """Return the trial row that a line of the file contains.
 
     Raises:
         ValueError: for a line that is short, a number that is none, a status that no trial ends with.

@@ -83,7 +83,7 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     urdf = finished.path("6-export/robot.urdf")
     urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
     assert kinds(finished)["export"] == steps.DONE
-    assert "replaced by hand: 6-export/robot.urdf" in words(finished, "export")
+    assert "replaced manually: 6-export/robot.urdf" in words(finished, "export")
     roles = {name: role for name, role, _, _ in certificate.listed(finished)}
     assert roles["6-export/robot.urdf"] == "edited by hand" and roles["6-export/robot.toml"] == "calibrated robot"
     assert go_on(finished) is None
@@ -221,7 +221,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     marginal = (place / "README.txt").read_text()
     assert marginal.startswith("verdict marginal: geometry: ") and "remain with rigid geometry alone" in marginal
     assert marginal.splitlines()[0] in before.decode()
-    assert "not stated: pass means" in finished.path("certificate.html").read_text(), "no tolerance"
+    assert "none given: pass means" in finished.path("certificate.html").read_text(), "no tolerance"
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 1
     said = capsys.readouterr().out.strip().split("\n")[-2]
