@@ -95,7 +95,7 @@ class Basis:
         return found[self.used]
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
-        """Return gradients by x (m, p) of m functions with slopes (m, 4, N, n) by q, v, a and jerk."""
+        """Return gradients (m, p) in x of m functions, from their gradients (m, 4, N, n) in q, v, a, jerk."""
         m, _, count, n = slopes.shape
         flat = slopes.transpose(3, 0, 1, 2).reshape(n, m, 4 * count)
         found = flat @ self.tables.reshape(n, 4 * count, -1)

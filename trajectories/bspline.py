@@ -110,7 +110,7 @@ def bspline_family(
 
 
 def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
-    """Return the slopes (4, N, count) of q, v, a, jerk by the control points."""
+    """Return the derivatives (4, N, count) of q, v, a, jerk with respect to the control points."""
     result = np.zeros((4, len(times), count))
     if count == 1:
         result[0] = 1.0

@@ -48,7 +48,7 @@ class MotionConstraint(Protocol):
     def groups(self) -> np.ndarray: ...
     def values(self, motion: SampledMotion) -> np.ndarray: ...
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        """Return the slopes (4, N, n) of Σ weights (N, k) · values by q, v, a, jerk."""
+        """Return the gradients (4, N, n) of Σ weights (N, k) · values in q, v, a, jerk."""
         ...
 
 
@@ -237,7 +237,7 @@ class Smoothed(NamedTuple):
     own: np.ndarray
 
     def slopes(self, motion: SampledMotion) -> np.ndarray:
-        """Return the slopes (r, 4, N, n) of the values by q, v, a, jerk of their motion."""
+        """Return the gradients (r, 4, N, n) of the values in q, v, a, jerk of the motion."""
         group, row = np.nonzero((self.own[:, None] & (self.shares > 1e-9)).any(axis=2))  # nine digits without the rest
         weights = np.where(self.own[group], self.shares[row] / self.constraint.scale, 0.0)
         result = np.zeros((len(self.own), 4, *motion.q.shape))
@@ -248,7 +248,7 @@ class Smoothed(NamedTuple):
 def smoothed(
     constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
 ) -> Smoothed:
-    """Return the smoothed constraints of a motion; slopes are computed on demand.
+    """Return the smoothed constraints of a motion; gradients are computed on demand.
 
     Args:
         sharpness: ρ.

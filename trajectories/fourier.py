@@ -109,7 +109,7 @@ def fourier_family(
 
 
 def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
-    """Return the slopes (4, N, 1 + 2 count) of q, v, a, jerk by q0, a, b."""
+    """Return the derivatives (4, N, 1 + 2 count) of q, v, a, jerk with respect to q0, a, b."""
     rates = 2 * np.pi / period * np.arange(1, count + 1)
     angle = np.outer(times, rates)
     sine, cosine = np.sin(angle), np.cos(angle)

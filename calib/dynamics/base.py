@@ -232,7 +232,7 @@ def standard_name(name: str, standard: Collection[str]) -> str:
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the R factor of [triangle; columnsᵀ] (p, p); columns (p, N)."""
+    """Return the R factor of [R factor; columnsᵀ] (p, p); columns (p, N)."""
     live = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
     stacked = np.empty((len(columns) + columns.shape[1], len(live)), order="F")
     stacked[: len(columns)] = triangle[:, live]

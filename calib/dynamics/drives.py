@@ -211,7 +211,7 @@ def slopes(
 
 
 def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of friction with memory along one uninterrupted record q (n, N), starting unstressed.
+    """Return the states (s, N) of friction with hysteresis along a gap-free record q (n, N), starting unstressed.
 
         z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1):
 

@@ -306,5 +306,5 @@ def from_chain(
 
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of friction with memory along one uninterrupted record q (N, n), not cut into blocks."""
+    """Return the states (s, N) of friction with hysteresis along a gap-free record q (N, n), not cut into blocks."""
     return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.n), "q").T))

@@ -65,7 +65,7 @@ class PathDynamics:
         return self.regressor(q, v, a)[:, -self.n :] @ self.parameters
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the friction torques (N, n); friction with memory (stop operators) counts as fully stressed."""
+        """Return the friction torques (N, n); friction with hysteresis (stop operators) counts as fully stressed."""
         rubbing = [k for k, one in enumerate(self.terms) if one.form.friction]
         loaded = any(self.terms[k].form.loaded for k in rubbing)
         load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a) if loaded else None

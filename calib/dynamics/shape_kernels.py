@@ -1,4 +1,4 @@
-"""Compiled shapes of friction and other drive torques (numba): one formula, with slopes, for arrays and simulations.
+"""Compiled shapes of friction and other drive torques (numba): one formula with derivatives for arrays and simulations.
 
 A shape's settings stand in one row of `acts`, from column 1 on, in the order of `calib.dynamics.shapes.SHAPES`; the
 other columns are the simulator's. The code of a shape is the constant of its name.

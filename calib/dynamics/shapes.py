@@ -1,4 +1,4 @@
-"""Shapes of drive torques: one row per shape; its formula and slopes are in `calib.dynamics.shape_kernels`.
+"""Shapes of drive torques: one row per shape; formulas and derivatives are in `calib.dynamics.shape_kernels`.
 
 A shape sees x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints, where a gear couples them), the
 torque the joint transmits, and its settings; it says by how much the torque changes per unit of its parameter. To add

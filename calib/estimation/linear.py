@@ -1,4 +1,4 @@
-"""Least squares of y = W x + ρ from triangles: ordinary, weighted per group, and with a prior.
+"""Least squares of y = W x + ρ from R factors of [W y]: ordinary, weighted per group, and with a prior.
 
 Covariances are those of the stated model of the noise. Filtered and decimated residuals are not white, and a covariance
 that counts every row as news is too small; `inflation` corrects it: group g counts as rows_g / inflation_g rows. It is

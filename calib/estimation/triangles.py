@@ -1,4 +1,4 @@
-"""All information of y = W x in triangles: the R factor of [W y] of each group of rows, updated block by block.
+"""All information of y = W x in triangles, the R factors of [W y] of each group of rows, updated block by block.
 
 An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. One triangle is kept
 per group (a joint, a load case, a file), so that weights may change afterwards without another pass over the data: the
@@ -46,7 +46,7 @@ class Triangles:
         return len(self.names)
 
     def residual_squares(self, values: np.ndarray) -> np.ndarray:
-        """Return ‖y_g - W_g x‖² of every group (g,), from the triangles alone."""
+        """Return ‖y_g - W_g x‖² of every group (g,), from the R factors alone."""
         return np.sum((self.factors @ np.append(values, -1.0)) ** 2, axis=1)
 
     def relative_errors(self, values: np.ndarray) -> np.ndarray:
@@ -55,7 +55,7 @@ class Triangles:
         return 100.0 * np.sqrt(self.residual_squares(values) / np.where(size > 0.0, size, np.inf))
 
     def select(self, columns: np.ndarray) -> Triangles:
-        """Return the triangles of the model with only these columns, in the given order."""
+        """Return the R factors of the model with only these columns, in the given order."""
         columns = np.asarray(columns, dtype=int)
         wanted = np.append(columns, self.parameters)
         factors = [retriangulate(factor[:, wanted]) for factor in self.factors]
@@ -64,7 +64,7 @@ class Triangles:
 
 
 def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
-    """Return the triangles of a problem without rows."""
+    """Return empty R factors, of a problem without rows."""
     p = len(names)
     given = tuple(units) if units is not None else ("",) * p
     require(len(given) == p, f"{p} parameter names but {len(given)} units")
@@ -72,7 +72,7 @@ def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int 
 
 
 def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.ndarray | int = 0) -> Triangles:
-    """Return the triangles updated by more rows: R_g becomes the R of [R_g; W_g y_g].
+    """Return the R factors updated by more rows: R_g becomes the R of [R_g; W_g y_g].
 
     Columns that are zero in all rows of a group (a joint does not feel the links before it) cost nothing.
 
@@ -107,7 +107,7 @@ def collect(
     names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
 ) -> Triangles:
-    """Return the triangles of a whole problem; without names the columns are called x1, x2, …"""
+    """Return the R factors of a whole problem; without names the columns are called x1, x2, …"""
     matrix = shaped(matrix, (None, None), "observation matrix W")
     count = 1 if group is None or len(group) == 0 else int(np.max(group)) + 1
     names = names if names is not None else [f"x{k + 1}" for k in range(matrix.shape[1])]
@@ -115,7 +115,7 @@ def collect(
 
 
 def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
-    """Return the triangles with equal parameters in each set: one column, their sum, in place of the first.
+    """Return the R factors with parameters of each set made equal: the sum of their columns replaces the first.
 
     Raises:
         CalibError: for a name that is no column, or in two sets.
@@ -146,7 +146,7 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
 
 
 def retriangulate(stacked: np.ndarray) -> np.ndarray:
-    """Return the R factor of any matrix as a square upper triangle, padded with zero rows."""
+    """Return the R factor of any matrix as a square upper triangular matrix, padded with zero rows."""
     return _factor(stacked, overwrite=False)
 
 
@@ -173,7 +173,7 @@ def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
 
 
 def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Solve R x = z from the triangle [R z; 0 ρ] of [W y]; return x, R⁻¹ and the condition numbers of W.
+    """Solve R x = z from the R factor [R z; 0 ρ] of [W y]; return x, R⁻¹ and the condition numbers of W.
 
     Raises:
         Unidentifiable: naming the columns that take part in a dependence.

@@ -31,7 +31,7 @@ Scaling = Literal["raw", "normalised"]
 
 
 class Value(NamedTuple):
-    """An objective's value and slopes: by the regressor (N, n, b), by q, v, a, jerk (4, N, n), by the duration [1/s].
+    """An objective's value and gradients: in the regressor (N, n, b), q, v, a, jerk (4, N, n), and duration [1/s].
 
     ``exact`` is the objective without smoothing, ``by_information`` ∂F/∂M (b, b) of the information's own.
     """
@@ -99,7 +99,7 @@ class Excitation:
         return self.index + (f" {self.scaling}" if isinstance(self.scaling, str) else " scaled")
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and its slopes by the regressor and by the information."""
+        """Return the index and its gradients with respect to the regressor and to the information."""
         seen = observed(regressor, self.sigmas, self.existing)
         found = self.seen(seen)
         return found._replace(by_regressor=seen.by_regressor(found.by_information))
@@ -296,7 +296,7 @@ def _stacked(regressor: np.ndarray) -> np.ndarray:
 
 
 def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
-    """Return log (Σ λ^p)^(1/p) and its slopes by λ; the log of the largest λ for p = ∞, of the smallest for -∞."""
+    """Return log (Σ λ^p)^(1/p) and its gradient in λ; the log of the largest λ for p = ∞, of the smallest for -∞."""
     logs = np.log(eigenvalues)
     if np.isinf(p):
         slope, k = np.zeros_like(logs), int(np.argmax(logs) if p > 0 else np.argmin(logs))

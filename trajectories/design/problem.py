@@ -236,7 +236,7 @@ def _matrix(one: Excitation) -> tuple[int, int]:
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
-    """Return the weighted sum with log condition numbers, and its slopes (1, k) by the values."""
+    """Return the weighted sum with log condition numbers, and its gradient (1, k) in the values."""
     logs = np.array([is_condition(one) for one, _ in problem.objectives])
     weights, sizes = np.array([weight for _, weight in problem.objectives]), np.array(values)
     sizes = np.where(logs, sizes, 1.0)
@@ -251,7 +251,7 @@ def _slope(
     shares: np.ndarray,
     seen: dict[tuple[int, int], Observed],
 ) -> np.ndarray:
-    """Return the slopes (4, N, n) of Σ shares · objectives by q, v, a, jerk: by one derivative product."""
+    """Return the gradients (4, N, n) of Σ shares · objectives in q, v, a, jerk, by one derivative product."""
     result, by_regressor = np.zeros((4, *motion.q.shape)), None
     by_information: dict[tuple[int, int], np.ndarray] = {}
     for one, objective, share in zip(found, _terms(problem), shares):

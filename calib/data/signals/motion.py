@@ -282,7 +282,7 @@ def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
 def _differences(
     of: Callable[[np.ndarray, float, int], np.ndarray], q: np.ndarray, sampled: Resampled, width: int
 ) -> np.ndarray:
-    """Return slopes or curvatures (N, n) of q (N, n), segment by segment."""
+    """Return first or second derivatives (N, n) of q (N, n), segment by segment."""
     return np.concatenate([of(q[own], sampled.rate, width) for own in filtering.segments(sampled.segment)])
 
 

@@ -55,7 +55,7 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     if len(moving) and one_frequency:
         low, high = strongest.min(), strongest.max()
         hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
-        notes.append(f"each joint moves at one frequency ({hertz}): inertia cannot be told from gravity or stiffness")
+        notes.append(f"each joint moves at one frequency ({hertz}): inertia, gravity and stiffness are inseparable")
     correlation = unit.T @ unit
     min_correlation = 0.98  # of two joints that move as one
     pairs = [f"{names[i]}–{names[j]}" for i, j in combinations(moving, 2) if abs(correlation[i, j]) > min_correlation]

@@ -1,4 +1,4 @@
-"""Least squares under bounds, equalities and positive definite matrices, from a triangle of [W y].
+"""Least squares under bounds, equalities and positive definite matrices, from an R factor of [W y].
 
 min ½ ‖R b - z‖² under A b >= e, E b = d and M_k(b) = Σ_j A_kj b_j ⪰ λ I. With R from `triangles.combine` it is
 constrained least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40,

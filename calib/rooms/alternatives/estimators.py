@@ -1,4 +1,4 @@
-"""Methods beside ordinary and weighted least squares: robust, total, and under constraints on parameters."""
+"""Methods other than ordinary and weighted least squares: robust, total, and under constraints on parameters."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

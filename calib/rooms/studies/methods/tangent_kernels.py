@@ -290,7 +290,7 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
 def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
 ):  # fmt: skip
-    """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; slopes[0] is not used."""
+    """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; `slopes[0]` is not used."""
     tree, body, linear, kinds, acts = plant
     own, more, ten, by_q, by_v, columns, at, rate, dat, drate = rooms
     n, c = dq.shape
