@@ -116,8 +116,8 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
     joints = []
     for name, c in zip(motion.joint_names, motion.coefficients):
         half = len(c) // 2
-        own = {"q0": c[0], "a": c[1 : 1 + half], "b": c[1 + half :]} if fourier else {"points": c}
-        joints.append({"name": name, **own})
+        series = {"q0": c[0], "a": c[1 : 1 + half], "b": c[1 + half :]} if fourier else {"points": c}
+        joints.append({"name": name, **series})
     return head | ({} if fourier else {"degree": motion.degree}) | {"joint": joints}
 
 
@@ -134,12 +134,12 @@ def read(folder: Path) -> Periodic:
     for number, joint in enumerate(table.joint, 1):
         place = f"{path}: [[joint]] number {number}"
         stated = (joint.points,) if table.family == "bspline" else ((joint.q0,), joint.a, joint.b)
-        own = [part for part in stated if part is not None and None not in part]
-        if len(own) < len(stated):
+        parts = [part for part in stated if part is not None and None not in part]
+        if len(parts) < len(stated):
             raise UsageError(f"{place}: family {table.family} needs {'points' if len(stated) == 1 else 'q0, a and b'}")
-        if len(own) == 3 and not len(own[1]) == len(own[2]) == len(table.joint[0].a or ()):
+        if len(parts) == 3 and not len(parts[1]) == len(parts[2]) == len(table.joint[0].a or ()):
             raise UsageError(f"{place}: a and b need {len(table.joint[0].a or ())} values each, as many as joint 1's a")
-        coefficients.append(np.concatenate([np.array(part, dtype=float) for part in own]))
+        coefficients.append(np.concatenate([np.array(part, dtype=float) for part in parts]))
     found = Periodic(
         tuple(joint.name for joint in table.joint), table.period, table.rate, table.repeat, table.family,
         tuple(coefficients), table.degree,
@@ -245,8 +245,8 @@ def lines(averaged: AveragedMotion) -> list[str]:
 
 def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:
     """Return rate and series of the longest part without gaps, with a whole number of samples per period."""
-    own = 1.0 / float(np.median(np.diff(recording.t)))
-    rate = max(1, round(period * own)) / period
+    recorded_rate = 1.0 / float(np.median(np.diff(recording.t)))
+    rate = max(1, round(period * recorded_rate)) / period
     sampled = resample(recording, rate=rate)
     longest = int(np.bincount(sampled.segment).argmax())
     rows = sampled.segment == longest

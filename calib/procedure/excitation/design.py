@@ -87,14 +87,14 @@ def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, gi
     if aim == "torque":
         require(np.isfinite(limits).all(), "goal 'torque': needs torque limits of all joints", UsageError)
         rows = (task_regressors(given, settings.seed) / limits[exact.joint_of_row][:, None])[:, exact.limited.ravel()]
-        wanted = np.einsum("nri,nrj->ij", rows, rows) / rows[:, :, 0].size
+        task = np.einsum("nri,nrj->ij", rows, rows) / rows[:, :, 0].size
     else:
         require(values is not None, "goal 'parameters': needs masses, or a model (--model)", UsageError)
-        own = cast(np.ndarray, values)[slice(None) if condition.columns is None else condition.columns]
-        wanted = np.diag(np.divide(1.0, own**2, out=np.zeros(len(own)), where=own != 0.0))
+        known = cast(np.ndarray, values)[given.columns.kept]
+        task = np.diag(np.divide(1.0, known**2, out=np.zeros(len(known)), where=known != 0.0))
     if given.prior is None and np.isfinite(limits).all():
         sigmas = sigmas * limits[exact.joint_of_row]
-    return replace(condition, index="trace", scaling="raw", sigmas=sigmas, task=wanted)
+    return replace(condition, index="trace", scaling="raw", sigmas=sigmas, task=task)
 
 
 def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:

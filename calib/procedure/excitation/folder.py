@@ -1,6 +1,6 @@
 """The folders of designed and planned motions: samples at the controller's rate, ROS messages, metrics and pictures.
 
-Each is written whole, beside its place, then moved there.
+Each folder is written completely under another name, then moved to its place.
 """
 
 from collections.abc import Callable, Sequence

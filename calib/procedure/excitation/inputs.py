@@ -189,10 +189,10 @@ def read_model(
     if chain.inertias is not None:
         check_bodies(chain, limits.torque)
         side = "motor" if model.torque_rows.with_motors else "link"  # where all friction counts, as the limits do
-        own = [known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
-               for one in model.columns]  # fmt: skip
+        drive_values = [known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
+                        for one in model.columns]  # fmt: skip
         payloads, said = _stated(options)
-        values = np.concatenate([standard_parameters(chain), *payloads, own])
+        values = np.concatenate([standard_parameters(chain), *payloads, drive_values])
         notes += said
         if not known:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
@@ -258,11 +258,11 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1) if label in run else bodies
     rows = found.model.torque_rows if _designable(found.model.torque_rows) else MOTOR
     model, notes = _differentiable(IdentificationModel(bodies, found.model.columns, rows))
-    own = np.array([values[name] for name in model.names])
-    if not np.isfinite(own).all():
-        name = model.names[int(np.argmin(np.isfinite(own)))]
+    parameters = np.array([values[name] for name in model.names])
+    if not np.isfinite(parameters).all():
+        name = model.names[int(np.argmin(np.isfinite(parameters)))]
         raise UsageError(f"{folder}: parameter {name} of the model is not finite")
-    made = excited_model(model, loads, own, any(one.shape == "sign" for one in model.columns), notes)
+    made = excited_model(model, loads, parameters, any(one.shape == "sign" for one in model.columns), notes)
     covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
@@ -362,21 +362,21 @@ def _selected(
     Raises:
         UsageError: for an unknown parameter, or ``essential`` without a folder.
     """
-    wanted = [name.strip() for text in settings.columns for name in text.split(",")]
-    if not wanted:
+    requested = [name.strip() for text in settings.columns for name in text.split(",")]
+    if not requested:
         return found
     standard = model.exact.model.names
     short = {standard_name(name, standard): name for name in found.names}
-    if "essential" in wanted:
+    if "essential" in requested:
         require(
             folder is not None, "columns 'essential': needs --model with the folder of an identification", UsageError
         )
-        wanted.remove("essential")
+        requested.remove("essential")
         essential = IdentificationFolder(cast(Path, folder)).essential()
-        wanted += [name for name in essential if standard_name(name, standard) in short]  # friction has derivatives
-    for name in wanted:
+        requested += [name for name in essential if standard_name(name, standard) in short]  # friction has derivatives
+    for name in requested:
         one_of(standard_name(name, standard), short, "columns: parameter", UsageError)
-    chosen = {short[standard_name(name, standard)] for name in wanted}
+    chosen = {short[standard_name(name, standard)] for name in requested}
     kept = np.array([k for k, name in enumerate(model.exact.names) if name in chosen])
     return replace(found, columns=kept, names=tuple(model.exact.names[k] for k in kept))
 

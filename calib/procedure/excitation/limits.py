@@ -130,7 +130,7 @@ class MotionBounds:
             if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
                 raise UsageError(
                     f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, above "
-                    f"{limit[j]:.4g}; so the motion is not written; state a limit {self.place.format(EXAMPLES[kind])}"
+                    f"{limit[j]:.4g}, so the motion is not written; state a limit {self.place.format(EXAMPLES[kind])}"
                 )
 
 
@@ -211,8 +211,8 @@ class MotionLimits:
     def positions(self) -> BoxLimit:
         """The joint position limits; infinite: not limited."""
         free = np.full(len(self.torque), np.inf)
-        own = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
-        return next(own, BoxLimit(0, -free, free))
+        boxes = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
+        return next(boxes, BoxLimit(0, -free, free))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
         """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""
@@ -244,7 +244,7 @@ def read_motion_limits(
             accelerations and torques (`MotionBounds`).
     """
     stated, where = read(LimitsFile, given, "limits")
-    own = stated.torque
+    torque_table = stated.torque
     without = ()
     if given_way:
         without = ("joint-margin", "floor") if stated.collision or stated.obstacle else DEFAULTS
@@ -253,15 +253,15 @@ def read_motion_limits(
     velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
     acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
     jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
-    amounts = {key: value for key, value in own.items() if key not in MARGINS}
+    amounts = {key: value for key, value in torque_table.items() if key not in MARGINS}
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
     counted = torque if predicted or chain.inertias is not None else np.full(chain.n, np.inf)
     sizes = velocity, acceleration, counted
     bounds = _bounds(chain, str(source or chain.name), stated, where, sizes, default=not given_way)
-    margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
+    margin = number(torque_table["margin"], f"{where}: torque.margin") if "margin" in torque_table else None
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
-    deviations = number(own.get("deviations", 2.0), f"{where}: torque.deviations")
+    deviations = number(torque_table.get("deviations", 2.0), f"{where}: torque.deviations")
     if not 0.0 <= deviations < np.inf:
         raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
     points = _points(stated.point, chain, where)
@@ -429,8 +429,8 @@ def _friction(stated: FrictionTable | None, chain: Chain, where: str) -> np.ndar
         return None
     result = []
     for key in ("Fv", "Fc"):
-        own = getattr(stated, key) or (0.0,) * chain.n
-        if len(own) not in (1, chain.n):
-            raise UsageError(f"{where}: friction.{key}: {len(own)} values for {chain.n} joints")
-        result.append(np.broadcast_to(np.array(own), (chain.n,)))
+        values = getattr(stated, key) or (0.0,) * chain.n
+        if len(values) not in (1, chain.n):
+            raise UsageError(f"{where}: friction.{key}: {len(values)} values for {chain.n} joints")
+        result.append(np.broadcast_to(np.array(values), (chain.n,)))
     return np.array(result)

@@ -1,6 +1,6 @@
 """Setpoints of an exciting motion for a controller: approach, periods, and a slow rehearsal.
 
-The approach leads from where a robot stands to where a motion starts: calm, jerk-limited, held against the limits file.
+The approach leads from where a robot stands to where a motion starts: calm, jerk-limited, within the limits file.
 """
 
 from collections.abc import Sequence

@@ -209,10 +209,12 @@ def _shortened(
         other = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
         return None
-    basis, own = other.basis(), problem.family.period * found.factor
+    basis, full = other.basis(), problem.family.period * found.factor
     path = problem.family.basis(basis.times * problem.family.period / period).motion(found.x).q
     middle = path.mean(axis=0)
-    run = one_start(other, evaluations, "slsqp", 0, basis.nearest(middle + period / own * (path - middle)), STAGES[1:3])
+    run = one_start(
+        other, evaluations, "slsqp", 0, basis.nearest(middle + period / full * (path - middle)), STAGES[1:3]
+    )
     return (other.family, run) if isinstance(run, SearchResult) else None
 
 

@@ -62,30 +62,30 @@ class ExcitationSettings:
             at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; repeatable.
             Instead of condition numbers, without a number: logdet, smallest (of the information), torque or parameters
             (predicted σ of torques on a typical task, or of parameters relative to their values)
-        hard: a goal that must be reached; repeatable
+        hard: a goal that the motion must reach, e.g. wrist=0.1; repeatable
         period: largest period of the motion [s]
         shortest: shortest period that the search may use [s]; default: the period is fixed
         harmonics: frequencies per joint, or control points of splines; default 12, or as many as are below resonance
-        family: functions of time that describe the motion
+        family: fourier (Fourier series) or bspline (splines)
         drives: drive terms to identify, if neither an identified model nor options state them
         loads: payloads of one run: none, a label, or labels with +; the same motion runs once with each; repeatable.
             Default: none, then each payload of the options
         columns: parameters that the motion has to determine, or essential: those that the identification of the
             model kept; repeatable. Default: all
         rate: of the controller [Hz]
-        samples: instants over the period at which the search evaluates
+        samples: instants per period at which the search evaluates limits and objectives
         starts: random starts of the search
-        evaluations: most evaluations per start
+        evaluations: largest number of evaluations per start
         solver: slsqp (SciPy); mma, ccsaq or auglag (NLopt)
-        seed: reproduces everything random
+        seed: of all random numbers; the same seed gives the same motion
         front: number of trade-offs between normalised condition number and first torque goal; 0: none
         start: joint values with commas [rad or m]; adds an approach from there
-        repeat: periods to run one after the other
+        repeat: number of periods to run one after the other
         slower: factor of a slow rehearsal, written next to the motion; 1: none
         existing: a recording (log.npz@0:9.4 cuts) or folder of an earlier design, to complement; repeatable
         lock: a joint that does not move: joint4, or joint4=0.5 [rad or m]; repeatable
-        noise: torque residual as a share of the torque limits; for predicted sigmas only
-        outlook: predict the sigmas of other periods, too
+        noise: expected torque residual as a share of the torque limits; only for predicted sigmas; default 0.01
+        outlook: also predict the sigmas of motions with other periods
     """
 
     goals: tuple[Goal, ...] = ()
@@ -122,7 +122,7 @@ class PlanSettings:
     """Settings of planning a motion through waypoints.
 
     Attributes:
-        payloads: label of an attached, identified payload; repeatable
+        payloads: label of an identified payload that is attached; repeatable
         lines: the tool moves straight from waypoint to waypoint, and stops at each
         rate: of the controller [Hz]
         shorten: number of timings to search for a faster path between waypoints; 0: none

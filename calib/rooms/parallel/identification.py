@@ -83,8 +83,8 @@ def identify_parallel(
         MeasurementError: for recordings that cannot be right.
     """
     options, known = options or IdentifyOptions(), robot.known
-    wanted = options.settings.torque_rows.name
-    rows = rows_named(known, "" if wanted == "motor" else wanted)
+    asked = options.settings.torque_rows.name
+    rows = rows_named(known, "" if asked == "motor" else asked)
     chosen = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
     options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
     _refuse(options.settings, options)

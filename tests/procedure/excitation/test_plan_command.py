@@ -257,7 +257,7 @@ def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
 
 def test_a_motion_beyond_its_bounds_is_not_written(room):
     planned = planning.plan("lwr4plus", room / "way.csv")
-    with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .*; so the motion is not written"):
+    with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .*, so the motion is not written"):
         motion_folder.write_plan(replace(planned, track=replace(planned.track, v=2 * planned.track.v)), room / "out")
     assert not (room / "out").exists()
 

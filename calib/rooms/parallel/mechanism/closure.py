@@ -5,7 +5,7 @@ Newton's method on the closure equations of all legs at once, eliminated leg by 
     J_k δq_k = G_k t - e_k        tip velocity of leg k = rigid-body velocity of its attachment, e_k the gap
     δq_k = J_k⁺ (G_k t - e_k),    t = t_0 + D v    with v the independent parts of the platform's twist
 
-From encoders, v minimises the distance to all readings, so that redundant ones are weighed alike (eq. 16 of Briot,
+From encoders, v minimises the distance to all readings, so that redundant ones have equal weights (eq. 16 of Briot,
 Gautier & Krut 2013 is the same for velocities). Samples are solved together. Whatever the motion, a sample is reached
 from home along a straight line in steps too short to jump to another branch; a minor of each leg's Jacobian, and with
 as many actuators as freedoms that of the platform, must keep its sign along it.
@@ -278,29 +278,29 @@ def _where(known: ClosedRobot, posture: Posture) -> str:
     return ", ".join(f"{name} = {value:.4g}" for name, value in zip(known.robot.freedom, values))
 
 
-def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim, near: Posture | None) -> Posture:
+def _reached(known: ClosedRobot, goals: np.ndarray, own: np.ndarray, aim: _Aim, near: Posture | None) -> Posture:
     """Return the postures at targets (N, k), found by Newton's method on a straight line from the values at home."""
-    if not len(wanted):
+    if not len(goals):
         return known.home[:0]
     if near is not None:
-        return _newton(known, near, wanted, aim)
+        return _newton(known, near, goals, aim)
     every = 16  # samples of a record of which the first is reached from home, the others from it
     max_stride = 0.25  # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
-    if len(wanted) > 2 * every and np.abs(np.diff(wanted, axis=0)).max() < max_stride / every:
-        first = _reached(known, wanted[::every], own, aim, None)
-        nearest = np.minimum((np.arange(len(wanted)) + every // 2) // every, len(first) - 1)
-        found = _newton(known, first[nearest], wanted, aim)
+    if len(goals) > 2 * every and np.abs(np.diff(goals, axis=0)).max() < max_stride / every:
+        first = _reached(known, goals[::every], own, aim, None)
+        nearest = np.minimum((np.arange(len(goals)) + every // 2) // every, len(first) - 1)
+        found = _newton(known, first[nearest], goals, aim)
     else:
-        count = max(1, int(np.ceil(np.abs(wanted - own).max() / max_stride)))
-        found = known.home[np.zeros(len(wanted), dtype=int)]
+        count = max(1, int(np.ceil(np.abs(goals - own).max() / max_stride)))
+        found = known.home[np.zeros(len(goals), dtype=int)]
         for share in np.arange(1, count) / count:
-            found = _newton(known, found, own + share * (wanted - own), aim, rough=True)
-        found = _newton(known, found, wanted, aim)
+            found = _newton(known, found, own + share * (goals - own), aim, rough=True)
+        found = _newton(known, found, goals, aim)
     _check_postures(known, found)
     return found
 
 
-def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
+def _newton(known: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
     """Return the postures near `start` that meet the targets, by Newton's method (two steps if `rough`)."""
     q, pose = np.array(start.q), np.array(start.pose)
     left = np.arange(len(q))
@@ -309,7 +309,7 @@ def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, r
         own = Posture(q[left], pose[left])
         links = leg_links(known.robot, own)
         D, t = twists(known, links, [one.gap for one in links])
-        twist = t + times(D, aim(known, links, D, t, own, wanted[left]))
+        twist = t + times(D, aim(known, links, D, t, own, goals[left]))
         steps = np.concatenate([times(one.inverse, times(one.carried, twist) - one.gap) for one in links], axis=1)
         size = np.maximum(np.abs(steps).max(axis=1), np.abs(twist).max(axis=1))
         share = np.minimum(1.0, BOUND / np.maximum(size, 1e-300))[:, None]
@@ -343,20 +343,20 @@ def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray, max_rc
 
 
 def _from_readings(
-    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
+    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that bring the encoder readings closest to their targets."""
     A = np.concatenate([one.inverse @ one.carried for one in links], axis=1)
     steps = np.concatenate([times(one.inverse, one.gap) for one in links], axis=1) - times(A, t)
     own = known.robot.actuated
-    return times(pseudo_inverse(A[:, own] @ D), wanted - posture.q[:, own] + steps[:, own])
+    return times(pseudo_inverse(A[:, own] @ D), goals - posture.q[:, own] + steps[:, own])
 
 
 def _from_coordinates(
-    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
+    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that move the platform to target coordinates (N, r)."""
-    target = _pose_of(known, wanted)
+    target = _pose_of(known, goals)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
 

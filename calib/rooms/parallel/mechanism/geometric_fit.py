@@ -119,12 +119,12 @@ def fit_loops(
     changes, W = np.zeros(count), np.zeros((0, count))
     for iteration in range(1, LIMIT + 1):
         residual, W = _observed(known, readings, coordinates, parameters)
-        told = len(split_columns(W, tolerance=TOLERANCE).kept)
-        if not told or len(residual) <= told:
-            raise Unidentifiable(f"{len(residual)} residuals for {told} parameters of the loops: measure more poses")
+        rank = len(split_columns(W, tolerance=TOLERANCE).kept)
+        if not rank or len(residual) <= rank:
+            raise Unidentifiable(f"{len(residual)} residuals for {rank} parameters of the loops: measure more poses")
         total = float(residual @ residual)
         before = float(np.sqrt(total / len(residual))) if iteration == 1 else before
-        std = float(np.sqrt(total / (len(residual) - told)))
+        std = float(np.sqrt(total / (len(residual) - rank)))
         if total < 1e-24 or (np.isfinite(square) and abs(square - total) <= loss * square):
             break
         square, pull = total, max(std, 1e-12) / SPREAD
@@ -137,7 +137,7 @@ def fit_loops(
     covariance = inverse @ inverse.T
     out = tuple(one.name for one, own in zip(parameters, np.sqrt(np.diag(covariance))) if own > 0.5 * SPREAD)
     names, units = (tuple(getattr(one, key) for one in parameters) for key in ("name", "unit"))
-    estimate = Estimate(names, units, changes, covariance, std, len(residual) - told)
+    estimate = Estimate(names, units, changes, covariance, std, len(residual) - rank)
     return LoopFit(known, parameters, estimate, out, before, float(np.sqrt(np.mean(residual**2))), iteration)
 
 
