@@ -87,7 +87,7 @@ class GainRecord:
 
     @classmethod
     def of(cls, found: DriveGains, unit: str) -> GainRecord:
-        """Return the record of estimated gains; `unit`: that of the torques."""
+        """Return the record of estimated gains; `unit` is the torques' unit."""
         told = np.array(found.told)
         return cls(
             np.where(told == "not told", np.nan, found.gains), np.where(told == "told", found.sigma, np.nan),

@@ -60,7 +60,7 @@ from calib.robot.chain import Chain
 from calib.units import TORQUE, per_ampere, without_gains
 
 MODEL = "dynamics.json"
-NOTE = "regrouped parameters have base values, the others zero: torques are right, single parameters not always"
+NOTE = "regrouped parameters have base values, all others are zero: torques are right, single parameters may not be"
 
 
 def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:

@@ -269,7 +269,7 @@ def _kind(term: DriveTerm) -> str:
 
 
 def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, more: np.ndarray) -> _Sizes:
-    """Return the kinds of parameters with the prior of their sizes; groups in `more` have no names."""
+    """Return the kinds of parameters and the prior of each kind's size; groups in `more` have no names."""
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
     kinds += [_kind(one) for one in model.columns]
     own = tuple(dict.fromkeys(kinds))

@@ -163,7 +163,7 @@ class TorqueDiscrepancy:
 
 @dataclass(frozen=True, eq=False)
 class TorqueErrorModel:
-    """Model of the standard deviations of errors of predicted torques.
+    """Model of the standard deviation of torque prediction errors.
 
     Attributes:
         columns: (k,) indices of the estimated columns of the model's regressor.
@@ -303,7 +303,7 @@ def learn_torque_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Data of M decimated samples of all recordings.
+    """Motion and residuals of M decimated samples of all recordings.
 
     Attributes:
         states: (3, M, n) q, v and a.

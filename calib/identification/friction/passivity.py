@@ -88,6 +88,6 @@ def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
         refuse_data(
             cases[0].motion.file,
             f"friction adds energy at joints {named}: the torques' sign is reversed, or "
-            "positions and torques are not of the same joints; turn the sign (gains = [-1]), or check the columns",
+            "positions and torques belong to different joints; reverse the sign (gains = [-1]), or check the columns",
         )
     return tuple(int(joint) for joint in found)

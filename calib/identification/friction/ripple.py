@@ -42,7 +42,7 @@ Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
 
 @dataclass(frozen=True)
 class GearWave:
-    """A wave of the ripple: its gear, named by its joint from 1, and its order per turn of that gear."""
+    """A wave of the ripple: number of the gear's joint (from 1), and order per turn of the gear."""
 
     gear: int
     order_per_turn: float
@@ -50,7 +50,7 @@ class GearWave:
 
 @dataclass(frozen=True)
 class RippleWaves:
-    """Ripple of a joint, from 1, and its explained share of the residual's high-frequency power on held-out time."""
+    """Ripple of a joint (from 1), and the share of high-frequency residual power that it explains on held-out time."""
 
     joint: int
     waves: tuple[GearWave, ...]
@@ -119,7 +119,7 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
 
 
 def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
-    """Return joint → motor turns per gear turn for the joints that move enough: the most coherent family of orders.
+    """Return joint → motor turns per gear turn for joints that move enough, from the most coherent orders.
 
     Args:
         residuals: (N, n) fast parts.

@@ -31,7 +31,7 @@ INFORMATION = "information.csv"
 
 @dataclass(frozen=True, eq=False)
 class Information(Frozen):
-    """An identified model with the information of its data.
+    """An identified model with the information matrix of its data.
 
     Attributes:
         chain: the robot it was identified on.

@@ -61,7 +61,7 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
         return
     for total in TOTALS:
         bodies = rods(chain, model, total)
-        words = f"no masses in the robot's description: rods between the joints, {total:.3g} kg in all, by the evidence"
+        words = f"the robot's description has no masses: rods between the joints, {total:.3g} kg in all by evidence"
         yield PriorBodies(bodies, ~carried, False, words)
 
 

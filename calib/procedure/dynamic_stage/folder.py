@@ -1,4 +1,4 @@
-"""Folder of an identification: written completely next to its final place, then moved there."""
+"""Folder of an identification: written completely into a temporary folder, then moved to its final place."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class IdentificationFolder:
         return read_json(self.numbers, "identify again", ModelMetrics, with_current_keys)
 
     def findings(self) -> ModelFindings:
-        """Read the findings on the model; older folders contain them only as warnings."""
+        """Read the findings on the model; older folders contain only warnings."""
         metrics = self.metrics()
         return metrics.findings or ModelFindings(Resting(), metrics.warnings)
 

@@ -235,7 +235,7 @@ def read_motion(
     band = SHARE * motion.rate / (2 * max(1, int(widest)))
     same = replace(own.filter, cutoff=_joints(motion.cutoff), velocity_cutoff=_joints(motion.velocity_cutoff))
     wider = make_motion(recording, replace(same, band=min(band, 0.45 * motion.rate)), sampled)
-    note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
+    note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
 

@@ -90,7 +90,7 @@ def described(chain: Chain) -> list[Finding]:
 
 
 def another_loop(found: LoopDisagreement | None) -> list[Finding]:
-    """Return the finding that recorded torques contradict an estimate based on the stated control loop."""
+    """Return the finding that recorded torques contradict an estimate based on the given control loop."""
     if found is None:
         return []
 

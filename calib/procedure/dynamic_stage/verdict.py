@@ -60,7 +60,7 @@ def judge(
     rows: Sequence[str] = (),
     coordinate: str = "joint",
 ) -> tuple[str, list[Finding]]:
-    """Return the torque errors on unseen motion as a sentence, and the findings against the model.
+    """Return the torque errors on unseen motion as a sentence, and the findings that worsen the verdict.
 
     Recordings in which the robot stands are left aside. Of the sum over joints the worst of the findings
     ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained``, ``no-torque-transfer``, of equals the

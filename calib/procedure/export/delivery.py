@@ -138,14 +138,14 @@ def _corrected_urdf(export: Export, path: Path) -> list[str]:
 def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
     if export.urdf is not None:
         content, read_by = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
-        made = f"joint origins of {export.urdf} calibrated, all else kept, base link and flange as the source has them"
+        made = f"joint origins of {export.urdf} are calibrated; base link, flange and all else are unchanged"
     else:
         content = ((export.fit or Path()) / name).read_bytes()
         chain = export.robot.chain if name == URDF else export.robot.complete
         read_by, made = geometry.check_readback(content.decode(), name, chain), "written from the calibrated table"
     files.write(path, _remarked(content, export.remark))
     kept = impossible_bodies(export.robot.chain) if name == URDF else ()
-    return [f"{path.name}: {made}; {read_by}", *(f"as the source has it: {each}" for each in kept)]
+    return [f"{path.name}: {made}; {read_by}", *(f"unchanged from the source: {each}" for each in kept)]
 
 
 def _copy(export: Export, path: Path) -> list[str]:
@@ -219,15 +219,15 @@ class ExportFile:
 
 
 _TO_MASTER = "for the controller: joint offsets to add to its mastering; contains no other part of the geometry"
-_ONLY = f"only for programs that apply {TERMS}, worse than {URDF} without them; masses as in the source"
+_ONLY = f"only for programs that apply {TERMS}, otherwise {URDF} is better; masses are those of the source"
 _TO_SIMULATE = "for simulators: motor inertia, friction and offset of each joint, with sigmas"
 _UR = "for ur_description: kinematics_params_file"
 _MUJOCO = "for MuJoCo: geometry, masses, motor inertia and friction"
-_ROS = "for ROS, MoveIt and simulators; if in doubt, take this one"
+_ROS = "for ROS, MoveIt and simulators; use this file if in doubt"
 FILES = (
     ExportFile(URDF, _urdf, _ROS, (GEOMETRY, DYNAMICS), "urdf", marked=True),
     ExportFile(CORRECTED_URDF, _corrected_urdf, _ONLY, deliverable="corrections", marked=True),
-    ExportFile(TERMS, _copy, "small corrections of each joint, which no URDF can hold", deliverable="corrections"),
+    ExportFile(TERMS, _copy, "small corrections of each joint, which no URDF can contain", deliverable="corrections"),
     ExportFile(FORMULA, _copy, "how to apply them"),
     ExportFile(ROBOT, _copy, "for this toolkit: geometry with covariance and corrections", deliverable="corrections"),
     ExportFile(OFFSETS, _offsets, _TO_MASTER),
@@ -340,7 +340,7 @@ def mark(out: Path, found: Verdicts) -> list[str]:
 
 def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
     """Yield the use of each exported file, and the verdict on it."""
-    holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses as in the source"
+    holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses of the source"
     for file in FILES:
         name = file.name
         if (out / name).exists():

@@ -149,8 +149,8 @@ def flange_note(robot: CalibratedChain) -> str:
         return ""
     away = f"{nominal.tip}, {1e3 * float(np.linalg.norm(behind[:3, 3])):.4g} mm behind the last joint's frame"
     if wrist_offset(nominal) > ON_AXIS:
-        return f"wrist_3 is the last joint's frame, as UR's tool0 is; the fixed joint to {away}, is not in it"
-    return f"wrist_3 reaches to {away}: this file holds UR's d6 there; it has to be UR's own flange, without a tool"
+        return f"wrist_3 is the last joint's frame, like UR's tool0; it excludes the fixed joint to {away}"
+    return f"wrist_3 includes {away}, as UR's d6; this must be UR's flange without a tool"
 
 
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)

@@ -333,6 +333,8 @@ def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: lis
     if not set(block.tool_names) <= known:
         if len(block.tool_names) != len(first.tool_names):
             found = ", ".join(block.tool_names)
-            raise UsageError(f"{block.file}: the fit has no tool {found}, but {', '.join(sorted(known))}; refit_frames")
+            raise UsageError(
+                f"{block.file}: the fit has no tool {found}, only {', '.join(sorted(known))}; refit_frames"
+            )
         block = replace(block, tool_names=first.tool_names)
     return block

@@ -313,15 +313,15 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
     lines, test = list(loop.notes), loop.durbin_wu_hausman
     if test is None:
         return lines
-    whose = f"the test of least squares by {loop.instruments}, not this estimate: " if loop.beside else ""
+    whose = f"results of the test of least squares by {loop.instruments}, not of this estimate: " if loop.beside else ""
     lines.append(
         f"{whose}closed loop simulated, {loop.rounds} rounds; difference of simulated and recorded motion "
         f"{_joints(loop.distance_percent)} %, torque {_joints(loop.simulated_torque_error_percent)} %"
     )
     strength = "weak" if loop.instruments_weak else "strong"
     lines.append(
-        f"instruments: full rank, Cragg-Donald {_number(loop.cragg_donald)} ({strength}), least share of a column "
-        f"explained {100 * loop.least_partial_r2:.3g} %"
+        f"instruments: full rank, Cragg-Donald {_number(loop.cragg_donald)} ({strength}), smallest explained share "
+        f"of a column {100 * loop.least_partial_r2:.3g} %"
     )
     said = "no bias of least squares is detected"
     if test.least_squares_biased:

@@ -122,7 +122,7 @@ def _setup(session: Session, found: fit_report.Report | None) -> list[tuple[str,
         allowed = section.tolerance_percent
         rows += [
             ("recordings", _named(session.brought("training", "unseen"))), ("torques", TORQUES[section.torques]),
-            ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none stated: pass below 10 %"),
+            ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none given: pass below 10 %"),
             ("payloads", ", ".join(f"{label} {mass:g} kg" for label, mass in section.payloads.items())),
         ]  # fmt: skip
     rows += [

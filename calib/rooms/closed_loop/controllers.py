@@ -170,7 +170,7 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
     tick = _ticks(reference, rate, len(measured))
     if rate * reference.period > 1.0 + 1e-3 or tick[-1] > len(reference.t) - 1:
         raise MeasurementError(
-            f"a log of {len(measured)} samples at {rate:g} Hz does not fit a reference of {len(reference.t)} instants "
+            f"a log of {len(measured)} samples at {rate:g} Hz does not match a reference of {len(reference.t)} samples "
             f"at {1 / reference.period:g} Hz"
         )
     return reference.at(tick)[0] - shaped(measured, (None, reference.q.shape[1]), "measured positions")

@@ -117,7 +117,7 @@ def _check_reference(motion: Motion) -> None:
         refuse_data(
             motion.file,
             "has no reference positions (columns q_ref1 …, q_des, q_cmd, or [recording] names = { q_ref = '…' }); the "
-            "simulation of the closed loop needs them. Log them, or state a file, "
+            "simulation of the closed loop needs them. Log them, or give a file: "
             "[loop] reference = '…'; without a reference use wls or irls",
         )
     finite = np.isfinite(motion.q_ref).all(axis=0)
@@ -271,7 +271,7 @@ def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
         raise CalibError(
             f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
             f"{1 / case.motion.rate:.6g} s, the simulation from {t[0]:.6g} s to {t[-1]:.6g} s in steps of "
-            f"{step:.6g} s; state the whole reference and `every`"
+            f"{step:.6g} s; give the whole reference and `every`"
         )
     return index
 

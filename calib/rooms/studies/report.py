@@ -63,8 +63,7 @@ def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
     words = (
         "Torque error on unseen motion, noise-free: boxes from quartile to quartile with the median, lines to the 5th "
         f"and 95th percentile, points beyond; fewer than {MIN_DATA_SETS} as points. Dark: as good as the best. Trials "
-        "without "
-        "an estimate stand at the right."
+        "without an estimate are counted at the right."
     )
     return picture(Chart([panel], 0.75 + LINE * len(names)), words)
 
