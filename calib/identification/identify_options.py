@@ -1,4 +1,4 @@
-"""The identification options file: settings that recordings do not contain, and those of the identification.
+"""The identification options file: settings of recordings (if not in their files) and of the identification.
 
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
@@ -120,7 +120,7 @@ FINDINGS = (
     "masses", "limit", "speed", "lag", "clock", "order", "zero", "coupling", "sign", "jump", "bodies", "description",
     "loop",
 )  # fmt: skip
-"""Names in ``accept``: those of chapters 9 and 10 of the catalogue of findings."""
+"""Names in ``accept``: the codes in chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]
 Gains = Annotated[tuple[float, ...], Expect("a list of finite numbers other than zero"), Checked(_no_zero)]
 

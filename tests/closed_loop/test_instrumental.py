@@ -220,7 +220,7 @@ def test_what_cannot_be_done_is_said():
         found(case, limit=1)
     with pytest.raises(Exception, match="whole reference"):
         found(case, Loop(PD, motion(), 2 * EVERY))
-    with pytest.raises(MeasurementError, match="does not fit"):
+    with pytest.raises(MeasurementError, match="does not match"):
         identify_controller(motion(), np.zeros((100, 2)), np.zeros((100, 2)), 3333.0)
     assert instrumental_variables.settled(found(case).fit, found(case).fit)
 

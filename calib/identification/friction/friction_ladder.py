@@ -139,7 +139,7 @@ class FrictionCandidates:
 def select_friction(
     candidates: FrictionCandidates, wanted: str = "auto", progress: Progress | None = None
 ) -> FrictionSelection:
-    """Return the friction terms that reduce the error on held-out time, or those of a named step.
+    """Return the friction terms that reduce the error on held-out time, or all terms of a named step.
 
     Args:
         wanted: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;

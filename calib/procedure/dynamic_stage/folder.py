@@ -117,7 +117,7 @@ class UnseenFolder:
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse an output folder that contains other files than those of an identification, or an input file."""
+    """Refuse an output folder that contains an input file, or files that no identification writes."""
     folders.check_target(out, OURS, (folders.METRICS, MODEL), "identification", inputs)
 
 

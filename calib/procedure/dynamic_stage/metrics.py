@@ -60,7 +60,7 @@ class ConditionNumber:
 
 @dataclass(frozen=True, eq=False)
 class FilterMetrics:
-    """Sampling rate, f_q and f_v by joint, identification band f_p [Hz], and the decimation to it."""
+    """Sampling rate, f_q and f_v by joint, identification band f_p [Hz], and decimation factor."""
 
     rate: float
     cutoff: Array

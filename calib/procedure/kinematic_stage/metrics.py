@@ -84,7 +84,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of a fit that its verdict needs in addition to the errors on rows; stored in the fit's folder.
+    """Findings of a fit that the verdict needs in addition to the errors on rows; stored in the fit's folder.
 
     Attributes:
         model: the one chosen.

@@ -102,7 +102,7 @@ def computed_torque(
 
 
 def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
-    """Return the controller with the saturation, delay and velocity filter that the settings state."""
+    """Return the controller with the saturation, delay and velocity filter given in the settings."""
     return Controller(
         controller.kp, controller.kd, controller.ki, np.full(n, loop.share), loop.per_joint("limit", n),
         loop.per_joint("windup", n), delay=loop.delay, cutoff=loop.velocity_cutoff,

@@ -176,13 +176,13 @@ def _distance(found: Instrumental) -> list[Finding]:
 
 
 def _gains(found: Instrumental) -> list[Finding]:
-    """Return the finding on joints whose stated gains differ from those of the recording."""
+    """Return the finding on joints whose given gains differ from the gains in the recording."""
     joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
     return [finding("loop-gains-off", joints=joints)] if joints else []
 
 
 def _biased(found: Instrumental) -> list[Finding]:
-    """Return the finding on a bias of least squares; none if the bias is small or the loop fits badly."""
+    """Return the finding on a bias of least squares; none if the bias is small or the simulated loop fits poorly."""
     shift, min_shift = found.shift, 1.0  # standard deviations of a shift that is worth a word (our choice)
     if not found.verdict.biased() or not found.valid or not found.explains or shift.max() < min_shift:
         return []

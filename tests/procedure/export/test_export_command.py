@@ -149,7 +149,7 @@ def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, ol
     assert calib("fit", "plate.urdf", file, "--tip", "plate", "--model", "geometry", "--out", "done")[0] == 0
     code, out, err = calib("export", "done", "--ur-kinematics", "k.yaml")
     assert code == 0, err
-    assert ("wrist_3 reaches to plate" if old else "the fixed joint to plate, 109 mm") in out
+    assert ("wrist_3 includes plate" if old else "the fixed joint to plate, 109 mm") in out
     wrist = re.findall(r"wrist_3:\n    x: (\S+)\n    y: (\S+)\n", Path("k.yaml").read_text())[0]
     assert float(wrist[1]) == pytest.approx(0.0823, abs=2e-3)
 
