@@ -306,7 +306,10 @@ def _differences(
     onboard = model.carried_columns(case.carried)
     parameters = found.base.to_standard(found.fitted.estimate.values[:b])[:bodies] * onboard
     q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
-    felt = model.torque_rows.fold(spread(residual, decimator, len(q))[:, :, None], (BODIES,))[:, :, 0]
+    torque_rows, felt = model.torque_rows, spread(residual, decimator, len(q))[:, :, None]
+    if torque_rows.projection is not None:  # which no geometry changes
+        felt = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), felt)
+    felt = replace(torque_rows, projection=None).fold(felt, (BODIES,))[:, :, 0]
     change = np.empty((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
     block = 512  # samples at a time: the regressor of so many stays in the processor's cache
