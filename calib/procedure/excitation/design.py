@@ -64,6 +64,8 @@ def objectives_of(
     errors_known = given.prior is not None and given.prior.sigmas is not None
     aims = [one for one in AIMS if one in settings.goals]
     if not aims and not (errors_known and not settings.goals):
+        if len(given.columns.aimed_names) == 1:
+            raise UsageError("columns: a single parameter has no condition number; add --goal parameters")
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
     others = [text for text in (*settings.goals, *settings.hard) if text.partition("=")[0] in (*SCALINGS, *AIMS)]
     if len(others) > 1:
@@ -90,11 +92,12 @@ def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, gi
         task = np.einsum("nri,nrj->ij", rows, rows) / rows[:, :, 0].size
     else:
         require(values is not None, "goal 'parameters': needs masses, or a model (--model)", UsageError)
-        known = cast(np.ndarray, values)[given.columns.kept]
-        task = np.diag(np.divide(1.0, known**2, out=np.zeros(len(known)), where=known != 0.0))
+        columns, known = given.columns, cast(np.ndarray, values)[given.columns.kept]
+        counted = (known != 0.0) & np.isin(columns.names, columns.aimed_names)
+        task = np.diag(np.divide(1.0, known**2, out=np.zeros(len(known)), where=counted))
     if given.prior is None and np.isfinite(limits).all():
         sigmas = sigmas * limits[exact.joint_of_row]
-    return replace(condition, index="trace", scaling="raw", sigmas=sigmas, task=task)
+    return replace(condition, index="trace", sigmas=sigmas, task=task, columns=given.columns.columns)
 
 
 def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
@@ -386,7 +389,7 @@ def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tupl
 def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
     """Return the objective: condition number of the identifiable columns, including earlier motions."""
     known = None if given.prior is None else given.prior.per_sample(settings.samples, settings.repeat * settings.period)
-    return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.columns)
+    return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.aimed)
 
 
 def _searched(
@@ -418,16 +421,18 @@ def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, 
     times = family.period * found.factor / INSTANTS * np.arange(INSTANTS)
     motion, columns = dense_motion(family, found.x, times, found.factor), given.columns
     Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
-    alone = condition_numbers(Y, columns.sigmas, columns=columns.columns)
+    alone = condition_numbers(Y, columns.sigmas, columns=columns.aimed)
     if given.prior is None:
         return DesignCondition(**alone)
     known = given.prior.per_sample(INSTANTS, repeat * family.period * found.factor)
-    both = condition_numbers(Y, columns.sigmas, known, columns.columns)
-    before = condition_numbers(0.0 * Y, None, known, columns.columns)
+    both = condition_numbers(Y, columns.sigmas, known, columns.aimed)
+    before = condition_numbers(0.0 * Y, None, known, columns.aimed)
     named = {
-        f"{key}_{when}": value for when, one in (("alone", alone), ("before", before)) for key, value in one.items()
+        f"{key}_{when}": value if np.isfinite(value) else None  # by itself it need not determine all columns
+        for when, one in (("alone", alone), ("before", before))
+        for key, value in one.items()
     }
-    return DesignCondition(**both, **named)
+    return DesignCondition(both["raw"], both["normalised"], **named)
 
 
 def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:

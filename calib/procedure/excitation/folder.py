@@ -143,7 +143,7 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
         "setting": {
             "robot": given.chain.name, "family": settings.family, "period": designed.period,
             "harmonics": getattr(family, "harmonics", getattr(family, "counts", ())),
-            "columns": given.columns.names, "samples": designed.problem.samples,
+            "columns": given.columns.aimed_names, "samples": designed.problem.samples,
             "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": settings.rate,
             "interrupted": found.interrupted, "held": designed.locked,
         },
@@ -160,16 +160,19 @@ def _seconds(track: Setpoints | None) -> float | None:
     return None if track is None else track.duration
 
 
+def _pair(raw: float | None, normalised: float | None) -> str:
+    return "no finite one" if raw is None or normalised is None else f"{raw:.4g} raw, {normalised:.4g} normalised"
+
+
 def design_lines(designed: Designed) -> list[str]:
     """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
     found, cond = designed.found, designed.condition
-    columns, prior = len(designed.inputs.columns.names), designed.inputs.prior
+    columns, prior = len(designed.inputs.columns.aimed_names), designed.inputs.prior
     earlier = ["what is identified"] if prior is not None and prior.sigmas is not None else []
     earlier += [f"{', '.join(prior.names)} ({prior.seconds:.1f} s)"] if prior is not None and prior.names else []
     together = [] if prior is None else [
-        f"together with {' and '.join(earlier)}, which alone has {cond.raw_before:.4g} raw, "
-        f"{cond.normalised_before:.4g} normalised; this motion alone has {cond.raw_alone:.4g} and "
-        f"{cond.normalised_alone:.4g}"
+        f"together with {' and '.join(earlier)}, which alone has {_pair(cond.raw_before, cond.normalised_before)}; "
+        f"this motion alone has {_pair(cond.raw_alone, cond.normalised_alone)}"
     ]  # fmt: skip
     result = [
         *(["interrupted: this is the best motion so far"] if found.interrupted else []),

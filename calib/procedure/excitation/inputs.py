@@ -30,7 +30,8 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot import description
 from calib.robot.calibrated import ROBOT, CalibratedChain
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import forward
 from trajectories.constraints import BoxLimit
 
 SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
@@ -64,12 +65,27 @@ class IdentifiableColumns:
         columns: (c,) of the model's; None: all of them.
         sigmas: (rows,) infinite for torque rows that are left out; None: all rows count.
         names: of the columns; notes: what a user should know.
+        chosen: (k,) of the model's, for which the motion is designed while the others are estimated, too; None: all.
     """
 
     columns: np.ndarray | None
     sigmas: np.ndarray | None
     names: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    chosen: np.ndarray | None = None
+
+    @property
+    def aimed(self) -> np.ndarray | None:
+        """The model's columns whose condition number counts; None: all."""
+        return self.columns if self.chosen is None else self.chosen
+
+    @property
+    def aimed_names(self) -> tuple[str, ...]:
+        """Names of the columns whose condition number counts."""
+        if self.chosen is None:
+            return self.names
+        own = np.arange(len(self.names)) if self.columns is None else self.columns
+        return tuple(name for k, name in zip(own, self.names) if k in self.chosen)
 
     @property
     def kept(self) -> np.ndarray | slice:
@@ -171,7 +187,9 @@ def read_model(
     """
     if folder is not None:
         if options is not None:
-            raise UsageError(f"model {folder}: already states rows, drives and payloads; leave the options out")
+            raise UsageError(
+                f"identification {folder}: already states rows, drives and payloads; leave the options out"
+            )
         return _identified(chain, folder, loads)
     notes = []
     if options is not None and not _designable(options.torque_rows):
@@ -184,6 +202,11 @@ def read_model(
         model = make_model(chain, options)
     model, left = _differentiable(model)
     cases = _loads(loads, model, with_payloads=True)
+    if options is not None and options.friction not in ("auto", "standard"):
+        notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
+    if chain.inertias is None and np.isfinite(limits.torque).any():
+        sizes = ", ".join(f"{x:g}" for x in dict.fromkeys(limits.torque.tolist()))
+        notes.append(f"NOT checked: torques (limits {sizes}), since the robot has no masses; name a model (--model)")
     known = {} if limits.friction is None else dict(zip(("velocity", "sign"), limits.friction))
     values, notes = None, notes + left
     if chain.inertias is not None:
@@ -250,6 +273,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
             message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
             raise UsageError(message) from error
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
+    _require_same_arm(chain, folder)
     loads = _loads(texts, found.model, with_payloads=False)
     run = {label for carried in loads for label in carried or ()}
     values = dict(zip(found.model.names, found.values))
@@ -267,6 +291,21 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
+
+
+def _require_same_arm(chain: Chain, folder: Path, max_miss: float = 0.05) -> None:
+    """Raise an error for an identification of another arm: its tip is elsewhere, by a share of the reach.
+
+    `max_miss`: calibrated and nominal arms of one type agree within a percent (our choice).
+    """
+    theirs, q = description.read(folder / ROBOT), random_joints(chain, 20, 0)
+    tips = [forward(one, q)[:, :3, 3] for one in (chain, theirs)]
+    miss = float(np.median(np.linalg.norm(tips[0] - tips[1], axis=1)))
+    if miss > max_miss * float(np.linalg.norm(tips[0], axis=1).max()):
+        raise UsageError(
+            f"{folder} is of another robot ({theirs.name}): its tip is {miss:.3g} m from that of {chain.name} (median of 20 "
+            "postures); name an identification of this robot"
+        )
 
 
 def excited_model(
@@ -378,7 +417,7 @@ def _selected(
         one_of(standard_name(name, standard), short, "columns: parameter", UsageError)
     chosen = {short[standard_name(name, standard)] for name in requested}
     kept = np.array([k for k, name in enumerate(model.exact.names) if name in chosen])
-    return replace(found, columns=kept, names=tuple(model.exact.names[k] for k in kept))
+    return replace(found, chosen=kept)
 
 
 def read_prior(
@@ -397,7 +436,10 @@ def read_prior(
     total, seconds, sigmas = np.zeros((len(model.exact.names),) * 2), 0.0, None
     if after is not None:
         total, sigmas = _known(after, model)
+    trained = () if after is None else tuple(IdentificationFolder(after).metrics().identification)
     for text in paths:
+        if Path(text).name in trained:
+            raise UsageError(f"existing {text}: {after} was identified from this recording; leave it out")
         designed = (Path(text) / coefficients.NAME).exists()
         q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
         total += information(model.exact, q, v, a, sigmas) / rate
@@ -408,13 +450,20 @@ def read_prior(
 def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (b, b) of an identification, and the square root of its torque error density (rows,)."""
     density, covariance = IdentificationFolder(folder).metrics().error_density, model.covariance
-    if covariance is None or density is None or len(density) != model.exact.model.rows:
-        raise UsageError(f"{folder}: states no covariance of the design's columns, or no torque errors; identify again")
+    if density is None or len(density) != model.exact.model.rows:
+        raise UsageError(f"{folder}/metrics.json has no error_density of the torque rows; identify again")
+    if covariance is None:
+        raise UsageError(
+            f"{folder}/covariance.csv is missing or lacks columns of the design; if the model has payloads, state each "
+            "run's load (--load none --load tool)"
+        )
     spread = np.sqrt(np.diag(covariance))
     # what a constraint holds has no spread and gains nothing: as if known to a millionth (our choice)
     spread = np.where(spread > 0.0, spread, np.maximum(1e-6 * np.abs(cast(np.ndarray, model.values)), 1e-12))
     unit = covariance / np.outer(spread, spread)
     np.fill_diagonal(unit, 1.0 + 1e-9)
+    if not np.linalg.eigvalsh(unit)[0] > 0.0:
+        raise UsageError(f"{folder}/covariance.csv is not positive definite, so it is damaged; identify again")
     return np.linalg.inv(unit) / np.outer(spread, spread), np.tile(np.sqrt(density), len(model.exact.loads))
 
 
