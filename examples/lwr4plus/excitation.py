@@ -63,6 +63,7 @@ from calib.rooms.closed_loop.controllers import Reference
 from calib.workers.threads import one_blas_thread
 from trajectories.design.objectives import condition_numbers
 
+PERIODS = (10.0, 15.0, 20.0, 25.0, 30.0)  # the paper's T0, section 4.3 [s]
 PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0  # of a trajectory and of a log [s]; of the controller [Hz]
 SPEEDS = (0.3, 0.45, 0.6, 0.9)  # of the plain moves, shares of the limits
 NOISE = np.repeat([0.003, 0.015], 7)  # of the limits, on joint and motor torques: D's weights (the truth's)
@@ -139,10 +140,13 @@ class Plan:
     knowledge: str = "estimate"
     harmonics: int = 5
     seed: int = 0
+    period: float = PERIOD
 
     @property
     def name(self) -> str:
-        return f"{self.which}, {self.columns} columns"
+        base = f"{self.which}, {self.columns} columns"
+        longer = "" if self.period == PERIOD else f", T0 = {self.period:g} s"
+        return base + longer + {"truth": ", known truth", "cad": ", CAD geometry"}.get(self.knowledge, "")
 
 
 def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
@@ -153,13 +157,14 @@ def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
     sigmas = np.tile(NOISE * np.tile(arm.effort, 2), len(RUNS)) if plan.which == "D" else None
     given = ExcitationInputs(
         arm.chain, read_motion_limits(LIMITS, arm.chain), excited, {},
-        IdentifiableColumns(columns, sigmas, tuple(base.names[k] for k in columns)), None,
+        IdentifiableColumns(None, sigmas, base.names, chosen=columns), None,
     )  # fmt: skip
     settings = ExcitationSettings(
-        goals=GOALS[plan.which], period=PERIOD, harmonics=plan.harmonics, rate=RATE, samples=80 + 8 * plan.harmonics,
-        starts=starts, evaluations=evaluations, seed=plan.seed, outlook=False,
+        goals=GOALS[plan.which], period=plan.period, harmonics=plan.harmonics, rate=RATE,
+        samples=80 + 8 * plan.harmonics, starts=starts, evaluations=evaluations, seed=plan.seed, outlook=False,
     )  # fmt: skip
-    return Reference(*ExcitationDesign(**vars(search_motion(given, settings))).sampled())
+    found = ExcitationDesign(**vars(search_motion(given, settings)))
+    return Reference(*(series[:-1] for series in found.sampled()))  # periods follow each other
 
 
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
@@ -224,7 +229,7 @@ class Task:
     @property
     def name(self) -> str:
         if isinstance(self.what, Plan):
-            return self.what.name + ("" if self.what.knowledge == "estimate" else ", known truth")
+            return self.what.name
         return "spline, 20 waypoints" if self.what is None else f"moves at {self.what:g}"
 
 
@@ -234,7 +239,8 @@ def done(task: Task) -> tuple[Reference, dict[str, Any]]:
     arm, plan = task.arm, task.what
     if isinstance(plan, Plan):
         effort = task.evaluations * (2 if plan.which == "D" else 1)
-        motion = designed(plan, truth() if plan.knowledge == "truth" else arm, task.starts, effort)
+        known = {"truth": truth(), "estimate": arm, "cad": Arm(lwr4plus.nominal_chain(), arm.values)}[plan.knowledge]
+        motion = designed(plan, known, task.starts, effort)
     elif plan is None:
         motion, _ = waypoint_spline(arm.chain, arm.torque, task.seed, RATE, PERIOD)
     else:
@@ -256,6 +262,8 @@ def study(
         wanted += [(speed, k) for speed in ((0.45, 0.9) if quick else SPEEDS)] + [(None, k)]
     if not quick:
         wanted.append((Plan("D", 44, harmonics=12, seed=seed), seed))
+        wanted += [(Plan("B", 44, period=period, seed=seed), seed) for period in PERIODS if period != PERIOD]
+        wanted.append((Plan("B", 44, "cad", seed=seed), seed))
     tasks = [Task(what, k, arm, starts, evaluations) for what, k in wanted]
     motions, rows = dict[str, Reference](), dict[str, list[dict[str, Any]]]()
     with ProcessPoolExecutor(workers) as pool:

@@ -303,8 +303,8 @@ def _require_same_arm(chain: Chain, folder: Path, max_miss: float = 0.05) -> Non
     miss = float(np.median(np.linalg.norm(tips[0] - tips[1], axis=1)))
     if miss > max_miss * float(np.linalg.norm(tips[0], axis=1).max()):
         raise UsageError(
-            f"{folder} is of another robot ({theirs.name}): its tip is {miss:.3g} m from that of {chain.name} (median of 20 "
-            "postures); name an identification of this robot"
+            f"{folder} is of another robot ({theirs.name}): its tip is {miss:.3g} m from that of {chain.name} at the same "
+            "joint values (median); name an identification of this robot"
         )
 
 
