@@ -114,28 +114,6 @@ def collect(
     return absorb(empty(names, units, count), matrix, target, 0 if group is None else group)
 
 
-def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
-    """Return the R factors with parameters of each set made equal: the sum of their columns replaces the first.
-
-    Raises:
-        CalibError: for a name that is no column, or in two sets.
-    """
-    named = [name for one in sets for name in one]
-    if wrong := [name for name in named if name not in data.names or named.count(name) > 1]:
-        raise CalibError(
-            f"equal parameters: '{wrong[0]}' is not a column, or named twice; the columns are {', '.join(data.names)}"
-        )
-    into = {name: one[0] for one in sets for name in one}
-    kept = [name for name in data.names if into.get(name, name) == name]
-    sums = np.zeros((data.parameters + 1, len(kept) + 1))
-    for k, name in enumerate(data.names):
-        sums[k, kept.index(into.get(name, name))] = 1.0
-    sums[-1, -1] = 1.0
-    factors = np.stack([retriangulate(factor @ sums) for factor in data.factors])
-    units = dict(zip(data.names, data.units))
-    return Triangles(tuple(kept), tuple(units[name] for name in kept), frozen(factors), data.rows)
-
-
 def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of all rows, those of group g divided by std[g] (None: by one)."""
     scale = np.ones(data.groups) if std is None else shaped(std, (data.groups,), "standard deviation per group")

@@ -27,12 +27,13 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.essential import Rule, eliminate
 from calib.estimation.estimate import Estimate
-from calib.estimation.triangles import Triangles, tie
+from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.identify import Identification, identify_model
 from calib.identification.prediction import predict
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.records import frozen
 from calib.rooms.parallel.excite import ParallelExcitation, design_parallel
 from calib.rooms.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import distributed, overconstraint
@@ -145,7 +146,7 @@ class Method:
         self.all = self.found.fitted.estimate
         self.free = self._kept(pooled, Rule.RSD, ratio=10.0)
         self.nine = self._kept(pooled, Rule.RSD, ratio=np.inf, drop=_others(pooled.names))
-        tied = tie(pooled, [LEGS])
+        tied = _tied(pooled, LEGS)
         self.equal_legs = self._kept(tied, Rule.RSD, ratio=np.inf, drop=_others(tied.names))
 
     def _kept(self, pooled: Triangles, rule: Rule, **limits: Any) -> Estimate:
@@ -166,6 +167,18 @@ class Method:
         """Return the relative error ‖ρ‖/‖y‖ of each joint on the validation motion, in the identification band."""
         y, found = (self.unseen.motion.in_band(x) for x in (self.unseen.target, self.predicted(estimate)))
         return [float(x) for x in np.linalg.norm(y - found, axis=0) / np.linalg.norm(y, axis=0)]
+
+
+def _tied(data: Triangles, same: tuple[str, ...]) -> Triangles:
+    """Return the R factors with the parameters of a set made equal: the sum of their columns replaces the first."""
+    kept = [name for name in data.names if name not in same[1:]]
+    sums = np.zeros((data.parameters + 1, len(kept) + 1))
+    for k, name in enumerate(data.names):
+        sums[k, kept.index(same[0] if name in same else name)] = 1.0
+    sums[-1, -1] = 1.0
+    factors = np.stack([retriangulate(factor @ sums) for factor in data.factors])
+    units = dict(zip(data.names, data.units))
+    return Triangles(tuple(kept), tuple(units[name] for name in kept), frozen(factors), data.rows)
 
 
 def _others(names: tuple[str, ...]) -> list[str]:

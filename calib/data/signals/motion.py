@@ -237,23 +237,6 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
     return replace(motion, q_ref=frozen(CubicSpline(t, q)(np.clip(motion.t, t[0], t[-1]))))
 
 
-def thin(motion: Motion) -> Motion:
-    """Return the motion at the samples kept by its decimator: q, v, a unchanged, efforts filtered to the band.
-
-    W for it is that of the *whole* motion, decimated; building W from the thinned q, v, a would not be parallel.
-    """
-    index = filtering.kept(motion.segment, motion.decimator)
-    efforts = {
-        name: filtering.decimate(value, motion.decimator, motion.segment)
-        for name in ("effort", "tau_link", "tau_motor", "weight")
-        if (value := getattr(motion, name)) is not None
-    }
-    picked = {name: value[index] for name in ROWS if (value := getattr(motion, name)) is not None}
-    rate = motion.rate / motion.decimator.factor
-    whole = filtering.design_decimator(rate, 1)
-    return replace(motion, **(picked | efforts), rate=rate, decimator=whole)
-
-
 def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
     """Return the mask (N, n) of moving joints: |v_j| ≥ `slow`, a share of the peak, or (n,) [rad/s or m/s]."""
     peak = np.abs(motion.v).max(axis=0)

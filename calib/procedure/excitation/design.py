@@ -361,20 +361,14 @@ def _excitation_problem(
     condition, smooth = _condition_objective(given, settings), given.model.smooth
     objectives = objectives_of(settings, condition, given)
     family, coarse = _family(given, settings)
+    shortest = settings.shortest or settings.period
+    if shortest > settings.period:
+        raise UsageError(f"--shortest {shortest:g} s: expected at most the period, {settings.period:g} s")
     problem = ExcitationProblem(
         family, smooth.regressor, smooth.regressor_gradient, objectives, search, samples=settings.samples,
-        stretch=_stretch(settings), coarse=coarse,
+        stretch=(shortest / settings.period, 1.0), coarse=coarse,
     )  # fmt: skip
     return problem, checked, notes
-
-
-def _stretch(settings: ExcitationSettings) -> tuple[float, float]:
-    """Return the smallest and the largest factor by which the search may scale the period."""
-    if settings.shortest is None:
-        return 1.0, 1.0
-    if settings.shortest > settings.period:
-        raise UsageError(f"--shortest {settings.shortest:g} s: expected at most the period, {settings.period:g} s")
-    return settings.shortest / settings.period, 1.0
 
 
 def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tuple[SearchResult, ExcitationProblem]:

@@ -168,10 +168,8 @@ def design_lines(designed: Designed) -> list[str]:
     """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
     found, cond = designed.found, designed.condition
     columns, prior = len(designed.inputs.columns.aimed_names), designed.inputs.prior
-    earlier = ["what is identified"] if prior is not None and prior.sigmas is not None else []
-    earlier += [f"{', '.join(prior.names)} ({prior.seconds:.1f} s)"] if prior is not None and prior.names else []
     together = [] if prior is None else [
-        f"together with {' and '.join(earlier)}, which alone has {_pair(cond.raw_before, cond.normalised_before)}; "
+        f"together with {', '.join(prior.names)}, which alone has {_pair(cond.raw_before, cond.normalised_before)}; "
         f"this motion alone has {_pair(cond.raw_alone, cond.normalised_alone)}"
     ]  # fmt: skip
     result = [

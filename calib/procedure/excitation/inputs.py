@@ -82,10 +82,8 @@ class IdentifiableColumns:
     @property
     def aimed_names(self) -> tuple[str, ...]:
         """Names of the columns whose condition number counts."""
-        if self.chosen is None:
-            return self.names
-        own = np.arange(len(self.names)) if self.columns is None else self.columns
-        return tuple(name for k, name in zip(own, self.names) if k in self.chosen)
+        own = range(len(self.names)) if self.columns is None else self.columns
+        return tuple(name for k, name in zip(own, self.names) if self.chosen is None or k in self.chosen)
 
     @property
     def kept(self) -> np.ndarray | slice:
@@ -303,8 +301,7 @@ def _require_same_arm(chain: Chain, folder: Path, max_miss: float = 0.05) -> Non
     miss = float(np.median(np.linalg.norm(tips[0] - tips[1], axis=1)))
     if miss > max_miss * float(np.linalg.norm(tips[0], axis=1).max()):
         raise UsageError(
-            f"{folder} is of another robot ({theirs.name}): its tip is {miss:.3g} m from that of {chain.name} at the same "
-            "joint values (median); name an identification of this robot"
+            f"{folder} is of another robot ({theirs.name}): its tip is {miss:.3g} m from {chain.name}'s (median)"
         )
 
 
@@ -444,7 +441,8 @@ def read_prior(
         q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
         total += information(model.exact, q, v, a, sigmas) / rate
         seconds += len(q) / rate
-    return PriorMotions(tuple(map(str, paths)), seconds, total, sigmas)
+    names = () if after is None else ("what is identified",)
+    return PriorMotions((*names, *map(str, paths)), seconds, total, sigmas)
 
 
 def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:

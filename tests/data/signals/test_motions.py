@@ -8,7 +8,7 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import propose_cutoffs
 from calib.data.signals.filtering import decimate
-from calib.data.signals.motion import FilterOptions, make_motion, moving, thin
+from calib.data.signals.motion import FilterOptions, make_motion, moving
 from calib.data.signals.persistency import repeats, report_excitation
 from calib.data.signals.resampling import find_clock, resample
 from calib.errors import CalibError, MeasurementError, UsageError
@@ -105,8 +105,6 @@ def test_short_gaps_are_bridged_and_long_ones_split():
     motion = make_motion(recorded(t, t).take(keep))
     assert sorted(set(motion.segment)) == [0, 1]
     assert not ((motion.t > t[2499] - 0.05) & (motion.t < t[3500] + 0.05)).any()
-    index = thin(motion)
-    assert len(decimate(motion.effort, motion.decimator, motion.segment)) == len(index)
 
 
 def test_crumbs_between_gaps_are_left_out():
@@ -161,7 +159,6 @@ def test_the_model_holds_after_the_parallel_decimation():
     y = decimate(motion.effort, motion.decimator, motion.segment)
     x = np.linalg.lstsq(w.reshape(-1, 3), y.ravel(), rcond=None)[0]
     np.testing.assert_allclose(x, [20.0, 2.0, 0.5], rtol=2e-4)
-    assert len(thin(motion)) == len(w) and thin(motion).rate == pytest.approx(50.0)
 
 
 def test_standing_and_moving_samples():
