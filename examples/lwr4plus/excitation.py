@@ -9,7 +9,8 @@ harmonics, rest at both ends; limits of position, velocity, torque with either l
 samples.
 
 Motions are designed with the *current estimate* of the arm: the geometry fitted to 60 measured poses, and Model 2
-identified on one slow log of plain moves (0.3 of the limits). What the truth would have given stands beside.
+identified on one slow log of plain moves (0.3 of the limits). What the truth would have given stands beside,
+and what the CAD geometry would.
 
 The RSDs "shrink twice" in the paper against another unit's non-optimised trapezoidal moves, whose speed it does not
 give. Here: 50 s of each motion per load, in closed loop at 1 kHz, through the study's own filters (10 Hz Butterworth,
@@ -19,7 +20,7 @@ truth is of the identified form; the 58 parameters that the 44 leave out are in 
 
     python examples/lwr4plus/excitation.py --out lwr4plus-excitation [--seeds 3] [--evaluations 250] [--workers 2]
 
-Some seven minutes of processor time; --quick takes one.
+Some 25 minutes of processor time; --quick takes one or two.
 """
 
 from __future__ import annotations
