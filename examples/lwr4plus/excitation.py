@@ -20,7 +20,7 @@ truth is of the identified form; the 58 parameters that the 44 leave out are in 
 
     python examples/lwr4plus/excitation.py --out lwr4plus-excitation [--seeds 3] [--evaluations 250] [--workers 2]
 
-Some 25 minutes of processor time; --quick takes one or two.
+25 minutes on two busy cores.
 """
 
 from __future__ import annotations
