@@ -6,8 +6,7 @@ import pytest
 from calib.errors import CalibError
 from calib.estimation.linear import wls
 from calib.estimation.triangles import collect
-from calib.rooms.alternatives.sample_weights import tuning
-from calib.rooms.alternatives.samples import irls, row_irls, stack
+from calib.rooms.alternatives.samples import irls, row_irls, stack, tuning
 
 NOISE = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 25.0]])
 TRUTH = np.array([1.0, -2.0, 0.5, 3.0])

@@ -6,7 +6,7 @@ import pytest
 from calib.errors import CalibError, Unidentifiable
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect
-from calib.rooms.alternatives.total import tls
+from calib.rooms.alternatives.estimators import tls
 
 TRUTH = np.array([2.0, -1.0, 0.5])
 NOISE = np.array([0.0, 0.2, 0.3, 0.1])  # the first column is exact

@@ -4,21 +4,98 @@ The residual of sample k, e_k = y_k - W_k x (n joints), has covariance S across 
 size is Mahalanobis', d_k² = e_kᵀ S⁻¹ e_k. A robust fit weights each sample by w(d_k), and beyond the gate by nothing.
 That guards against bad y; a sample with a bad W of great leverage draws the fit unseen, as in every M-estimator.
 The samples stay in memory, since each round weights them anew: meant for decimated data.
+
+Robust weights of whole samples, by the Mahalanobis size of their residuals.
+
+For e ~ N(0, S) with n joints the size d = (eᵀ S⁻¹ e)^½ is chi-distributed, so what counts as large grows with n. The
+expectations below are means over 4000 quantiles of d², good to four digits.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
+from scipy.special import chdtri
 
 from calib.errors import CalibError, NotConverged
 from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit, leverage, wls
+from calib.estimation.robust import weights
 from calib.estimation.triangles import Triangles, absorb, combine, empty, solve_triangle
 from calib.records import frozen, shaped
-from calib.rooms.alternatives import sample_weights
+
+GATE = 0.999  # probability of a good sample to stay in
+
+
+@lru_cache
+def tuning(joints: int, efficiency: float = 0.95) -> float:
+    """Return Huber's constant with efficiency `efficiency` for normal residuals of `joints` joints at once.
+
+    The efficiency of the weights w(d) is b² / a with a = E w² d² / n and b = E w d² / n (Maronna 1976; the latter
+    equals E[w + w' d / n] by Stein's lemma). For one joint: 1.345.
+    """
+    from scipy.optimize import brentq
+
+    square = _quantiles(joints)
+
+    def excess(constant: float) -> float:
+        w = weights(np.sqrt(square), "huber", constant)
+        return float(np.mean(w * square) ** 2 / np.mean(w**2 * square) / joints - efficiency)
+
+    return float(brentq(excess, 0.05, 20.0 * np.sqrt(joints)))  # type: ignore[arg-type]
+
+
+def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarray:
+    """Return Huber's weights w(d) (N,) of samples of Mahalanobis size d (N,), zero beyond the gate.
+
+    Args:
+        joints: (N,) how many joints each sample has.
+        gated: whether samples beyond `GATE` weigh nothing.
+    """
+    result = np.zeros(len(size))
+    for n in np.unique(joints[joints > 0]):
+        own = joints == n
+        result[own] = _weights(size[own], int(n), gated)
+    return result
+
+
+@lru_cache
+def consistency(joints: int) -> float:
+    """Return c = E w / E[w d² / n], so that c Σ w e eᵀ / Σ w estimates S for normal residuals."""
+    square = _quantiles(joints)
+    w = _weights(np.sqrt(square), joints)
+    return float(np.mean(w) / np.mean(w * square) * joints)
+
+
+def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
+    """Return v with cov(x) = v (Σ w_k W_kᵀ S⁻¹ W_k)⁻¹ for the weighted fit (Huber & Ronchetti 2009, section 7.6).
+
+    cov(x) = a / b² (Σ W_kᵀ S⁻¹ W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples, and the sum
+    over all samples is the weighted one over mean w. The step of w at the gate is not counted: some per mille.
+    """
+    n = np.maximum(joints, 1)
+    w = weigh(size, joints)
+    h = 1e-4
+    bent = [np.where(w > 0.0, weigh(size * (1.0 + k * h), joints, False), 0.0) for k in (1, -1)]
+    slope = (bent[0] - bent[1]) / (2.0 * h)  # w' d
+    share = joints / joints.sum()
+    a, b = np.sum(share * w**2 * size**2 / n), np.sum(share * (w + slope / n))
+    return float(a / b**2 * np.sum(share * w))
+
+
+def _weights(size: np.ndarray, joints: int, gated: bool = True) -> np.ndarray:
+    w = weights(size, "huber", tuning(joints))
+    return np.where(size**2 <= chdtri(joints, 1.0 - GATE), w, 0.0) if gated else w
+
+
+@lru_cache
+def _quantiles(joints: int) -> np.ndarray:
+    """Return 4000 equally likely values of d², for numerical expectations."""
+    return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))
+
 
 CHUNK = 2000  # samples whitened at a time
 ROUNDS = 200
@@ -94,7 +171,7 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
 
     S, weights and x alternate until x moves by less than 1e-4 of its standard deviation. Starts from a row-wise Cauchy
     fit with median spreads, because a covariance estimated from all samples would hide the outliers that made it. The
-    covariance of x is that of the M-estimator, `sample_weights.variance_factor`.
+    covariance of x is that of the M-estimator, `variance_factor`.
 
     Args:
         data: the samples.
@@ -108,7 +185,7 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
     for _ in range(ROUNDS):
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
         size = _sizes(residual, covariance, data.present)
-        weights = sample_weights.weigh(size, data.joints)
+        weights = weigh(size, data.joints)
         covariance = _scatter(data, residual, weights * _consistent(data), weights)
         factor, last = _factor(data, covariance, weights), values
         values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
@@ -143,7 +220,7 @@ def _pack(
     squares = np.sum(weights * _consistent(data) * size**2)
     dof = int(data.joints[weights > 0.0].sum() / inflation) - len(values)
     residual_std = float(np.sqrt(squares / np.sum(weights * data.joints)))
-    covariance = sample_weights.variance_factor(size, data.joints) * inflation * inverse @ inverse.T
+    covariance = variance_factor(size, data.joints) * inflation * inverse @ inverse.T
     estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
     outliers = (weights == 0.0) & (data.joints > 0)
     fit = LinearFit(estimate, np.sqrt(np.diag(noise)), *conditions)
@@ -212,7 +289,7 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
 def _consistent(data: Samples) -> np.ndarray:
     """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
-    each = [sample_weights.consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    each = [consistency(n) if n else 0.0 for n in range(data.target.shape[1] + 1)]
     return np.array(each)[data.joints]
 
 
