@@ -35,6 +35,9 @@ def implausible(
     sizes = [compare_sizes(case, chain, gravity, inputs.unit == TORQUE) for case in inputs.cases]
     signs = {case.name: signs_of(case, chain, gravity) for case in (*inputs.cases, *inputs.unseen)}
     found = [*findings(sizes, chain.joint_names), *impossible(impossible_by), *another_loop(loop), *described(chain)]
+    for label, load in inputs.options.settings.payloads.items():
+        if not load.parameters and not any(label in case.carried for case in inputs.cases):
+            found.append(finding("payload-never", label=label))
     return settle([*found, *wrong_joints(signs, chain.joint_names)], inputs.options.accept)
 
 

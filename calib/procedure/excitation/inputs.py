@@ -441,8 +441,7 @@ def read_prior(
         q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
         total += information(model.exact, q, v, a, sigmas) / rate
         seconds += len(q) / rate
-    names = () if after is None else ("what is identified",)
-    return PriorMotions((*names, *map(str, paths)), seconds, total, sigmas)
+    return PriorMotions((*["what is identified"] * (after is not None), *map(str, paths)), seconds, total, sigmas)
 
 
 def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:

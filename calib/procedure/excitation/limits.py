@@ -272,7 +272,9 @@ def read_motion_limits(
     constraints += _places(stated, found, points)
     notes = list(found.notes)
     if found.collision is None:
-        notes.append(_unchecked(where if given else None))
+        notes.append(
+            "collisions and floor are NOT checked: state [collision], with floor = … at least, in a limits file"
+        )
     else:
         names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
         constraints.append(Clearance(found.collision.distances, found.collision.gradients, names, found.clearance))
@@ -321,13 +323,6 @@ def _bounds(
         origin["acceleration"] = DEFAULT_ORIGIN if np.isinf(acceleration).all() else f"{path}, or {DEFAULT_ORIGIN}"
         acceleration = np.where(free, DEFAULT_RISE * velocity, acceleration)
     return MotionBounds(robot, chain.joints, velocity, acceleration, torque, origin)
-
-
-def _unchecked(path: str | None) -> str:
-    """Return a note on hazards that are not checked, with advice on the limits file."""
-    if path is None:
-        return "collisions and floor are NOT checked: state obstacles and floor in a limits file"
-    return f"collisions are NOT checked: {path} has no [collision]; add it, with floor = … at least"
 
 
 @dataclass(frozen=True, eq=False)

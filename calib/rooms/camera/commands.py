@@ -23,7 +23,7 @@ def board(
     paper: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Make a calibration board to print at true scale; check the print with a ruler.
+    """Make a calibration board to print; check it with a ruler.
 
     Take ChArUco: it may be seen in part, and its corners are found to hundredths of a pixel; the
     corners of tags ten times worse. Print at 100 %, glue it onto something flat, measure a square, correct board.toml.

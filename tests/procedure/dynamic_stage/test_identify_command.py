@@ -65,6 +65,16 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     assert "is no evidence" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("options", "code"), [("rows = 'power'", ""), ("[payload.tool]\nmass = 2.0", "payload-never")])
+def test_power_is_explained_and_a_payload_that_is_never_carried_is_said(robot, tmp_path, options, code):
+    train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
+    (tmp_path / "options.toml").write_text(options)
+    chosen = ("--options", tmp_path / "options.toml", "--friction", "standard", "--out", tmp_path / "out")
+    assert run(robot, train, "--validate", other, *chosen) == 0
+    found = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert (found["verdict"], found["code"]) == ("marginal" if code else "pass", code)
+
+
 def test_the_calibrated_robots_folder_serves_and_the_nominal_chooses_columns(tmp_path):
     from calib.robot import description
 
