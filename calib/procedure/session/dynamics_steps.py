@@ -278,7 +278,8 @@ def identify(session: Session, say: Say) -> list[str]:
     designed = session.path("6-excitation/training")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
         notes.append(prediction.compared_with_identification(designed, outcome))
-    return [*notes, *outcome.warnings]
+    later = lines_of([one for one in outcome.noticed if one.code == "no-unseen-motion"])  # `predict` judges
+    return [*notes, *(words for words in outcome.warnings if words not in later)]
 
 
 def predict(session: Session, say: Say) -> list[str]:
