@@ -154,7 +154,9 @@ def test_the_same_motion_is_designed(session: Session, tmp_path: Path) -> None:
     session = open_session(settings.parent, plots=False)
     dynamics_steps.excite(session, quiet)
     words = "--period 4 --harmonics 2 --rate 100 --starts 1 --evaluations 20 --repeat 1"
-    assert not command("excite", session.path("4-fit"), *words.split(), "--out", tmp_path / "motion")
+    (tmp_path / "options.toml").write_text(f'rows = "{session.settings.dynamics.torques}"\nfriction = "standard"\n')
+    chosen = (*words.split(), "--options", tmp_path / "options.toml", "--out", tmp_path / "motion")
+    assert not command("excite", session.path("4-fit"), *chosen)
     names = {path.name for path in (tmp_path / "motion").iterdir()}
     assert names == {path.name for path in session.path("6-excitation/training").iterdir()}
     for name in names - {"metrics.json"}:
