@@ -141,7 +141,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
     found = installation.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
-        f"true errors over {TRUTH} poses in the whole joint range: tool error {before:.3f} mm rms with the "
+        f"hidden truth, over {TRUTH} poses of the whole joint range: tool error {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
     ]
     truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
