@@ -111,17 +111,9 @@ class BaseModel:
     def units(self) -> tuple[str, ...]:
         return self.base.units
 
-    def regressor(
-        self,
-        q: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        load: np.ndarray | None = None,
-        carried: Collection[str] | None = None,
-        states: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Return the base regressor (N, rows, b); for the arguments see `IdentificationModel.regressor`."""
-        full = self.model.regressor(q, v, a, load, carried, states)
+    def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads."""
+        full = self.model.regressor(q, v, a)
         return full.transpose(2, 1, 0)[self.base.kept].transpose(2, 1, 0)
 
     def regressor_gradient(

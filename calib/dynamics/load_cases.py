@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,17 +48,9 @@ class LoadCases(BaseModel):
         result[self.limited] = of_joints
         return result
 
-    def regressor(
-        self,
-        q: np.ndarray,
-        v: np.ndarray,
-        a: np.ndarray,
-        load: np.ndarray | None = None,
-        carried: Collection[str] | None = None,
-        states: np.ndarray | None = None,
-    ) -> np.ndarray:
+    def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the stacked base regressor (N, loads x rows per sample, b); columns of absent payloads are zero."""
-        one = super().regressor(q, v, a, load, carried, states)
+        one = super().regressor(q, v, a)
         if self._plain:
             return one
         columns = one.transpose(2, 1, 0)
@@ -67,6 +60,8 @@ class LoadCases(BaseModel):
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives of Σ weights · regressor by q, v, a, each (N, n); weights (N, all rows, b)."""
+        if self._plain:
+            return super().regressor_gradient(q, v, a, weights)
         parts = np.split(weights, len(self.loads), axis=1)
         return super().regressor_gradient(
             q, v, a, np.sum([part * mask for part, mask in zip(parts, self._masks)], axis=0)
@@ -81,17 +76,21 @@ class LoadCases(BaseModel):
         by_q, by_v, by_a = (np.sum(one, axis=0) for one in zip(*each))
         return by_q, by_v, by_a
 
+    def largest_torques(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the motor torques (N, n) of base parameters (b,), each of the load under which it is largest."""
+        torques = (self.regressor(q, v, a) @ values)[:, self.limited]  # (N, loads, n)
+        largest = np.abs(torques).argmax(axis=1, keepdims=True)
+        return np.take_along_axis(torques, largest, axis=1)[:, 0]
+
     @property
     def _plain(self) -> bool:
         return len(self.loads) == 1 and bool(self._masks[0].all())
 
-    @property
+    @cached_property
     def _masks(self) -> list[np.ndarray]:
         """Factors (b,) of each load: zero for columns of payloads that are absent."""
-        result = []
+        model, result = self.model, []
         for carried in self.loads:
-            factors = np.ones(self.model.p)
-            if carried is not None:
-                factors[: self.model.inertial] = self.model.carried_columns(carried)[: self.model.inertial]
-            result.append(factors[self.base.kept])
+            present = np.ones(model.inertial) if carried is None else model.carried_columns(carried)
+            result.append(np.append(present, np.ones(model.p - model.inertial))[self.base.kept])
         return result

@@ -67,9 +67,7 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
     parts, model = [], dynamics.exact
     for begin in range(0, len(track), BLOCK_ROWS):
         part = (np.ascontiguousarray(x[begin : begin + BLOCK_ROWS]) for x in (track.q, track.v, track.a))
-        torque = (model.regressor(*part) @ dynamics.values)[:, model.limited]  # (N, loads, n)
-        largest = np.abs(torque).argmax(axis=1, keepdims=True)
-        parts.append(np.take_along_axis(torque, largest, axis=1)[:, 0])
+        parts.append(model.largest_torques(dynamics.values, *part))
     return replace(track, tau=np.concatenate(parts))
 
 

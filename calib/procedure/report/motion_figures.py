@@ -67,7 +67,7 @@ def _motion_figure(designed: Designed) -> Chart:
         (values, *boxes.get(order, (-none, none))) for order, values in enumerate((motion.q, motion.v, motion.a))
     ]
     if model.values is not None:
-        torque = model.exact.regressor(motion.q, motion.v, motion.a) @ model.values
+        torque = model.exact.largest_torques(model.values, motion.q, motion.v, motion.a)
         rows.append((torque, -limits.torque, limits.torque))
     return _motion_sheet(motion.times, rows, designed.inputs.chain.joints)
 
