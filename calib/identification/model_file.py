@@ -56,7 +56,8 @@ from calib.errors import RobotError, refuse_option, refused_as
 from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.calibrated import ROBOT
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import forward
 from calib.units import TORQUE, per_ampere, without_gains
 
 MODEL = "dynamics.json"
@@ -109,6 +110,27 @@ def refuse_currents(folder: Path, task: str) -> None:
             f"torques are {without_gains(unit)}; {task} needs N m: state "
             "gains = [...] (N m/A) in the options file, or identify them with [gain_identification] (runs without and "
             "with a load of known mass), and run calib identify again",
+        )
+
+
+def refuse_other_arm(folder: Path, chain: Chain, max_miss: float = 0.05) -> None:
+    """Raise an error for an identification of another arm than `chain`.
+
+    `max_miss`: of the tip, as a share of the reach; arms of one type agree within a percent (our choice).
+
+    Raises:
+        UsageError: for another number of joints, or a tip elsewhere at the same joint values.
+        RobotError: where the folder's robot cannot be read.
+    """
+    theirs = description.read(folder / ROBOT)
+    if theirs.n != chain.n:
+        refuse_option(folder, f"is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}")
+    q = random_joints(chain, 20, 0)
+    tips = [forward(one, q)[:, :3, 3] for one in (chain, theirs)]
+    miss = float(np.median(np.linalg.norm(tips[0] - tips[1], axis=1)))
+    if miss > max_miss * float(np.linalg.norm(tips[0], axis=1).max()):
+        refuse_option(
+            folder, f"is of another robot ({theirs.name}): its tip is {miss:.3g} m from {chain.name}'s (median)"
         )
 
 

@@ -1,9 +1,6 @@
 """Designing exciting motions: the package `trajectories` gets a robot's regressor and limits.
 
-Its goals: ``raw=35``, ``normalised=6``: condition numbers; ``wrist=0.1``, ``joint6=0.1``: mean torque;
-``coverage=0.1``: speeds; ``duration=12``: the period [s], where ``--shortest`` leaves it free. ``logdet`` and
-``smallest``, without a number: the information's determinant, or its smallest singular value, is made as large as can
-be in place of condition numbers.
+Goals and aims are described in `calib.procedure.excitation.settings.ExcitationSettings`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -61,9 +58,8 @@ def objectives_of(
     Raises:
         UsageError: for two aims, or one together with the condition numbers that it replaces.
     """
-    errors_known = given.prior is not None and given.prior.sigmas is not None
     aims = [one for one in AIMS if one in settings.goals]
-    if not aims and not (errors_known and not settings.goals):
+    if not aims and not (given.errors_known and not settings.goals):
         if len(given.columns.aimed_names) == 1:
             raise UsageError("columns: a single parameter has no condition number; add --goal parameters")
         return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
@@ -275,10 +271,9 @@ def excite(
 ) -> Designed:
     """Design a motion that excites the dynamics of a robot within its limits.
 
-    Without goals the logarithms of both condition numbers, raw and normalised, are minimised in equal parts, or the
-    index that ``logdet`` or ``smallest`` name. With goals
-    (``wrist=0.1``) both take part with what a single-objective run reached as their goal (the study's advice), unless
-    they are given themselves.
+    Without goals the logarithms of both condition numbers, raw and normalised, are minimised in equal parts, or an aim
+    such as ``logdet`` alone. With goals (``wrist=0.1``) both take part with what a single-objective run reached as
+    their goal (the study's advice), unless they are given themselves.
 
     Args:
         robot, base, tip: see `calib.robot.library`.

@@ -20,7 +20,7 @@ from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of, require
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.identify_options import FileSettings
-from calib.identification.model_file import from_table, read_table, refuse_currents
+from calib.identification.model_file import from_table, read_table, refuse_currents, refuse_other_arm
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -28,10 +28,8 @@ from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
-from calib.robot import description
-from calib.robot.calibrated import ROBOT, CalibratedChain
-from calib.robot.chain import Chain, random_joints
-from calib.robot.kinematics import forward
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
 from trajectories.constraints import BoxLimit
 
 SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
@@ -63,7 +61,7 @@ class IdentifiableColumns:
 
     Attributes:
         columns: (c,) of the model's; None: all of them.
-        sigmas: (rows,) infinite for torque rows that are left out; None: all rows count.
+        sigmas: (rows,) by which torque rows are divided, see `PriorMotions`; infinite for rows left out; None: 1.
         names: of the columns; notes: what a user should know.
         chosen: (k,) of the model's, for which the motion is designed while the others are estimated, too; None: all.
     """
@@ -129,6 +127,11 @@ class ExcitationInputs:
     locked: Mapping[int, float | None]
     columns: IdentifiableColumns
     prior: PriorMotions | None
+
+    @property
+    def errors_known(self) -> bool:
+        """Whether an identification states the errors of the torques."""
+        return self.prior is not None and self.prior.sigmas is not None
 
 
 def read_inputs(
@@ -261,17 +264,13 @@ def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, li
 def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedModel:
     """Return the model of an identification's folder with the payloads of the loads, and its covariance."""
     refuse_currents(folder, "an excitation within torque limits")
+    refuse_other_arm(folder, chain)
     table = read_table(folder)
     try:
         found = from_table(chain, table)
         require(found.model.torque_rows.has_bodies, "rows 'drive' contain no information on the bodies", ValueError)
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        theirs = description.read(folder / ROBOT)
-        if theirs.n != chain.n:
-            message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
-            raise UsageError(message) from error
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
-    _require_same_arm(chain, folder)
     loads = _loads(texts, found.model, with_payloads=False)
     run = {label for carried in loads for label in carried or ()}
     values = dict(zip(found.model.names, found.values))
@@ -289,20 +288,6 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
-
-
-def _require_same_arm(chain: Chain, folder: Path, max_miss: float = 0.05) -> None:
-    """Raise an error for an identification of another arm: its tip is elsewhere, by a share of the reach.
-
-    `max_miss`: calibrated and nominal arms of one type agree within a percent (our choice).
-    """
-    theirs, q = description.read(folder / ROBOT), random_joints(chain, 20, 0)
-    tips = [forward(one, q)[:, :3, 3] for one in (chain, theirs)]
-    miss = float(np.median(np.linalg.norm(tips[0] - tips[1], axis=1)))
-    if miss > max_miss * float(np.linalg.norm(tips[0], axis=1).max()):
-        raise UsageError(
-            f"{folder} is of another robot ({theirs.name}): its tip is {miss:.3g} m from {chain.name}'s (median)"
-        )
 
 
 def excited_model(
@@ -431,9 +416,10 @@ def read_prior(
     if not paths and after is None:
         return None
     total, seconds, sigmas = np.zeros((len(model.exact.names),) * 2), 0.0, None
+    names, trained = [], ()
     if after is not None:
         total, sigmas = _known(after, model)
-    trained = () if after is None else tuple(IdentificationFolder(after).metrics().identification)
+        names, trained = ["what is identified"], tuple(IdentificationFolder(after).metrics().identification)
     for text in paths:
         if Path(text).name in trained:
             raise UsageError(f"existing {text}: {after} was identified from this recording; leave it out")
@@ -441,7 +427,7 @@ def read_prior(
         q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
         total += information(model.exact, q, v, a, sigmas) / rate
         seconds += len(q) / rate
-    return PriorMotions((*["what is identified"] * (after is not None), *map(str, paths)), seconds, total, sigmas)
+    return PriorMotions((*names, *paths), seconds, total, sigmas)
 
 
 def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ from calib.errors import RobotError, UsageError, require
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
-from calib.identification.model_file import read_dynamics, refuse_currents
+from calib.identification.model_file import read_dynamics, refuse_currents, refuse_other_arm
 from calib.identification.prediction import Dynamics
 from calib.identification.torque_errors import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits, check_bodies, read_motion_limits
@@ -288,8 +288,8 @@ def _law(
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
     """Return the dynamics of an identified model with the given payloads, and its uncertainty or None."""
     refuse_currents(folder, "a motion plan")
-    arm, dynamics = read_dynamics(folder)
-    require(arm.n == chain.n, f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}", UsageError)
+    refuse_other_arm(folder, chain)
+    dynamics = read_dynamics(folder)[1]
     model = dynamics.model
     known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):

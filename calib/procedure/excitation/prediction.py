@@ -121,7 +121,7 @@ def foretell(
     model, kept = given.model, given.columns.kept
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
     before, earlier = None, [None] * len(spread)
-    if _errors_known(given):
+    if given.errors_known:
         root = _root(_known(given))
         before, earlier = _torque_sigma(given, task, root)[1], np.linalg.norm(root, axis=1).tolist()
     parts = given.columns.names, np.array(model.exact.units)[kept].tolist(), values[kept].tolist(), spread.tolist()
@@ -131,10 +131,6 @@ def foretell(
         known_rsd = 100.0 * sigma / abs(value) if known else None
         rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd, sigma_before))
     return MotionOutlook(share, sigmas, own, tuple(others), before), rows
-
-
-def _errors_known(given: ExcitationInputs) -> bool:
-    return given.prior is not None and given.prior.sigmas is not None
 
 
 def _known(given: ExcitationInputs) -> np.ndarray:
@@ -179,7 +175,7 @@ def _prediction(
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     rows, sigmas = 2.0 * _band(motion, period) * period * repeat, given.columns.sigmas
-    if sigmas is None or not _errors_known(given):
+    if sigmas is None or not given.errors_known:
         sigmas = noise[given.model.exact.joint_of_row] * (1.0 if sigmas is None else sigmas)
         weight, earlier = rows / PERIOD_SAMPLES, np.zeros((0, task.shape[2]))
     else:

@@ -24,6 +24,7 @@ from calib.procedure.excitation import coefficients, design
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.inputs import identifiable, read_inputs, read_model, read_prior
 from calib.procedure.excitation.limits import Points, read_motion_limits
+from calib.procedure.excitation.planning import plan
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.kinematics import forward
 from trajectories.basis import SampledMotion
@@ -403,6 +404,19 @@ def test_designs_for_predicted_sigmas_predict_smaller_ones():
     assert torque["torque",] < torque[()] and rsd["parameters",] < rsd[()]
     with pytest.raises(UsageError, match="needs masses, or a model"):
         design.excite("ur10e", replace(SHORT, goals=("parameters",)))
+
+
+def test_an_identification_of_another_arm_is_refused(tmp_path):
+    """Of as many joints, for motions to excite and to plan alike; no search begins."""
+    write_model(tmp_path)
+    way = np.zeros((2, 7)) + [[0.0], [0.1]]
+    for use in (
+        lambda: read_inputs("panda", SHORT, model=tmp_path),
+        lambda: read_inputs("panda", SHORT, after=tmp_path),
+        lambda: plan("panda", way, model=tmp_path, limits={"acceleration": {"all": 5.0}}),
+    ):
+        with pytest.raises(UsageError, match="is of another robot"):
+            use()
 
 
 def test_a_goal_out_of_reach_is_named():
