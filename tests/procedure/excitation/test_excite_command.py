@@ -409,7 +409,7 @@ def test_designs_for_predicted_sigmas_predict_smaller_ones():
 def test_an_identification_of_another_arm_is_refused(tmp_path):
     """Of as many joints, for motions to excite and to plan alike; no search begins."""
     write_model(tmp_path)
-    way = np.zeros((2, 7)) + [[0.0], [0.1]]
+    way = np.linspace(np.zeros(7), np.full(7, 0.1), 2)
     for use in (
         lambda: read_inputs("panda", SHORT, model=tmp_path),
         lambda: read_inputs("panda", SHORT, after=tmp_path),
