@@ -206,16 +206,17 @@ def identify_instrumental(
             f"instruments from simulation need a recording with its reference, and rows motor, link or both; found "
             f"'{rows.name}'"
         )
-    plain = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
-    first = pool(triangulate(plain), model.rows)
-    loads = base.to_standard(wls(first, settled_std(first, 1e-3)).estimate.values) if terms else None
-    friction = Friction(tuple(terms), model, decimator, loads)
-    observed = [friction.added(part, case) for part, (case, _) in zip(plain, cases)]
+    observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
+    data, friction = pool(triangulate(observed), model.rows), _Friction((), model, decimator, None)
+    if terms:
+        loads = base.to_standard(wls(data, settled_std(data, 1e-3)).estimate.values)
+        friction = _Friction(tuple(terms), model, decimator, loads)
+        observed = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
+        data = pool(triangulate(observed), model.rows)
     if constraints is None and positive:
         settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
     task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints, friction)
-    data = pool(triangulate(observed), model.rows)
     ordinary = wls(data, settled_std(data, 1e-3))
     plant, std = _regular(model, friction.terms, cases[0][1], inertia), ordinary.group_std
     before: LinearFit | None = None
@@ -241,7 +242,7 @@ def identify_instrumental(
 
 
 @dataclass(frozen=True, eq=False)
-class Friction:
+class _Friction:
     """Richer friction of a model: its terms, and the standard parameters (p,) from which joint loads are computed."""
 
     terms: tuple[DriveTerm, ...]
@@ -269,7 +270,7 @@ class _Fixed:
     observed: Sequence[ObservationRows]
     estimator: _RoundEstimator
     constraints: Constraints | None
-    friction: Friction
+    friction: _Friction
 
     def after(self, found: _Found) -> _Fixed:
         """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
