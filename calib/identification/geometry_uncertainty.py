@@ -18,8 +18,12 @@ frames. The coefficients of T printed with an estimate are those of T(ĝ); that 
 interval of φ*, for the estimate never uses them.
 
 Not part of S: the weights' and the prior's own dependence on g, and that of load-dependent friction's columns (which
-rest on the fitted torque, and that hardly changes with g). For methods other than OLS and WLS the sensitivity is that
-of WLS with their residuals' spread.
+rest on the fitted torque, and that hardly changes with g). With instruments Z, Zᵀ R⁻¹ (y - W φ) = 0 gives
+
+    dφ/dg_k = -(Zᵀ R⁻¹ W)⁻¹ Zᵀ R⁻¹ (∂W/∂g_k) φ    [+ (Zᵀ R⁻¹ W)⁻¹ (dZ/dg_k)ᵀ R⁻¹ (y - W φ)],
+
+the bracket left out: it vanishes with the residual, and in the mean, since no function of the reference is correlated
+with the noise. (`didim`: W is Z.) For other methods the sensitivity is that of WLS with their residuals' spread.
 
 `compare` adds one identification on two geometries, the nominal and the calibrated one, from the same torques.
 """
@@ -235,7 +239,9 @@ def sensitivity(
     pulled = np.zeros((p, count))
     used: list[ObservationRows] = []
     changes: list[np.ndarray] = []
-    for part, case in zip(found.rows, cases):
+    instruments: list[np.ndarray] = []
+    own_rows = found.fitted.instruments or tuple((case, part, None) for part, case in zip(found.rows, cases))
+    for case, part, z in own_rows:
         for number, (own, span) in enumerate(_pieces(case, decimator, step)):
             say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
             used.append(cut(part, own))
@@ -244,13 +250,19 @@ def sensitivity(
             change, pull = _differences(found, moved, case, span, weighed, decimator)
             changes.append(change)
             pulled[: found.base.b] += pull
+            instruments += [] if z is None else [z[own].reshape(-1, p)]
     matrix, scale = (np.concatenate(x) for x in zip(*[(stacked(part), weights(how, part)) for part in used]))
     change = np.concatenate([x.reshape(-1, count) for x in changes])
-    share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for part in found.rows))
+    share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for _, part, _ in own_rows))
     known = np.sqrt(share) * np.hstack([how.beforehand, np.zeros((len(how.beforehand), count))])
-    factor = retriangulate(np.vstack([known, np.hstack([matrix, change]) * scale[:, None]]))
-    inverse = inverted(factor[:p, :p])
-    solved = inverse @ (inverse.T @ pulled - factor[:p, p:])
+    if instruments:
+        factor = retriangulate(np.hstack([np.concatenate(instruments), matrix, change]) * scale[:, None])[:p, p:]
+        unit = np.linalg.norm(factor[:, :p], axis=0)
+        solved = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
+    else:
+        factor = retriangulate(np.vstack([known, np.hstack([matrix, change]) * scale[:, None]]))
+        inverse = inverted(factor[:p, :p])
+        solved = inverse @ (inverse.T @ pulled - factor[:p, p:])
     seen = scale > 0.0
     after = change + matrix @ solved
     return solved, _rms(change[seen]), _rms(after[seen])

@@ -118,6 +118,8 @@ class MethodEstimate:
         failure: reason for a missing solution, and advice.
         held: the constraints and which of them bind, for a method with constraints.
         alone: whether only values and covariance describe it, because least squares of `pooled` differs.
+        instruments: of a method with instruments, by recording: the case whose motion W is of, its rows, and Z as
+            `ObservationRows.matrix`; () for the others.
     """
 
     method: str
@@ -134,6 +136,7 @@ class MethodEstimate:
     failure: Unidentifiable | NotConverged | None = None
     held: Held | None = None
     alone: bool = False
+    instruments: tuple[tuple[Case, ObservationRows, np.ndarray], ...] = ()
 
     @property
     def found(self) -> bool:

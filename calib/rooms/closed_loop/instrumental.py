@@ -98,6 +98,7 @@ class Instrumental:
         constrained: the constrained estimate, if constraints are set; `fit` has its values and covariance.
         problem: triangles of [Z W y], one group per torque row.
         estimator: estimator used in each iteration.
+        rows: by recording, the case whose motion W is of, its rows, and Z.
     """
 
     fit: LinearFit
@@ -113,6 +114,7 @@ class Instrumental:
     constrained: Held | None
     problem: Instruments
     estimator: _RoundEstimator
+    rows: tuple[tuple[Case, ObservationRows, np.ndarray], ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -355,9 +357,13 @@ def _result(
     fit, bound = _held_fit(task, problem, std, found.tau)
     verdict = instrumental_variables.exogeneity(problem, std, found.tau)
     strength = instrumental_variables.strength(problem, std)
+    rows = zip((case for (case, _), _ in runs), found.observed, found.simulated)
+    if not task.estimator.measured:
+        moved = (simulated_case(case, run, loop) for (case, loop), run in runs)
+        rows = ((case, replace(own, matrix=z), z) for case, own, z in zip(moved, found.observed, found.simulated))
     return Instrumental(
         fit, ordinary, plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
-        _distance(runs), _stray(runs), bound, problem, task.estimator,
+        _distance(runs), _stray(runs), bound, problem, task.estimator, tuple(rows),
     )  # fmt: skip
 
 

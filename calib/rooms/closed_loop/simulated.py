@@ -95,7 +95,7 @@ class _Simulated(Method):
             result = replace(
                 plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
                 simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
-                held=found.constrained,
+                held=found.constrained, instruments=found.rows,
             )  # fmt: skip
             return LoopEstimate(**{**vars(result), "loops": loops, "instrumental": found})
 
