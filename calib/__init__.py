@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib.api.dynamic import DynamicsModel, identify_dynamics, methods
     from calib.api.exporting import export, validate
-    from calib.api.kinematic import GeometryFit, JointCommands, PoseSelection, compensate, fit_geometry, select_poses
+    from calib.api.kinematic import GeometryFit, PoseSelection, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
     from calib.errors import CalibError
@@ -33,17 +33,19 @@ if TYPE_CHECKING:
     from calib.procedure.session.commands import new_session
     from calib.procedure.session.fleet import run_sessions
     from calib.robot.calibrated import CalibratedChain
+    from calib.rooms.compensation.api import JointCommands, compensate
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
 _HOMES = {
     "api.reading": ("load", "read_poses", "read_recording"),
-    "api.kinematic": ("select_poses", "fit_geometry", "compensate", "PoseSelection", "GeometryFit", "JointCommands"),
+    "api.kinematic": ("select_poses", "fit_geometry", "PoseSelection", "GeometryFit"),
     "api.motions": ("design_excitation", "plan_motion", "ExcitationDesign", "MotionPlan"),
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
     "api.exporting": ("validate", "export"),
     "procedure.session.commands": ("new_session",),
     "procedure.session.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
+    "rooms.compensation.api": ("compensate", "JointCommands"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
     "identification.identify_options": ("IdentifySettings",),

@@ -125,9 +125,12 @@ def test_the_walker_sees_every_form_of_import():
 
 
 def test_no_core_module_names_a_room():
-    core = {path: path.read_text(encoding="utf-8") for path in SOURCES if path.parts[len(ROOT.parts) + 1] != "rooms"}
-    naming = [path for path, text in core.items() if "import calib.rooms" in text or "from calib.rooms" in text]
-    assert naming == []
+    """Except the list of what `import calib` offers, whose entries are loaded when first used."""
+    others = [
+        path for path in SOURCES if path.parts[len(ROOT.parts) + 1] != "rooms" and path != ROOT / "calib/__init__.py"
+    ]
+    core = {path: path.read_text(encoding="utf-8") for path in others}
+    assert [path for path in core if re.search(r"(import|from) calib\.rooms", path.read_text(encoding="utf-8"))] == []
 
 
 def test_the_rooms_can_be_shut(monkeypatch):

@@ -11,21 +11,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Judged, Progress, data_frame, listed, optional, progress_shown, saved
+from calib.api.rendering import Judged, Progress, data_frame, listed, optional, progress_shown
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.pose_lists import Targets, read_targets
-from calib.errors import CalibError, UsageError, as_ours
+from calib.errors import UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.geometry.observation import pose_sigmas
-from calib.procedure.kinematic_stage import compensation, fit, folder, inputs, selection
+from calib.procedure.kinematic_stage import fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
-from calib.procedure.robot_kinds import Mechanism, joints_of, stage_of
+from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import plain, shaped
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
@@ -202,25 +201,6 @@ class GeometryFit(Judged, fit.Outcome):
         return f"<GeometryFit of {self.robot.chain.name}: model {self.selection.chosen}, {self.verdict.level}>"
 
 
-class JointCommands(compensation.Commands):
-    """Joint commands that move the real tool to nominal targets. ``print`` says what is reached and how well."""
-
-    @checked
-    def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the joint commands as CSV; with `partial`, also if some targets were not reached.
-
-        A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
-        """
-        with files.results([(Path(path), (".csv",))], overwrite=overwrite):
-            return compensation.write(self, Path(path), partial)
-
-    def __repr__(self) -> str:
-        return f"<JointCommands: {int(self.reached.sum())} of {len(self.q)} targets reached>"
-
-    def __str__(self) -> str:
-        return "\n".join(compensation.lines(self))
-
-
 @checked
 def select_poses(
     robot: str | Path | CalibratedChain,
@@ -312,58 +292,3 @@ def fit_geometry(
     if on_read is not None:
         on_read(given)
     return GeometryFit(**vars(fit.run(given, chosen, settings, progress, expected or None)))
-
-
-def read_fitted(folder: str | Path) -> compensation.Fitted:
-    """Return the fitted arm with its instrument and tools from a fit's folder.
-
-    Raises:
-        UsageError: where it is none, lacks something, or is of a parallel robot.
-    """
-    try:
-        return compensation.read(folder)
-    except CalibError:  # looked at again only where reading failed
-        stage_of(folder, "compensation")
-        raise
-
-
-@checked
-def compensate(
-    fitted: GeometryFit | compensation.Fitted | str | Path,
-    targets: Targets | str | Path | np.ndarray,
-    *,
-    frame: str = "base",
-    tool: str = "flange",
-    dof: int | None = None,
-    start: Sequence[float] | None = None,
-    tolerance: tuple[float, float] = compensation.TOLERANCE,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> JointCommands:
-    """Compute the joint commands that move the real tool to nominal targets.
-
-    Args:
-        fitted: a fit, the folder of one, or what was read of it.
-        targets: CSV file (``calib formats targets``), targets in memory, or an array: poses (m, 4, 4) [m], or nominal
-            joint values (m, n) [rad or m].
-        frame: what the targets are in: ``base`` of the calibrated robot, ``nominal``, or a station's name.
-        tool: what stands there: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` [m, rad].
-        dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only; None: as the targets say.
-        start: (n,) joint values [rad or m] near which targets without joints are sought.
-        tolerance: what a command may leave by the calibrated model [m], [rad].
-        seed: of the starts for targets without joints.
-        progress: called with a few words now and then.
-    """
-    if isinstance(fitted, compensation.Fitted):
-        found = fitted
-    else:
-        with saved(fitted) as place:
-            found = read_fitted(place)
-    chain = found.nominal.chain
-    if isinstance(targets, str | Path):
-        targets = read_targets(targets, joints_of(chain))
-    commands = compensation.compensate(
-        found, Targets.of(targets), frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed,
-        progress=progress_shown(progress),
-    )  # fmt: skip
-    return JointCommands(**vars(commands))

@@ -14,10 +14,6 @@ TOPICS: Mapping[str, tuple[str, str]] = {
         "CSV files of measured poses, positions, distances",
         "calib.data.poses.pose_files calib.data.poses.robodk",
     ),
-    "targets": (
-        "targets of calib compensate, and the commands it writes",
-        "calib.data.poses.pose_lists calib.procedure.kinematic_stage.compensation",
-    ),
     "options": ("the TOML file of calib fit --options", "calib.data.poses.fit_options"),
     "identify-options": (
         "the TOML file of calib identify --options",

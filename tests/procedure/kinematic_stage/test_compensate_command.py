@@ -16,12 +16,13 @@ from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
 from calib.geometry.observation import layout
 from calib.procedure.findings import catalogue
-from calib.procedure.kinematic_stage import compensation, inputs
+from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.kinematics import forward
 from calib.robot.library import load
 from calib.rooms.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.rooms.cells.virtual_cells import perturbed_cell
+from calib.rooms.compensation import joint_commands
 from calib.transforms import from_quaternion, from_xyz_rpy, rotation_vector, to_quaternion
 
 SIGMA = 20e-6
@@ -138,12 +139,12 @@ def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(c
     ("first", "code"), [(0.5, "expected-as-unseen"), (3.1, "expected-beyond-range")], ids=["inside", "outside"]
 )
 def test_without_an_error_model_and_orientations_it_is_said(cell, fitted, here, first, code):
-    given = compensation.read(fitted)
+    given = joint_commands.read(fitted)
     table = layout(given.cell)
     kept = [not table.names[k].endswith((".rx", ".ry", ".rz")) for k in given.free]
     known = dict(free=given.free[kept], covariance=given.covariance[np.ix_(kept, kept)], discrepancy=None)
-    found = compensation.compensate(replace(given, **known), Targets(np.array([[first, -1.2, 1.3, 0.4, 0.9, 0.2]])))
-    said = " ".join(compensation.lines(found))
+    found = joint_commands.computed(replace(given, **known), Targets(np.array([[first, -1.2, 1.3, 0.4, 0.9, 0.2]])))
+    said = " ".join(joint_commands.lines(found))
     assert "no orientations were measured" in said and catalogue()[code].says.split(":")[0] in said
 
 
@@ -154,8 +155,8 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     out = commanded(calib, fitted)
     assert "base frame of the calibrated robot" in out and "tool 'flange'" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
-    found = compensation.read(fitted)
-    goal = Goal(compensation.placements(found)[1], torques=found.torques)
+    found = joint_commands.read(fitted)
+    goal = Goal(joint_commands.placements(found)[1], torques=found.torques)
     at = inverse.seen_at(goal, sent).poses()
     position, turn = off(at, forward(cell.nominal, q))
     assert position < 1e-7 and turn < 1e-7
@@ -311,13 +312,13 @@ def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done", "--no-plots"]
     assert cli.run([str(each) for each in arguments]) == 0
     unseen = inputs.gather(robot, [file], settings=FitSettings(holdout=share)).unseen[file.name].block
-    fitted = compensation.read(tmp_path / "done")
+    fitted = joint_commands.read(tmp_path / "done")
     turns = from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3] if isinstance(unseen, Poses) else None
     targets = Targets(unseen.q, unseen.position, turns, file=file.name)
-    found = compensation.compensate(
+    found = joint_commands.computed(
         fitted, targets, frame=unseen.station, tool=unseen.tool_names[0], tolerance=(1e-6, 1e-5)
     )
-    arms = compensation.placements(fitted, unseen.station, unseen.tool_names[0])
+    arms = joint_commands.placements(fitted, unseen.station, unseen.tool_names[0])
     ruler = Goal(replace(arms[0], tools=arms[1].tools))
     stood = inverse.seen_at(ruler, unseen.q).poses()
     off = {

@@ -203,7 +203,7 @@ def _tool(cell: Installation, tool: str) -> np.ndarray:
     return from_xyz_rpy(values[:3], values[3:] or [0.0, 0.0, 0.0])
 
 
-def compensate(
+def computed(
     fitted: Fitted,
     targets: Targets,
     *,
