@@ -1,153 +1,156 @@
-"""Least squares by two neural networks: Widrow's adaptive linear neuron, and Hopfield and Tank's recurrent one.
+"""Least squares by two neural networks, as the survey has them: an adaptive linear neuron, and a Hopfield-Tank network.
 
-Both come to rest at the minimum of ‖R⁻¹ (y - W x)‖²; what they add to it is that data are seen sample by sample, or
-that parameters stay within stated bounds. Their noise of training is in the covariance.
+Both go towards the minimum of ‖y - W x‖², ordinary least squares, by gradients that are not scaled, for a set number of
+steps, and do not arrive where W is badly conditioned: slow directions stay near the start. Both start from the
+problem's start values, or from zero without any. What remains between them and ordinary least squares, d = x - x_ols,
+is their error of training: the covariance is that of x_ols plus d dᵀ (an efficient estimate is uncorrelated with what
+another one differs by: Hausman 1978).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.errors import NotConverged
-from calib.estimation.linear import LinearFit, wls
-from calib.estimation.triangles import Triangles, combine, solve_triangle
+from calib.errors import NotConverged, require
+from calib.estimation.linear import LinearFit, ols
+from calib.estimation.triangles import combine
 from calib.identification.methods.least_squares import weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.rooms.alternatives.estimators import samples_of
 from calib.rooms.alternatives.samples import Samples
 
-EPOCHS = 60  # at most
+STEPS = 10_000  # of either network, as the survey's
 
 
-def adaline(
-    data: Samples, triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, seed: int = 0
-) -> tuple[LinearFit, int]:
-    """Return the estimate of an adaptive linear neuron, trained in random order, and the number of epochs.
+def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = STEPS, seed: int = 0) -> np.ndarray:
+    """Return the weights x (p,) of an adaptive linear neuron after `steps` samples in random order.
 
-        w ← w + μ_k Z_kᵀ (y_k - Z_k w),    Z_k = R⁻¹ W_k T,    x = T w
+        x ← x + η (rᵀ r) / ‖W_k r‖² r,    r = W_kᵀ (y_k - W_k x)
 
-    with T such that the inputs are uncorrelated and of unit power, and μ_k = 1 / (epoch² mean ‖Z‖²), at most
-    1 / ‖Z_k‖²: LMS with Newton's direction (Widrow & Hoff 1960; Widrow & Stearns 1985, chapter 8). The estimate is the
-    mean of the last epoch's weights (Polyak & Juditsky 1992); its distance from the minimum is added to the covariance.
+    stochastic gradients with a line search for each sample (Widrow & Hoff 1960; Leboutet et al. 2021): the
+    last samples decide, and the weights keep moving with the noise.
 
     Args:
-        data: samples.
-        triangles: of the same rows, one group per row of a sample.
-        std, inflation: (n,) of the rows, see `linear.wls`.
-
-    Raises:
-        NotConverged: with the last `LinearFit`.
+        data: N samples.
+        start: (p,).
+        rate: η; 1 minimises a sample's residual along its gradient.
+        steps: samples seen; each once before any comes back.
     """
-    fit, factor, p = wls(triangles, std, inflation), combine(triangles, std), triangles.parameters
-    rows, size = np.where(data.present, 1.0 / std, 0.0), np.sqrt(data.present.sum())
-    inverse = size * solve_triangle(factor, data.names)[1]
-    inputs, target = (rows[:, :, None] * data.matrix) @ inverse, rows * data.target
-    power = np.maximum(np.sum(inputs**2, axis=(1, 2)), 1e-300)
-    rng, weights = np.random.default_rng(seed), np.zeros(p)
-    max_away = 0.1  # standard deviations from the minimum, rms over parameters, at which training may end
-    for epoch in range(1, EPOCHS + 1):
-        mean, steps = np.zeros(p), np.minimum(1.0 / power, 1.0 / (epoch**2 * power.mean()))
-        for k in rng.permutation(len(target)):
-            own = inputs[k]
-            weights = weights + steps[k] * ((target[k] - own @ weights) @ own)
-            mean += weights
-        values = inverse @ mean / len(target)
-        away = float(np.sqrt(np.mean((factor[:p, :p] @ values - factor[:p, p]) ** 2)))
-        trained = replace(fit.estimate, values=values)
-        if away < max_away:
-            excess = fit.estimate.covariance + (away / size) ** 2 * inverse @ inverse.T
-            return replace(fit, estimate=replace(trained, covariance=excess)), epoch
-    raise NotConverged(
-        f"the neuron is {away:.2g} standard deviations from rest after {EPOCHS} epochs: few samples for so many "
-        "parameters, or samples that do not fit",
-        replace(fit, estimate=trained),
-    )
+    matrix = np.where(data.present[:, :, None], data.matrix, 0.0)
+    target = np.where(data.present, data.target, 0.0)
+    rng, x = np.random.default_rng(seed), np.array(start, dtype=float)
+    rounds = -(-steps // len(target))
+    with np.errstate(over="ignore", invalid="ignore"):  # of a rate that diverges
+        for k in np.concatenate([rng.permutation(len(target)) for _ in range(rounds)])[:steps]:
+            slope = (target[k] - matrix[k] @ x) @ matrix[k]
+            moved = matrix[k] @ slope
+            if size := moved @ moved:
+                x += rate * (slope @ slope) / size * slope
+    return x
 
 
 def hopfield(
-    triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, bound: np.ndarray | None = None
-) -> tuple[LinearFit, int]:
-    """Return the estimate of a Hopfield-Tank network of p neurons in equilibrium, and the number of steps.
+    factor: np.ndarray, start: np.ndarray, bound: float, rate: float = 1.0, steps: int = STEPS
+) -> tuple[np.ndarray, int]:  # fmt: skip
+    """Return the outputs x (p,) of a Hopfield-Tank network, and the number of steps until it rests, at most `steps`.
 
-        u̇ = -∂E/∂x = -(Wᵀ R⁻¹ W x - Wᵀ R⁻¹ y),    x_i = α_i tanh(u_i / α_i),    E = ½ ‖R^(-½) (y - W x)‖²
+        u̇ = -Wᵀ W x + Wᵀ y,    x = α tanh(u / 5)
 
-    (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004), E falling all the way. The equation is stiff by the square
-    of the condition number; it is integrated by the linearly implicit Euler form with steps that grow as E settles, in
-    units in which the columns have unit norm.
+    by Euler steps (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004; Leboutet et al. 2021). At rest x is ordinary
+    least squares, if no neuron saturates. The survey tunes the step by robot, 3e-8 to 1e-6; here it is half of what is
+    stable, times `rate` (our choice).
 
     Args:
-        triangles: of the rows, one group per standard deviation.
-        std, inflation: (g,), see `linear.wls`.
-        bound: α (p,), what no parameter exceeds; None: `box` times what one column needs to explain all torques.
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] of [W y], not weighted.
+        start: (p,) of x.
+        bound: α, above all |x|.
 
     Raises:
-        NotConverged: where a neuron saturates, so that x is a bound and no estimate, or after `max_steps`.
+        NotConverged: where a neuron saturates: x is then a bound and no estimate.
     """
-    fit = wls(triangles, std, inflation)
-    factor = combine(triangles, std)
-    p = triangles.parameters
-    norms = np.linalg.norm(factor[:p, :p], axis=0)
-    upper, target = factor[:p, :p] / norms, factor[:p, p]
-    box = 30.0  # times the parameter that explains all torques by one column: no estimate is near it
-    reach = np.full(p, box * np.linalg.norm(target)) if bound is None else np.asarray(bound, dtype=float) * norms
-    inner, step = np.zeros(p), 1.0
-    max_rest = 1e-3  # standard deviations from the equilibrium
-    max_steps = 200
-    for count in range(1, max_steps + 1):
-        outer = reach * np.tanh(inner / reach)
-        rest = upper @ outer - target
-        if np.linalg.norm(rest) < max_rest:
-            return replace(fit, estimate=replace(fit.estimate, values=outer / norms)), count
-        while True:
-            gain = 1.0 - (outer / reach) ** 2
-            moved = inner - np.linalg.solve(np.eye(p) / step + (upper.T @ upper) * gain, upper.T @ rest)
-            energy = np.linalg.norm(upper @ (reach * np.tanh(moved / reach)) - target)
-            if energy < np.linalg.norm(rest) or step < 1e-12:
-                break
-            step *= 0.25
-        if step < 1e-12:
-            break
-        inner, step = moved, 4.0 * step
-    saturation = 0.9  # of the box
-    saturated = [name for name, x, most in zip(triangles.names, outer, reach) if abs(x) > saturation * most]
-    cause = f"neurons saturate: {', '.join(saturated[:5])}; widen their bounds" if saturated else "it has not settled"
-    raise NotConverged(f"the network after {count} steps: {cause}", outer / norms)
-
-
-Train = Callable[[IdentificationProblem, np.ndarray, np.ndarray], tuple[LinearFit, int]]
+    p = len(start)
+    weights, bias = factor[:p, :p].T @ factor[:p, :p], factor[:p, :p].T @ factor[:p, p]
+    width = 5.0  # of the sigmoid, as the survey's
+    step = rate * width / bound / np.linalg.norm(factor[:p, :p], 2) ** 2
+    u = width * np.arctanh(np.asarray(start) / bound)
+    x, count = np.asarray(start, dtype=float), 0
+    max_rest = 1e-9  # of the first slope
+    slope = first = bias - weights @ x
+    while np.linalg.norm(slope) > max_rest * np.linalg.norm(first) and count < steps:
+        u += step * slope
+        x = bound * np.tanh(u / width)
+        slope, count = bias - weights @ x, count + 1
+    saturation = 0.95  # of α
+    full = np.flatnonzero(np.abs(x) > saturation * bound)
+    numbers = ", ".join(str(k + 1) for k in full[:5])
+    require(not len(full), f"neurons saturate at {bound:.3g}: parameters {numbers}", NotConverged)
+    return x, count
 
 
 @dataclass(frozen=True)
 class _Network(Method):
-    """Identification by a neural network that converges to weighted least squares.
+    """Identification by a network trained towards ordinary least squares.
 
     Attributes:
-        train: the problem, (rows,) standard deviations and inflation to the fit, and the number of rounds.
+        rate: step, times the survey's (adaline) or half the stable one (hopfield).
+        steps: at most.
     """
 
-    train: Train
+    tunes: tuple[str, ...] = field(default=("learning rate", f"{STEPS:,} steps"), kw_only=True)
+    version: int = field(default=2, kw_only=True)
+    rate: float = 1.0
+    steps: int = STEPS
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the trained network; its covariance includes the noise of training."""
+        """Return the estimate of the trained network; its covariance includes the error of training."""
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        pooled = problem.pooled
         std, tau = weighed(problem)
-        fit, rounds = self.train(problem, std, tau)
-        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, iterations=rounds)
+        fit = ols(pooled, tau)
+        start = np.zeros(pooled.parameters) if problem.start is None else problem.start
+        values, count = self.trained(problem, start)
+        require(
+            np.isfinite(values).all(), f"the network diverges: take a smaller rate than {self.rate:g}", NotConverged
+        )
+        found = _off(fit, values, np.sqrt(pooled.residual_squares(values) / pooled.rows))
+        return MethodEstimate(
+            self.name, EstimateStatus.FOUND, found, pooled, std, tau, False, iterations=count, alone=True
+        )  # fmt: skip
+
+    def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return the network's weights (p,) from a start, and its steps."""
+        raise NotImplementedError
 
 
-_LIKE_WLS = "torque noise of each joint from its residuals; q, v and a exact"
-ADALINE = _Network(
-    "adaline", f"{_LIKE_WLS}; samples in random order",
-    lambda problem, std, tau: adaline(samples_of(problem), problem.pooled, std, tau),
-    description="adaptive linear neuron, trained sample by sample",
-    source="Widrow & Hoff 1960; Widrow & Stearns 1985", tunes=("decay of the learning rate", "60 epochs"),
+class _Adaline(_Network):
+    def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
+        return adaline(samples_of(problem), start, self.rate, self.steps), self.steps
+
+
+class _Hopfield(_Network):
+    def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
+        factor = combine(problem.pooled)
+        largest = float(np.abs(start).max())
+        if not largest:  # without start values: what the weakest column needs to explain all torques
+            largest = float((np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)).max())
+        return hopfield(factor, start, 1.5 * largest, self.rate, self.steps)
+
+
+def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit:
+    """Return a fit moved to other values, by the distance less certain."""
+    away = values - fit.estimate.values
+    covariance = fit.estimate.covariance + np.outer(away, away)
+    return replace(fit, estimate=replace(fit.estimate, values=values, covariance=covariance), group_std=group_std)
+
+
+_LIKE_OLS = "the torques of all joints are equally noisy; q, v and a exact; enough steps"
+ADALINE = _Adaline(
+    "adaline", f"{_LIKE_OLS}; samples in random order",
+    description="adaptive linear neuron: stochastic gradients", source="Widrow & Hoff 1960; Leboutet et al. 2021",
 )  # fmt: skip
-HOPFIELD = _Network(
-    "hopfield", f"{_LIKE_WLS}; no parameter is near the bound of its neuron",
-    lambda problem, std, tau: hopfield(problem.pooled, std, tau),
-    description="Hopfield-Tank network at rest", source="Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
-    tunes=("bounds of its neurons", "200 steps"),
+HOPFIELD = _Hopfield(
+    "hopfield", f"{_LIKE_OLS}; no parameter is above 1.5 times the largest start value",
+    description="Hopfield-Tank network, Euler steps", source="Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
 )  # fmt: skip
