@@ -29,6 +29,7 @@ from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, fi
 from calib.estimation.estimate import Estimate
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, check_target, write_covariance, write_staged
 from calib.procedure.findings import Verdict
+from calib.procedure.kinematic_stage.folder import RESIDUALS
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import ROBOT
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
     from calib.procedure.report.page import Section
 
 READ = ("holdout", "tolerance", "seed")  # of the settings
-FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE)
+FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, RESIDUALS)
 HEADER = ("name", "unit", "value", "sigma")
 
 
@@ -64,6 +65,7 @@ class ParallelFit(Judged):
         own: errors on the fitted rows, nominal and calibrated (2, m, k): platform coordinates; or what encoders
             contradict each other by.
         unseen: the same of unseen rows, by name.
+        kept: the unseen rows themselves, by name, but those of a cross-validation.
         settings: what was asked for.
     """
 
@@ -73,6 +75,7 @@ class ParallelFit(Judged):
     found: LoopFit
     own: np.ndarray
     unseen: Mapping[str, np.ndarray]
+    kept: Mapping[str, np.ndarray]
     settings: FitSettings
 
     @property
@@ -135,6 +138,7 @@ class ParallelFit(Judged):
             parallel_robot.write(folder / ROBOT, self.robot.chain, words, read)
             files.write_table(folder / ESTIMATE, HEADER, list(self._table()))
             write_covariance(folder / COVARIANCE, found.names, found.covariance)
+            files.write_table(folder / RESIDUALS, *self._residuals())
             files.write_json(folder / METRICS, self.to_dict())
 
         check_fit_target(Path(out), [self.nominal.source])
@@ -143,6 +147,23 @@ class ParallelFit(Judged):
     def _table(self) -> Iterator[tuple[str, str, float, float]]:
         found = self.estimate
         return zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
+
+    def _residuals(self) -> tuple[list[str], list[list[object]]]:
+        """Return header and rows of ``residuals.csv``: readings, measured coordinates, and errors of both robots."""
+        robot, scale, rows = self.nominal.chain, np.ones(self.own.shape[2]), []
+        head = ["set", *(f"{joint.name} [{joint.unit}]" for joint in robot.joints)]
+        if self.measured:
+            scale = np.where(robot.selected < 3, 1e3, np.degrees(1.0))
+            named = [f"{name} [{'mm' if k < 3 else 'deg'}]" for name, k in zip(robot.freedom, robot.selected)]
+            head += [*named, *(f"d{name}" for name in named), *(f"nominal d{name}" for name in named)]
+        else:
+            head += [*self.columns, *(f"nominal {name}" for name in self.columns)]
+        parts = {"fit": (self.rows, self.own)} | {name: (own, self.unseen[name]) for name, own in self.kept.items()}
+        for name, (given, (before, after)) in parts.items():
+            readings, coordinates = given[:, : robot.n], scale * given[:, robot.n :]
+            table = np.hstack([readings, coordinates, scale * after, scale * before])
+            rows += [[name, *row] for row in table.tolist()]
+        return head, rows
 
     def to_dataframe(self) -> Any:
         """Return the estimate as a pandas DataFrame: name, unit, value, sigma."""
@@ -186,10 +207,11 @@ class ParallelFit(Judged):
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
         """Return the same fit with a verdict on additional unseen files, without refitting."""
         validate = _paths(unseen)
-        proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
+        proofs, kept = {name: self.unseen[name] for name in self.kept}, dict(self.kept)
         for path, rows in zip(validate, _read(self.nominal.chain, validate, self.rows.shape[1])):
-            proofs[f"{path.name}, unseen"] = _errors(self.nominal.known, self.found.known, rows)
-        return replace(self, unseen=proofs, files=(*self.files, *validate))
+            name = f"{path.name}, unseen"
+            proofs[name], kept[name] = _errors(self.nominal.known, self.found.known, rows), rows
+        return replace(self, unseen=proofs, kept=kept, files=(*self.files, *validate))
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -222,24 +244,25 @@ def fit_parallel(
     held = _held(known, settings, options or FitOptions())
     tables = _read(known.robot, (*measured, *validate))
     rows = np.concatenate(tables[: len(measured)])
-    unseen = {f"{path.name}, unseen": own for path, own in zip(validate, tables[len(measured) :])}
+    kept = {f"{path.name}, unseen": own for path, own in zip(validate, tables[len(measured) :]) if len(own)}
     if settings.tolerance is not None and not (rows.shape[1] > known.robot.n and (known.robot.selected < 3).any()):
         raise UsageError("a tolerance needs a measured platform position; none was measured")
     if settings.holdout:
         order = np.random.default_rng(settings.seed).permutation(len(rows))
-        kept = len(rows) - round(settings.holdout * len(rows))
-        unseen["held out, unseen"], rows = rows[order[kept:]], rows[order[:kept]]
+        count = len(rows) - round(settings.holdout * len(rows))
+        held_out, rows = rows[order[count:]], rows[order[:count]]
+        kept |= {"held out, unseen": held_out} if len(held_out) else {}
     say("fitting")
     try:
         found = fit_loops(known, *_parts(known, rows), held=held)
         say("judging")
-        proofs = {name: _errors(known, found.known, own) for name, own in unseen.items() if len(own)}
+        proofs = {name: _errors(known, found.known, own) for name, own in kept.items()}
         own = _errors(known, found.known, rows)
     except NoPosture as error:
         raise MeasurementError(f"{error}", measured[0]) from error
     if not proofs:
         proofs = _cross_validated(known, rows, held, settings.seed)
-    return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, settings)
+    return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, kept, settings)
 
 
 def _paths(measured: Sequence[object]) -> tuple[Path, ...]:

@@ -2,9 +2,11 @@
 
 ``robot.toml`` comes first: each folder is a robot to the next command. identify: ``dynamics.json`` (values of all
 parameters, base expressions); the others are those of a serial arm (``calib formats identified``). fit:
-``estimate.csv`` (changes of the loops' constants), ``covariance.csv``, ``metrics.json``. excite: ``motion.csv`` (time,
-platform coordinates, and position, speed, torque of each actuator), ``trajectory.toml`` (the actuators' positions as
-Fourier series, for `calib recall`), ``metrics.json`` and figures. plan: the same without series.
+``estimate.csv`` (changes of the loops' constants), ``covariance.csv``, ``residuals.csv`` (a row per pose: readings,
+measured coordinates, errors of the calibrated and of the nominal robot), ``metrics.json``. excite: ``motion.csv``
+(time, platform coordinates, and position, speed, torque of each actuator), ``trajectory.toml`` (the actuators'
+positions as Fourier series, for `calib recall`), ``metrics.json`` and figures. plan: the same without series.
+`calib view` shows each of these folders.
 """
 
 from calib.procedure.dynamic_stage.folder import check_identification_target
@@ -13,6 +15,7 @@ from calib.rooms.parallel.excite import check_motion_target, excite_parallel
 from calib.rooms.parallel.identification import assess, identify_parallel
 from calib.rooms.parallel.loop_fit import check_fit_target, fit_parallel
 from calib.rooms.parallel.plan import plan_parallel
+from calib.rooms.parallel.view import picture
 
 STAGES = {
     "parallel robot": {
@@ -20,5 +23,6 @@ STAGES = {
         "identify": Stage(identify_parallel, check_identification_target, assess),
         "excite": Stage(excite_parallel, check_motion_target),
         "plan": Stage(plan_parallel, check_motion_target),
+        "view": Stage(picture, check_motion_target),
     }
 }

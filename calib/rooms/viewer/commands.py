@@ -25,14 +25,12 @@ def view(
         folder: of a fit, a session, an identification, a motion; or a CSV
         save: write a Rerun recording (.rrd), and open no window
         spawn: open Rerun's window; by default where nothing is saved
-        robot: the arm to draw, where the folder does not say
+        robot: the robot to draw, where the folder does not say
     """
     from calib.files import results
-    from calib.procedure.robot_kinds import stage_of
     from calib.rooms.viewer import viewer
 
     require(folder.exists(), f"{folder}: no such folder or CSV", UsageError)
-    stage_of(folder, "calib view")
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or omit --no-spawn")
     scene = None

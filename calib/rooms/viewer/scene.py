@@ -6,6 +6,7 @@ All points are in the base of the arm that is drawn; its meshes are those of the
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,9 +23,10 @@ from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.measuring.run import is_run, rehearsed_samples
+from calib.procedure.robot_kinds import stage_of
 from calib.records import Frozen
 from calib.robot import calibrated, library
-from calib.robot.chain import Chain, joint_kinds
+from calib.robot.chain import Chain, Joint, joint_kinds
 from calib.robot.collision import find_mesh, urdf_meshes
 from calib.robot.formats.urdf_tree import numbers, origin
 from calib.robot.kinematics import forward, joint_frames
@@ -32,6 +34,34 @@ from calib.robot.library import load, resolve
 from calib.transforms import invert
 
 DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")  # meshes that the viewer shows
+
+
+@runtime_checkable
+class Drawn(Protocol):
+    """A robot that is not a serial arm, as its ``view`` (`calib.procedure.robot_kinds.Stage`) returns it.
+
+    Attributes:
+        n, joints, joint_names: its actuated joints.
+    """
+
+    @property
+    def n(self) -> int: ...
+    @property
+    def joints(self) -> tuple[Joint, ...]: ...
+    @property
+    def joint_names(self) -> tuple[str, ...]: ...
+
+    def strips(self, q: np.ndarray) -> list[np.ndarray]:
+        """Return lines (m, k, 3) [m] for readings q (m, n); the first ends at the point whose errors are shown."""
+        ...
+
+    def torque_rows(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return titles and units of an identification's torque rows, by the ``kind`` of ``dynamics.json``."""
+        ...
+
+    def measured(self, place: Path) -> tuple[np.ndarray, ...]:
+        """Return the poses of a fit's folder, in the order of `Measured`."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +114,9 @@ class Measured:
     unseen: np.ndarray
     turned: np.ndarray
 
-    def arrow_scale(self, chain: Chain) -> float:
+    def arrow_scale(self, chain: Chain | Drawn) -> float:
         """Return the factor 1, 2 or 5 · 10^k that makes the larger arrows about a tenth of the arm long."""
-        span = float(np.ptp(skeleton(chain, self.q)[:, -1], axis=0).max()) or 1.0
+        span = float(np.ptp(strips(chain, self.q)[0][:, -1], axis=0).max()) or 1.0
         large = float(np.quantile(np.linalg.norm(self.seen - self.nominal, axis=1), 0.9)) or 1e-3
         wanted = 0.1 * span / large
         steps = np.array([f * 10.0**k for k in range(7) for f in (1.0, 2.0, 5.0)])
@@ -126,7 +156,7 @@ class Scene:
 
     Attributes:
         title: of the recording.
-        chain: the arm that is drawn; None where none is known.
+        chain: the robot that is drawn; None where none is known.
         meshes: of its links.
         measured: poses with their errors.
         chosen: names and joint values of pose plans (m, n), in the order of choice.
@@ -136,7 +166,7 @@ class Scene:
     """
 
     title: str
-    chain: Chain | None = None
+    chain: Chain | Drawn | None = None
     meshes: tuple[Visual, ...] = ()
     measured: tuple[Measured, ...] = ()
     chosen: tuple[tuple[str, np.ndarray], ...] = ()
@@ -170,15 +200,19 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         folder.resolve().stem if one else folder.resolve().name,
         chain,
         tuple(meshes),
-        tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
+        tuple(_joined(_measured(place, chain), ValidationFolder(folder / VALIDATED).errors) for place in fits),
         tuple(
-            (path.stem, read_poses(path, Joints(chain.joint_names, joint_kinds(chain))))
+            (path.stem, read_poses(path, Joints(chain.joint_names, _kinds(chain))))
             for path in plans
             if chain and not is_run(path)
         ),
         (
-            *(Played(path.stem, *rehearsed_samples(path, chain)) for path in plans if chain and is_run(path)),
-            *(_played(path, folder) for path in motions),
+            *(
+                Played(path.stem, *rehearsed_samples(path, chain))
+                for path in plans
+                if isinstance(chain, Chain) and is_run(path)
+            ),
+            *(_played(path, folder, chain) for path in motions),
         ),
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
@@ -196,8 +230,10 @@ def _below(folder: Path, pattern: str) -> list[Path]:
     return [path for depth in ("", "*/", "*/*/") for path in sorted(folder.glob(depth + pattern))]
 
 
-def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
-    """Return the arm to show, and its original description file."""
+def _arm(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | None]:
+    """Return the robot to show, and its original description file."""
+    if (stage := stage_of(robot or folder, "view")) is not None:
+        return stage.run(), None
     if robot is not None:
         return load(robot), resolve(robot)
     for place in (folder, folder / IN_SESSION):
@@ -213,9 +249,13 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
     return (load(name), None) if name in library.names() else (None, None)
 
 
-def _meshes(chain: Chain | None, source: Path | None) -> tuple[list[Visual], list[str]]:
+def _kinds(chain: Chain | Drawn) -> list[str]:
+    return joint_kinds(chain) if isinstance(chain, Chain) else [joint.kind for joint in chain.joints]
+
+
+def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visual], list[str]]:
     """Return the meshes of the moving links, and a note on missing meshes."""
-    if chain is None or source is None or source.suffix != ".urdf" or not chain.links:
+    if not isinstance(chain, Chain) or source is None or source.suffix != ".urdf" or not chain.links:
         return [], []
     found, missing = visuals(source)
     known = [one for one in found if one.link in (chain.base, *chain.links)]
@@ -225,8 +265,10 @@ def _meshes(chain: Chain | None, source: Path | None) -> tuple[list[Visual], lis
     return known, [words] if words else []
 
 
-def _measured(place: Path) -> Measured:
+def _measured(place: Path, chain: Chain | Drawn | None) -> Measured:
     """Return the measured positions of ``residuals.csv``, with the predictions of both arms."""
+    if isinstance(chain, Drawn):
+        return Measured(*chain.measured(place))
     after, before = installation.read_arms(place)
     table = read_table(FitFolder(place).residuals)
     positions = ~np.isnan(table.numbers("dx", "length", gaps=True))
@@ -278,26 +320,36 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
     return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
 
 
-def _played(path: Path, folder: Path) -> Played:
+def _played(path: Path, folder: Path, chain: Chain | Drawn | None) -> Played:
     table = read_table(path)
-    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), table.block("v"))
+    t, q, v = _seconds(table), table.block("q"), table.block("v")
+    if isinstance(chain, Drawn) and q is None:
+        q, v = (np.column_stack([table.numbers(f"{key}_{name}") for name in chain.joint_names]) for key in "qv")
+    return Played(_name(path, folder), t, _needed(table, "q", path) if q is None else q, v)
 
 
-def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
+def _seconds(table: Table) -> np.ndarray:
+    return np.asarray(table.cells[table.index("t")], dtype=float)
+
+
+def _torques(path: Path, folder: Path, chain: Chain | Drawn | None) -> Torques:
     table = read_table(path)
     measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
-    t = np.asarray(table.cells[table.index("t")], dtype=float)
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
-    return Torques(_name(path, folder), rows, units, t, measured, predicted, table.block("q"))
+    return Torques(_name(path, folder), rows, units, _seconds(table), measured, predicted, table.block("q"))
 
 
-def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _torque_rows(place: Path, chain: Chain | Drawn | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the labels and units of an identification's torque rows."""
     for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
         if chain is None or not folder.model.is_file():
             continue
         table = model_file.read_table(folder.path)
-        rows, unit = ROWS.get(table.get("kind", ""), MOTOR), table.get("unit", "N m")
+        unit = table.get("unit", "N m")
+        if isinstance(chain, Drawn):
+            titles, units = chain.torque_rows(table.get("kind", ""))
+            return tuple(f"{title} force or torque" for title in titles), units if unit == "N m" else (unit,) * count
+        rows = ROWS.get(table.get("kind", ""), MOTOR)
         if rows.count(chain.n) == count:
             kind = f"{' motor' if rows.motors_alone else ''} {'torque' if unit == 'N m' else 'current'}"
             units = rows.units([joint.kind == "prismatic" for joint in chain.joints])
@@ -319,6 +371,11 @@ def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
 def _name(path: Path, folder: Path) -> str:
     parent = path.parent
     return path.stem if parent == folder else f"{parent.name}" if path.stem != "torques_1" else f"{parent.name} torques"
+
+
+def strips(chain: Chain | Drawn, q: np.ndarray) -> list[np.ndarray]:
+    """Return the lines (m, k, 3) [m] by which a robot is drawn; an arm has one."""
+    return [skeleton(chain, q)] if isinstance(chain, Chain) else chain.strips(q)
 
 
 def skeleton(chain: Chain, q: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from calib.errors import CalibError, UsageError, command_line, refused_as
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames
 from calib.rooms.viewer import scene as viewing
-from calib.rooms.viewer.scene import Measured, Played, Scene, Torques
+from calib.rooms.viewer.scene import Drawn, Measured, Played, Scene, Torques
 from calib.transforms import to_quaternion
 
 ARM, BEFORE, AFTER, SEEN, LIMIT = (
@@ -172,9 +172,9 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
     return start + EACH * len(measured.q) + GAP
 
 
-def _chosen(recording: Any, scene: Scene, chain: Chain, name: str, q: np.ndarray, start: float) -> float:
+def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float) -> float:
     """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
-    tips = viewing.skeleton(chain, q)[:, -1]
+    tips = viewing.strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
     grown = np.concatenate([tips[:k] for k in counts])
     columns = rr.Points3D.columns(positions=grown, radii=np.full(len(grown), 0.008)).partition(counts)
@@ -242,19 +242,22 @@ def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
     """Log the arm's links as lines, and its links' frames where it has meshes."""
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
-    points = viewing.skeleton(scene.chain, q)
-    thick = 0.006 if scene.meshes else 0.018
+    lines = viewing.strips(scene.chain, q)
+    thick = 0.006 if scene.meshes else 0.018 / len(lines)
+    count = len(q) * len(lines)
     strips = rr.LineStrips3D.columns(
-        strips=list(points), radii=np.full(len(q), thick), colors=np.tile(ARM, (len(q), 1))
-    )
-    recording.send_columns("world/robot/lines", indexes=index, columns=strips)
+        strips=[line for at_once in zip(*lines) for line in at_once], radii=np.full(count, thick),
+        colors=np.tile(ARM, (count, 1)),
+    )  # fmt: skip
+    recording.send_columns("world/robot/lines", indexes=index, columns=strips.partition([len(lines)] * len(q)))
+    points = np.concatenate(lines, axis=1)
     count = points.shape[1]
     spheres = rr.Points3D.columns(
         positions=points.reshape(-1, 3), radii=np.full(count * len(q), 1.4 * thick),
         colors=np.tile(ARM, (count * len(q), 1)),
     )  # fmt: skip
     recording.send_columns("world/robot/joints", indexes=index, columns=spheres.partition([count] * len(q)))
-    if scene.meshes:
+    if scene.meshes and isinstance(scene.chain, Chain):
         frames = joint_frames(scene.chain, q)
         for link, frame in zip(scene.chain.links, frames):
             moves = rr.Transform3D.columns(translation=frame[:, :3, 3], quaternion=to_quaternion(frame))

@@ -205,7 +205,7 @@ def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:
     return np.hstack([posture.pose[:, :3, 3] - home[:3, 3], angles])[:, known.robot.selected]
 
 
-def _pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
+def pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
     """Return platform poses (N, 4, 4) at coordinates (N, r); coordinates that the loops determine are zero."""
     full = np.zeros((len(coordinates), 6))
     full[:, known.robot.selected] = coordinates
@@ -356,7 +356,7 @@ def _from_coordinates(
     known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that move the platform to target coordinates (N, r)."""
-    target = _pose_of(known, goals)
+    target = pose_of(known, goals)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
 
