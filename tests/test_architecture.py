@@ -16,7 +16,7 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 
 # heavy dependency -> the only modules that may import it (a trailing dot: all of that package)
 HOMES = {
-    "pinocchio": ["calib.robot.collision", "calib.robot.formats.simulators"],
+    "pinocchio": ["calib.robot.collision", "calib.robot.formats.simulators", "calib.rooms.parallel.export"],
     "coal": ["calib.robot.collision"],
     "numba": [
         "calib.dynamics.gradient_kernels",

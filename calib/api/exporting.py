@@ -83,7 +83,8 @@ def export(
     """
     into = Path(into)
     with saved(result) as place:
-        stage_of(place, "export")
+        if (stage := stage_of(place, "export")) is not None:
+            return stage.run(place, into, urdf=urdf, prior=prior)
         source = optional(urdf)
         if is_identified(place):
             wanted = delivery.Export(source, identified=place, prior=prior)

@@ -146,7 +146,7 @@ def export(
     from calib.procedure.export import delivery, geometry
     from calib.procedure.robot_kinds import stage_of
 
-    stage_of(folder, "export")
+    stage_of(folder, "export" if into else "export to single files")
     if into:
         from calib.api.exporting import export as export_all
 

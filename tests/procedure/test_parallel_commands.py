@@ -1,6 +1,7 @@
 """The commands on parallel robots: identify, excite, fit; what they refuse, and what is for serial arms."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -85,6 +86,15 @@ def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, 
     assert metrics["validation"]["other.csv"]["filtered"]["relative_error_percent"]["total"] < 5.0
     assert metrics["verdict"] == "pass"
     assert metrics["rows"] == (["power"] if options == "power" else ["x", "y", "rz"])
+    assert calib("export", out, "--into", tmp_path / "all") == 0
+    exported = json.loads((tmp_path / "all" / "parameters.json").read_text())["dynamics"]
+    values = dict(zip(exported["standard"]["names"], exported["standard"]["values"]))
+    platform = sum(values[f"M{k}"] for k in ("4", "11", "21", "12", "22", "13", "23", "14", "24"))
+    masses = re.findall(r'mass value="([^"]+)"', (tmp_path / "all" / "robot.urdf").read_text())
+    assert len(masses) == 12 and abs(sum(map(float, masses)) - platform) < 1e-9 and exported["consistency"]["possible"]
+    drives = np.genfromtxt(tmp_path / "all" / "drives.csv", delimiter=",", names=True, dtype=None, encoding=None)
+    motor = next(row for row in drives if row["joint"] == "motor1")
+    assert abs(motor["friction"] - 0.3) < 3.0 * motor["friction_sigma"] and motor["damping_sigma"] > 0.0
     if options == "power":  # the folder of an identification is a robot
         words = ["--options", folder / "options.toml", "--out", tmp_path / "again", "--no-plots"]
         assert calib("identify", out, *files, *words) == 0
@@ -148,8 +158,9 @@ def test_the_api_identifies_and_plans_as_the_commands_do(folder, tmp_path):
     still = model.robot.known.home.q[:, robot.known.robot.actuated]
     assert np.abs(judged.torques(still, 0 * still, 0 * still)).max() < 1.0
     assert api.plan_motion(fitted.robot, folder / "way.csv", model=judged).duration > 0.1
-    with pytest.raises(api.CalibError):
-        api.export(judged, tmp_path / "no")
+    assert "robot.xml (loops closed)" in api.export(judged, tmp_path / "exported")[0]
+    with pytest.raises(api.CalibError, match="urdf is for serial arms only"):
+        api.export(judged, tmp_path / "no", urdf=tmp_path / "robot.urdf")
 
 
 def test_the_api_chooses_no_poses_for_a_parallel_robot():
@@ -183,6 +194,7 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
         (("fit", "dualv", "poses.csv", "--model", "stiffness"), "model 'stiffness' is for serial arms"),
         (("fit", "dualv", "readings.csv", "--tolerance", 0.1), "a tolerance needs a measured platform position"),
         (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
+        (("export", "dualv"), "give --into FOLDER"),
         (("select", "dualv"), "choosing poses is for serial arms"),
         (("new", "--robot", "dualv", "--instrument", "cmm"), "a guided session is for serial arms"),
         )),

@@ -30,7 +30,7 @@ them, and a note says so. The sign of Coulomb friction was smoothed as tanh(v / 
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +57,7 @@ from calib.procedure.kinematic_stage.folder import (
     ValidationFolder,
 )
 from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
+from calib.robot.chain import Joint
 from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
 from calib.robot.formats.urdf_tree import text, with_comment
@@ -172,17 +173,20 @@ def _mjcf(export: Export, path: Path) -> list[str]:
     return [f"{path.name}: MJCF with armature, damping and frictionloss; {READ_BACK}"]
 
 
-def _drives(export: Export, path: Path) -> list[str]:
-    joints, drives = export.dynamics.chain.joints, export.dynamics.drives
+def write_drives(joints: Sequence[Joint], drives: identified.Drives, path: Path) -> None:
+    """Write ``drives.csv``: the drives' values of joints, and of couplings, with their sigmas."""
     named = [(joint.name, joint) for joint in joints]
     named += [(f"{joints[i].name} {'+' if w > 0 else '-'} {joints[j].name}", joints[i]) for i, j, w in drives.pairs]
     rows, values = [], np.vstack([drives.values, drives.couplings])
     sigmas = np.zeros(values.shape) if drives.sigma is None else drives.sigma
     for (name, joint), row, sigma in zip(named, values, sigmas, strict=True):
-        linear = joint.kind == "prismatic"
-        units = ("kg", "N s/m", "N") if linear else ("kg m²", "N m s/rad", "N m")
+        units = ("kg", "N s/m", "N") if joint.kind == "prismatic" else ("kg m²", "N m s/rad", "N m")
         rows.append((name, *map(float, row), *units, *(float(one) or None for one in sigma)))
     files.write_table(path, DRIVE_COLUMNS, rows)
+
+
+def _drives(export: Export, path: Path) -> list[str]:
+    write_drives(export.dynamics.chain.joints, export.dynamics.drives, path)
     return [f"{path.name}, {PARAMETERS}" + ("" if export.urdf is None else ", joint_origins.yaml (tesseract's SRDF)")]
 
 

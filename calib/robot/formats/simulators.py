@@ -39,7 +39,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
     ends = [one[:3, 3] for one in (*placed[1:], chain.tail)]
     for number, k in enumerate(chain.driven.tolist()):
         element, name = chain.elements[k], joint_name(chain, k)
-        parent = ET.SubElement(parent, "body", {"name": f"{name}_body", **_placed(placed[number])})
+        parent = ET.SubElement(parent, "body", {"name": f"{name}_body", **pose_attributes(placed[number])})
         if bodies[number].any():
             mass, centre, (xx, xy, xz, yy, yz, zz) = centred(bodies[number])
             full = numbers_text(np.array([xx, yy, zz, xy, xz, yz]))
@@ -60,7 +60,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
         if np.linalg.norm(ends[number]) > 1e-3:
             shape = {"type": "capsule", "fromto": f"0 0 0 {numbers_text(ends[number])}", "size": "0.03"}
             ET.SubElement(parent, "geom", shape, contype="0", conaffinity="0", rgba="0.6 0.6 0.6 1")
-    ET.SubElement(parent, "site", {"name": f"{chain.tip}_tip", **_placed(chain.tail)})
+    ET.SubElement(parent, "site", {"name": f"{chain.tip}_tip", **pose_attributes(chain.tail)})
     root.extend([ties] if len(ties) else [])
     return xml_text(root)
 
@@ -72,7 +72,7 @@ def joint_name(chain: Chain, k: int) -> str:
     return chain.joints[element.joint or 0].name if main else element.name.removesuffix(".offset")
 
 
-def _placed(frame: np.ndarray) -> dict[str, str]:
+def pose_attributes(frame: np.ndarray) -> dict[str, str]:
     x, y, z, w = Rotation.from_matrix(frame[:3, :3]).as_quat()
     return {"pos": numbers_text(frame[:3, 3]), "quat": numbers_text(np.array([w, x, y, z]))}
 
@@ -90,9 +90,8 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     """
     import pinocchio
 
-    pin: Any = pinocchio  # its names come from C++, where no type checker sees them
-    with refused_as(RobotError, (ValueError, RuntimeError), "Pinocchio cannot read the URDF: {}"):
-        model: Any = pin.buildModelFromXML(source)
+    pin: Any = pinocchio
+    model = pinocchio_model(source)
     data = model.createData()
     base, tip = model.getFrameId(chain.base), model.getFrameId(chain.tip)
     result = np.empty((len(q), 4, 4))
@@ -146,9 +145,7 @@ def motion_torques(
     import pinocchio
 
     pin: Any = pinocchio
-    words = f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {{}}"
-    with refused_as(RobotError, (ValueError, RuntimeError), words):
-        model: Any = _from_mjcf(pin, source) if mjcf else pin.buildModelFromXML(source)
+    model = pinocchio_model(source, mjcf)
     data = model.createData()
     model.gravity = pin.Motion(np.array(chain.gravity), np.zeros(3))
     joints = driven_joints(model, chain)
@@ -163,12 +160,20 @@ def motion_torques(
     return torques, frames, model.damping[main], model.friction[main]
 
 
-def _from_mjcf(pin: Any, source: str) -> Any:
-    """Return Pinocchio's model of an MJCF text, which it reads from a temporary file."""
-    with tempfile.TemporaryDirectory() as folder:
+def pinocchio_model(source: str, mjcf: bool = False) -> Any:
+    """Return Pinocchio's model of a URDF or MJCF text; it reads MJCF from a temporary file.
+
+    Raises:
+        RobotError: where Pinocchio cannot read the text.
+    """
+    import pinocchio
+
+    pin: Any = pinocchio  # its names come from C++, where no type checker sees them
+    words = f"Pinocchio cannot read the {'MJCF' if mjcf else 'URDF'}: {{}}"
+    with refused_as(RobotError, (ValueError, RuntimeError), words), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.xml"
         path.write_text(source, encoding="utf-8")
-        return pin.buildModelFromMJCF(str(path))
+        return pin.buildModelFromMJCF(str(path)) if mjcf else pin.buildModelFromXML(source)
 
 
 def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[str], q: np.ndarray) -> np.ndarray:

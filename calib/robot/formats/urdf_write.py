@@ -193,7 +193,7 @@ def write_new(chain: Chain) -> str:
         parent, before = child, np.eye(4)
     if parent != chain.tip:
         ET.SubElement(root, "link", name=chain.tip)
-        _add_joint(root, f"{chain.tip}_fixed", "fixed", parent, chain.tip, before @ chain.tail)
+        add_joint(root, f"{chain.tip}_fixed", "fixed", parent, chain.tip, before @ chain.tail)
     return '<?xml version="1.0"?>\n' + xml_text(root)
 
 
@@ -373,7 +373,7 @@ def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
     return fallback if name == chain.base or (name == chain.tip and not last) else name
 
 
-def _add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
+def add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
     """Add a <joint> with its links and its origin (4, 4) to a URDF, and return it."""
     joint, (xyz, rpy) = ET.SubElement(root, "joint", name=name, type=kind), to_xyz_rpy(origin)
     ET.SubElement(joint, "parent", link=parent)
@@ -389,7 +389,7 @@ def _add_moving_joint(
     joint = chain.joints[element.joint or 0]
     free = not np.isfinite([joint.lower, joint.upper]).any()
     kind = "prismatic" if element.axis[0] == "t" else "continuous" if free else "revolute"
-    node = _add_joint(root, joint.name if main else element.name, kind, parent, child, origin)
+    node = add_joint(root, joint.name if main else element.name, kind, parent, child, origin)
     ET.SubElement(node, "axis", xyz=numbers_text(element.sign * np.eye(3)[AXES.index(element.axis) % 3]))
     limits = {key: getattr(joint, key) for key in LIMITS if kind != "continuous" or key not in ("lower", "upper")}
     written = {key: repr(float(np.clip(value, -UNLIMITED, UNLIMITED))) for key, value in limits.items()}

@@ -4,6 +4,7 @@ OFFERS = {"topics": ":TOPICS", "robots": "robots:find", "stages": "verbs:STAGES"
 TOPICS = {
     "parallel": (
         "a parallel robot as legs and a platform, and what commands write of one",
-        "calib.rooms.parallel.mechanism.parallel_robot calib.rooms.parallel.loop_fit calib.rooms.parallel.verbs",
+        "calib.rooms.parallel.mechanism.parallel_robot calib.rooms.parallel.loop_fit calib.rooms.parallel.verbs "
+        "calib.rooms.parallel.export",
     )
 }

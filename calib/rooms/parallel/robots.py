@@ -23,7 +23,8 @@ INSTEAD = {
     "limits": "state velocity, effort, lower and upper in its file",
     "drives": "identify a model with its drives, and name it",
     "poses": "pose selection does not support it",
-    "export": "a URDF cannot contain closed loops: use its robot.toml and dynamics.json",
+    "export to single files": "give --into FOLDER",
+    "urdf": "robot.urdf is written anew",
 }  # of commands and arguments that there are not
 
 
@@ -50,13 +51,14 @@ class ParallelMechanism:
         from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.shapes import V0
         from calib.folders import COVARIANCE
+        from calib.identification.model_file import regrouping
 
         model = dynamics.model
         return {
             "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
             "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
             "values": dict(zip(model.names, map(float, dynamics.values))),
-            "base": dict(zip(base.names, expressions(base))), "covariance": COVARIANCE,
+            "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base), "covariance": COVARIANCE,
         }  # fmt: skip
 
     def __repr__(self) -> str:

@@ -12,6 +12,7 @@ positions as Fourier series, for `calib recall`), ``metrics.json`` and figures. 
 from calib.procedure.dynamic_stage.folder import check_identification_target
 from calib.procedure.robot_kinds import Stage
 from calib.rooms.parallel.excite import check_motion_target, excite_parallel
+from calib.rooms.parallel.export import check_export_target, export_parallel
 from calib.rooms.parallel.identification import assess, identify_parallel
 from calib.rooms.parallel.loop_fit import check_fit_target, fit_parallel
 from calib.rooms.parallel.plan import plan_parallel
@@ -23,6 +24,7 @@ STAGES = {
         "identify": Stage(identify_parallel, check_identification_target, assess),
         "excite": Stage(excite_parallel, check_motion_target),
         "plan": Stage(plan_parallel, check_motion_target),
+        "export": Stage(export_parallel, check_export_target),
         "view": Stage(picture, check_motion_target),
     }
 }
