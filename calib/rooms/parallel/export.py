@@ -194,7 +194,7 @@ class OpenedRobot:
         robot, root = self.known.robot, ET.Element("mujoco", model=self.known.robot.name)
         world, home = ET.Element("worldbody"), numbers_text(self.known.home.q[0])
         for chain, drives in zip(self.chains, self.rows(self.drives.values)):
-            own = ET.fromstring(mjcf_text(chain, chain.inertias, *drives.T[:3]))
+            own: Any = ET.fromstring(mjcf_text(chain, np.asarray(chain.inertias), *drives.T[:3]))
             if not len(root):
                 root.extend([own.find("compiler"), own.find("option"), world])
                 root[1].set("timestep", "0.001")
@@ -250,9 +250,12 @@ def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Any,
     chain = Chain(model.known.robot.name, joints, elements, inertias=own)
     coordinates = np.array([*range(count), *[-1] * len(model.payloads)])
     n = int(model.known.robot.starts[-1])
-    bodies = SimpleNamespace(count=len(model.labels), n=n, labels=model.labels, coordinates=coordinates)
     named = SimpleNamespace(
-        bodies=bodies, columns=model.terms, names=model.names, inertial=model.inertial, torque_rows=model.torque_rows
+        bodies=SimpleNamespace(count=len(model.labels), n=n, labels=model.labels, coordinates=coordinates),
+        columns=model.terms,
+        names=model.names,
+        inertial=model.inertial,
+        torque_rows=model.torque_rows,
     )
     return chain, named
 
