@@ -101,14 +101,14 @@ def _information(found: Identification) -> np.ndarray:
     return retriangulate(np.vstack(rows))
 
 
-def read(folder: str | Path, known: tuple[Chain, Dynamics] | None = None) -> Information:
-    """Return the information of the identification stored in `folder`; `known`: its robot and model, read already.
+def read(folder: str | Path, given: tuple[Chain, Dynamics] | None = None) -> Information:
+    """Return the information of the identification stored in `folder`; `given`: its robot and model, read already.
 
     Raises:
         RobotError: where the folder holds none, or one of a version that did not write how parameters regroup.
     """
     folder = Path(folder)
-    chain, dynamics = known or read_dynamics(folder)
+    chain, dynamics = given or read_dynamics(folder)
     groups = read_table(folder).get("regrouping")
     if groups is None:
         raise RobotError(f"{folder}/dynamics.json lacks the regrouping of parameters; identify again")
