@@ -7,6 +7,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     topics, schemas        of `calib formats`: see `calib.procedure.formats`
     methods                of identification: tuples of `calib.identification.methods.method.Method`
     loop_results           function: problem, estimate → `calib.identification.loop.LoopResults`
+    link_motion            function: robot, case, settings → the case with its links' motion, moved by joint corrections
+    deflection_sensitivity function: identification, robot, cases → derivative of the estimate by their coefficients
     track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`

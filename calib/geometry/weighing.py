@@ -15,6 +15,7 @@ from calib.estimation.nonlinear import Solution, covariance
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, parameter_values, stack
 from calib.geometry.residuals import Part
+from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
 
@@ -127,7 +128,14 @@ def calibrated_chain(
         covariance = np.zeros((len(chain.elements), len(chain.elements)))
         where = rigid.free[own]
         covariance[np.ix_(where, where)] = rigid.estimate.covariance[np.ix_(own, own)]
-    corrections = CorrectedChain(whole.chain, whole.deflection) if whole.deflection.terms else None
+    corrections = None
+    if whole.deflection.terms:
+        names = (*chain.names, *whole.deflection.names(chain))
+        fitted = [place for place, name in enumerate(found.estimate.names) if name in names]
+        where = [names.index(found.estimate.names[place]) for place in fitted]
+        spread = np.zeros((len(names), len(names)))
+        spread[np.ix_(where, where)] = found.estimate.covariance[np.ix_(fitted, fitted)]
+        corrections = CorrectedChain(whole.chain, whole.deflection, frozen(spread))
     return CalibratedChain(chain, nominal, covariance, corrections)
 
 

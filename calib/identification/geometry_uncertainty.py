@@ -41,6 +41,7 @@ from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.triangles import retriangulate
+from calib.extensions import needed
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.rows import Case, ObservationRows, observe, segments, thinned
 from calib.identification.settings import make_model
@@ -203,17 +204,22 @@ def propagate(
 
     Args:
         found: the identification.
-        robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact.
+        robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact. Where
+            joint corrections move the links, their coefficients' uncertainty takes part.
         cases: its training data.
     """
     robot = as_calibrated(robot)
-    chain, covariance = robot.chain, robot.covariance
+    chain, covariance, deflected = robot.chain, robot.covariance, cases[0].link is not None
+    if deflected and robot.corrections is not None:
+        chain, covariance = robot.complete, robot.corrections.covariance
     matrix, felt, left = sensitivity(found, chain, cases, progress)
     count = len(chain.elements)
-    geometry, deviations = None, np.full(count + len(TILTS), np.nan)
+    geometry, deviations, felt_by = None, np.full(count + len(TILTS), np.nan), matrix[:, :count]
     if covariance is not None:
-        geometry = frozen(matrix[:, :count] @ covariance @ matrix[:, :count].T)
-        own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        if deflected:
+            felt_by = np.hstack([felt_by, needed("deflection_sensitivity")(found, robot, cases)])
+        geometry = frozen(felt_by @ covariance @ felt_by.T)
+        own = np.sqrt(np.clip(np.diag(covariance)[:count], 0.0, None))
         deviations[:count] = np.where(own > 0.0, own, np.nan)
     return GeometryUncertainty(
         found.names, (*chain.names, *TILTS), (*chain.units, *("rad" for _ in TILTS)), matrix,
@@ -242,7 +248,7 @@ def sensitivity(
     instruments: list[np.ndarray] = []
     own_rows = found.fitted.instruments or tuple((case, part, None) for part, case in zip(found.rows, cases))
     for case, part, z in own_rows:
-        for number, (own, span) in enumerate(_pieces(case, decimator, step)):
+        for number, (own, span) in enumerate(pieces(case, decimator, step)):
             say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
             used.append(cut(part, own))
             residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
@@ -282,7 +288,7 @@ def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodie
     return [*((moved(one), moved(-one)) for one in elements), *((tilted(one), tilted(-one)) for one in tilts)]
 
 
-def _pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32) -> list[tuple[slice, slice]]:
+def pieces(case: Case, decimator: Decimator, step: int = 1, min_piece: int = 32) -> list[tuple[slice, slice]]:
     """Return (decimated rows, full-rate samples that they depend on) of every `step`-th piece of a case.
 
     With step 1 each segment is one piece.
@@ -313,11 +319,11 @@ def _differences(
     Args:
         residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
     """
-    model, motion, b = found.dynamics.model, case.motion, found.base.b
+    model, b = found.dynamics.model, found.base.b
     bodies = model.inertial
     onboard = model.carried_columns(case.carried)
     parameters = found.base.to_standard(found.fitted.estimate.values[:b])[:bodies] * onboard
-    q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
+    q, v, a = (np.asarray(x[span]) for x in case.links)
     torque_rows, felt = model.torque_rows, spread(residual, decimator, len(q))[:, :, None]
     if torque_rows.projection is not None:  # which no geometry changes
         felt = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), felt)
@@ -379,7 +385,7 @@ def compare(
     Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
     """
     how, noise = estimator(found), np.array(found.fitted.std) * np.sqrt(found.fitted.inflation)
-    both = (rows_on(found, nominal, cases), found.rows)
+    both = (rows_on(found, nominal, [replace(case, link=None) for case in cases]), found.rows)
     (first, inverse), (second, own) = (estimate(how, rows) for rows in both)
     values = np.asarray(found.fitted.estimate.values)
     alone, apart = np.zeros(len(values)), np.array(carried.sigma_geometry**2)

@@ -83,19 +83,20 @@ def identify(
 
     Args:
         robot: as a geometric fit returns it, or a chain that no fit has moved. Base columns are chosen on its nominal
-            geometry; joint corrections take no part.
+            geometry; joint corrections take part where the cases have the links' motion.
         cases: training recordings.
         settings: the choices; None: those that suit a serial arm with motor torques.
         progress: called with a few words at each stage.
     """
     settings, robot = settings or IdentificationSettings(), as_calibrated(robot)
-    model = make_model(robot.chain, settings)
+    chain = robot.chain if any(case.link is None for case in cases) else robot.complete
+    model = make_model(chain, settings)
     nominal = None if robot.nominal is None or not robot.moved else make_model(robot.nominal, settings)
-    states = chain_states(robot.chain, nominal or model, settings.seed)
+    states = chain_states(chain, nominal or model, settings.seed)
     found = identify_model(
-        model, cases, settings, nominal=nominal, states=states, cad=_known_masses(robot.chain),
-        shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(robot.chain, model), 0.0).ravel(),
-        effort=_torque_limits(robot.chain), progress=progress,
+        model, cases, settings, nominal=nominal, states=states, cad=_known_masses(chain),
+        shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(chain, model), 0.0).ravel(),
+        effort=_torque_limits(chain), progress=progress,
     )  # fmt: skip
     return cast(Identification, found)  # its model is the chain's
 

@@ -216,12 +216,10 @@ class Dynamics(Frozen, Generic[Model]):
 
     def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
         """Return the torques (N, n) that the gears transmit to the bodies, for load-dependent friction."""
-        model, motion = self.model, case.motion
-        result = np.empty(motion.q.shape)
-        for start in range(0, len(motion), BLOCK):
+        result = np.empty(case.motion.q.shape)
+        for start in range(0, len(case.motion), BLOCK):
             part = slice(start, start + BLOCK)
-            q, v, a = motion.q[part], motion.v[part], motion.a[part]
-            result[part] = model.transmitted(self.values, q, v, a, case.carried)
+            result[part] = self.model.transmitted(self.values, *(x[part] for x in case.links), case.carried)
         return result
 
 
@@ -233,5 +231,7 @@ def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)
         q, v, a = motion.q[part], motion.v[part], motion.a[part]
-        result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part])
+        result[part] = model.torque(
+            dynamics.values, q, v, a, case.carried, states[:, part], **case.deflected(part)
+        )  # fmt: skip
     return result

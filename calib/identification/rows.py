@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class Case:
         noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
             known.
         torque_rows: kind of torques in the target.
+        link: q, v, a (N, n) of the links, where joint corrections part them from the motors' motion; None: the same.
     """
 
     name: str
@@ -45,6 +46,16 @@ class Case:
     present: np.ndarray
     noise: np.ndarray | None = None
     torque_rows: TorqueRows = MOTOR
+    link: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    @property
+    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Motion q, v, a (N, n) of the links: the motors' own, where joints do not deflect."""
+        return self.link or (self.motion.q, self.motion.v, self.motion.a)
+
+    def deflected(self, part: slice) -> dict[str, Any]:
+        """Return the argument ``link`` of a model's regressor at a part of the samples; none where joints are stiff."""
+        return {} if self.link is None else {"link": [x[part] for x in self.link]}
 
     @property
     def duration(self) -> float:
@@ -273,7 +284,8 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
     """Return the regressor (N_i, rows, p) at a part of the samples."""
     motion = case.motion
-    return model.regressor(motion.q[part], motion.v[part], motion.a[part], None, case.carried, states[:, part])
+    given = motion.q[part], motion.v[part], motion.a[part], None, case.carried, states[:, part]
+    return model.regressor(*given, **case.deflected(part))
 
 
 def _power_block(

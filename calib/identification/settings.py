@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from calib.config import strict
-from calib.config_types import Checked, Expect, JointNumber, Names, OneOf, Positive, Real, Spread, Text, Whole
+from calib.config_types import Checked, Expect, Flag, JointNumber, Names, OneOf, Positive, Real, Spread, Text, Whole
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -71,6 +71,8 @@ class Choices:
         gravity: gravity in the base frame [m/s²]; None: the robot's.
         samples: largest number of rows per torque; longer recordings use only every second, third, ... row.
         folds: number of time blocks for cross-validation.
+        deflections: whether joint corrections of the fit (compliance, gears, encoders) move the links; never where the
+            closed loop is simulated.
         loop: the closed loop in which recordings were made, for instrumental variables.
         constraints: constraints on parameters for the methods pc-*; None: their defaults.
     """
@@ -89,6 +91,7 @@ class Choices:
     gravity: Annotated[tuple[float, float, float], Expect("three numbers [m/s²]")] | None = None
     samples: Annotated[int, Whole(1000, 10_000_000)] = 20_000
     folds: Annotated[int, Whole(2, 50)] = 6
+    deflections: Flag = True
     loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
     constraints: ConstraintSettings | None = None
 

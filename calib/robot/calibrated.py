@@ -8,6 +8,8 @@
     rigid = [0.0, 0.1627, ...]       # those of the best geometry without joint corrections, where there are any
     [deflection]                     # the joint corrections; formula in `calib.robot.calibrated`
     reference = [0.0, 0.1, ...]      # element values of the chain that levers are taken from (the nominal one)
+masses = [[0.1, ...], ...]       # XX .. M of its bodies, where these were identified: gravity torques are right, single
+                                 # parameters are not
     [[deflection.term]]
     element = "q3.offset"            # the element it moves
     basis = "sin"                    # torque, lever, joint, cos, sin
@@ -161,10 +163,12 @@ class CorrectedChain:
     Attributes:
         chain: the geometry.
         deflection: the corrections (at least one term).
+        covariance: (K + E, K + E) of the chain's element values and the corrections' coefficients; None if unknown.
     """
 
     chain: Chain
     deflection: Deflection
+    covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,7 +178,7 @@ class CalibratedChain:
     ``print`` shows its joints and their limits.
 
     Attributes:
-        chain: the best geometry without joint corrections, for URDF export and identification of dynamics.
+        chain: the best geometry without joint corrections, for URDF export.
         nominal: the arm before calibration; None if unknown.
         covariance: (K, K) of the chain's element values [m, rad], zero if an element was not fitted; None without a
             fit.
@@ -253,7 +257,7 @@ class CalibratedChain:
         return tip_jacobian(self.complete, values)
 
     def without_corrections(self) -> CalibratedChain:
-        """Return the robot without its joint corrections, which torques and URDFs ignore."""
+        """Return the robot without its joint corrections, as a URDF describes it."""
         return replace(self, corrections=None)
 
 
@@ -285,10 +289,11 @@ def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
 
     chain = valued("rigid") or complete
     deflection = _deflection(extra.get("deflection", {}), complete, where)
-    robot = CalibratedChain(
-        chain, valued("nominal"), _covariance(path.parent / COVARIANCE, chain),
-        CorrectedChain(complete, deflection) if deflection.terms else None, str(known.get("robot", "")),
-    )  # fmt: skip
+    beside, names = path.parent, (*complete.names, *deflection.names(complete))
+    own = _covariance(beside / COVARIANCE, chain.names)
+    whole = _covariance(beside / str(known.get("covariance", "")), names) if deflection.terms else None
+    corrections = CorrectedChain(complete, deflection, whole) if deflection.terms else None
+    robot = CalibratedChain(chain, valued("nominal"), own, corrections, str(known.get("robot", "")))
     return robot, extra
 
 
@@ -331,14 +336,15 @@ def nominal_of(robot: CalibratedChain) -> Chain:
     return robot.nominal
 
 
-def _covariance(path: Path, chain: Chain) -> np.ndarray | None:
-    """Return the covariance (K, K) of all element values from a table by name; None without that file."""
+def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
+    """Return the covariance (k, k) of named values, zero for those not in a file's table; None without that file."""
     if not path.is_file():
         return None
-    names, values = read_covariance(path)
-    index = chain.element_index(names)
-    result = np.zeros((len(chain.elements), len(chain.elements)))
-    result[np.ix_(index, index)] = values
+    found, values = read_covariance(path)
+    own = [place for place, name in enumerate(found) if name in names]
+    index = [names.index(found[place]) for place in own]
+    result = np.zeros((len(names), len(names)))
+    result[np.ix_(index, index)] = values[np.ix_(own, own)]
     return result
 
 
@@ -349,13 +355,17 @@ def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
          "coefficient": float(value)}
         for term, value in zip(deflection.terms, np.asarray(deflection.coefficients))
     ]  # fmt: skip
-    reference = None if deflection.reference is None else deflection.reference.values.tolist()
-    return {"reference": reference, "term": terms}
+    if (reference := deflection.reference) is None:
+        return {"term": terms}
+    described, known = corrections.chain.inertias, reference.inertias
+    same = known is None or (described is not None and np.array_equal(known, described))
+    masses = {} if same else {"masses": np.asarray(known).tolist()}
+    return {"reference": reference.values.tolist(), **masses, "term": terms}
 
 
 def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
     where = f"{where}, deflection"
-    check_keys(table, ("reference", "term"), where)
+    check_keys(table, ("reference", "masses", "term"), where)
     terms, coefficients = [], []
     for entry in table.get("term", []):
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
@@ -368,4 +378,7 @@ def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
     reference = chain
     if "reference" in table:
         reference = chain.with_values(vector(table["reference"], len(chain.elements), f"{where}, reference"))
+    if "masses" in table:
+        rows = [vector(row, 10, f"{where}, masses") for row in table["masses"]]
+        reference = replace(reference, inertias=shaped(np.array(rows), (chain.n, 10), f"{where}, masses"))
     return Deflection(tuple(terms), np.array(coefficients), reference)

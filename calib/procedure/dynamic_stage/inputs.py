@@ -17,6 +17,7 @@ from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
+from calib.extensions import offered
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
@@ -43,8 +44,8 @@ class IdentificationInputs:
     """Robot, recordings and options of an identification.
 
     Attributes:
-        robot: `CalibratedChain` from a geometric fit or from a description, without joint corrections;
-            or a `calib.procedure.robot_kinds.Mechanism`.
+        robot: `CalibratedChain` from a geometric fit or from a description, with joint corrections only where these
+            move the links; or a `calib.procedure.robot_kinds.Mechanism`.
         source: the file it came from.
         cases: training recordings.
         unseen: recordings to be predicted.
@@ -97,7 +98,7 @@ class IdentificationInputs:
         for name, path, each in zip(names, paths, validate):
             joints = joints_of(self.chain)
             motion = read_motion(each, joints, self.options.file_settings(path), self.cases[0].motion)
-            cases.append(_read_case(path, name, motion, self.options, self.currents))
+            cases.append(_read_case(path, name, motion, self.options, self.currents, self.robot))
             notes += [f"{name}: {note}" for note in motion.notes]
         return replace(self, unseen=(*self.unseen, *cases), notes=(*self.notes, *notes))
 
@@ -153,13 +154,16 @@ def gather(
     count = len(recordings)
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
     options = found.options
-    cases = [_read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
+    cases = [_read_case(path, name, motion, options, found, known) for name, path, motion in zip(names, paths, motions)]
     _check_payloads(cases[:count], cases[count:], options.settings)
+    if isinstance(known, CalibratedChain) and known.corrections is not None:
+        far = [np.abs(case.link[0] - case.motion.q).max() for case in cases if case.link is not None]
+        known = known if far else known.without_corrections()
+        how = f"move the links by up to {1e3 * max(far):.3g} mrad or mm" if far else "take no part: the links are rigid"
+        notes.append(f"joint corrections of the geometric fit {how}")
     return IdentificationInputs(
-        known.without_corrections() if isinstance(known, CalibratedChain) else known, source, tuple(cases[:count]),
-        tuple(cases[count:]), options,
-        (*notes, *found.notes), found,
-    )  # fmt: skip
+        known, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found
+    )
 
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
@@ -192,17 +196,22 @@ def _with_choices(options: IdentifyOptions, method: str | None, friction: str | 
     return replace(options, settings=replace(options.settings, seed=seed, **given))
 
 
-def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
-    """Return the case of one recording, with payload and gains from the options or from the gain identification."""
+def _read_case(
+    path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains, robot: Any
+) -> Case:  # fmt: skip
+    """Return the case of one recording: payload, gains, and the links' motion where joints have corrections."""
     own = options.file_settings(path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
     try:
-        return make_case(
+        case = make_case(
             name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own),
             carried=own.payload, slow=slow,
         )  # fmt: skip
     except NoPosture as error:
         raise MeasurementError(f"{error}", name) from error
+    for moved in offered("link_motion") if getattr(robot, "corrections", None) is not None else ():
+        case = moved(robot, case, options.settings)
+    return case
 
 
 def read_motion(
