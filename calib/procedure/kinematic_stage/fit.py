@@ -43,7 +43,7 @@ class Outcome:
     Attributes:
         inputs: what it worked on.
         selection: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
-        rigid: the best fit without joint corrections: the geometry that a URDF holds and dynamics is identified on.
+        rigid: the best fit without joint corrections: the geometry that a URDF holds.
         outliers: rows of the fit that do not fit, worst first.
         unclear: what is not identifiable from the poses.
         findings: what the fit says of itself.
