@@ -100,7 +100,7 @@ class IdentificationModel:
         load: np.ndarray | None = None,
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
-        link: Sequence[np.ndarray] | None = None,
+        link: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return the regressor (N, rows, p), in the memory order (p, rows, N), which stacks without a copy.
 
@@ -115,7 +115,8 @@ class IdentificationModel:
         loads = None if load is None else shaped(load, q.shape, "load").T
         out = np.zeros((self.p, self.n * len(self.torque_rows.blocks), len(q)))
         if self.inertial:
-            rigid_body.fill_regressor(self.bodies, *(link or (q, v, a)), out[: self.inertial])
+            moved = (q, v, a) if link is None else link
+            rigid_body.fill_regressor(self.bodies, *moved, out[: self.inertial])
             self._drop_absent(out, carried)
         motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
         states = drives.friction_states(self.columns, motions[0]) if states is None else states
@@ -190,13 +191,14 @@ class IdentificationModel:
         a: np.ndarray,
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
-        link: Sequence[np.ndarray] | None = None,
+        link: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return the torques (N, rows) of parameters (p,), by recursive Newton-Euler.
 
         Friction that depends on the load feels the torque that the bodies, which move as `link`, need by the model.
         """
-        load = self.transmitted(values, *(link or (q, v, a)), carried) if self.inertial else None
+        moved = (q, v, a) if link is None else link
+        load = self.transmitted(values, *moved, carried) if self.inertial else None
         states = drives.friction_states(self.columns, np.ascontiguousarray(q.T)) if states is None else states
         parts, state = {BODIES: np.zeros(np.shape(q)) if load is None else load}, 0
         motions = [q.T, v.T, a.T, None if load is None else load.T]

@@ -219,7 +219,8 @@ class Dynamics(Frozen, Generic[Model]):
         result = np.empty(case.motion.q.shape)
         for start in range(0, len(case.motion), BLOCK):
             part = slice(start, start + BLOCK)
-            result[part] = self.model.transmitted(self.values, *(x[part] for x in case.links), case.carried)
+            q, v, a = (x[part] for x in case.links)
+            result[part] = self.model.transmitted(self.values, q, v, a, case.carried)
         return result
 
 

@@ -55,7 +55,7 @@ class Case:
 
     def deflected(self, part: slice) -> dict[str, Any]:
         """Return the argument ``link`` of a model's regressor at a part of the samples; none where joints are stiff."""
-        return {} if self.link is None else {"link": [x[part] for x in self.link]}
+        return {} if self.link is None else {"link": tuple(x[part] for x in self.link)}
 
     @property
     def duration(self) -> float:
