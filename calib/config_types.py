@@ -12,6 +12,7 @@ import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from typing import Annotated, Any, get_args
 
@@ -20,6 +21,7 @@ from calib.units import QUANTITIES
 
 UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
+_NAMES = {"pi": math.pi, "inf": math.inf}
 
 
 class _Short(reprlib.Repr):
@@ -96,25 +98,34 @@ def _expression(text: str, quantity: str, max_letters: int = 200) -> float:
         if text.endswith(unit):
             text, factor = text.removesuffix(unit).strip(), size
             break
-    return _evaluated(ast.parse(text, mode="eval").body) * factor
+    return evaluated(ast.parse(text, mode="eval").body) * factor
 
 
-def _evaluated(node: ast.expr) -> float:
-    """Return the value of an expression of numbers, pi, signs and + - * /; refuse anything else."""
+def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Mapping[Any, Any] = _BINARY) -> Any:
+    """Return the value of an expression of numbers, names, signs and operations; refuse anything else.
+
+    Args:
+        names: values by name, and functions of one value.
+        operations: class of the operation, as `ast` has it → function of two values.
+
+    Raises:
+        ValueError: with the part that is something else.
+    """
+    inner = partial(evaluated, names=names, operations=operations)
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
-        case ast.Name(id="pi"):
-            return math.pi
-        case ast.Name(id="inf"):
-            return math.inf
+        case ast.Name(id=name) if name in names and not callable(names[name]):
+            return names[name]
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return -_evaluated(operand)
+            return -inner(operand)
         case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-            return _evaluated(operand)
-        case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _BINARY:
-            return _BINARY[type(sign)](_evaluated(left), _evaluated(right))
-    raise ValueError(ast.dump(node))
+            return inner(operand)
+        case ast.BinOp(left=left, op=sign, right=right) if type(sign) in operations:
+            return operations[type(sign)](inner(left), inner(right))
+        case ast.Call(func=ast.Name(id=name), args=[operand], keywords=[]) if callable(names.get(name)):
+            return names[name](inner(operand))
+    raise ValueError(ast.unparse(node))
 
 
 def _float(value: Any) -> float:

@@ -8,7 +8,7 @@ is not a special case. Joint numbers here count from 0, in names from 1.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,17 +161,6 @@ def coupled(
         DriveTerm(f"Fvm{label}", "velocity", crossed),
         DriveTerm(f"Fcm{label}", "sign", total, (v0,)),
     )
-
-
-def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
-    """Return the constant inertia (n, n) that acceleration terms add to that of the bodies: diag(Ia) and couplings."""
-    result = np.zeros((n, n))
-    for one, value in zip(terms, values, strict=True):
-        if one.shape == "acceleration":
-            for row, motion in one.acts:
-                for joint, weight in motion:
-                    result[row, joint] += weight * value
-    return result
 
 
 def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarray | None], states: np.ndarray) -> None:

@@ -3,8 +3,9 @@
 The methods with constraints are in `calib.rooms.alternatives` and `calib.rooms.closed_loop`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -43,6 +44,26 @@ class WeightedSum:
         return -np.inf if low is None else low, np.inf if high is None else high
 
 
+_Json = partial(Checked, lambda value: value)  # what a file's schema says of a key that Python may fill with a function
+
+
+@strict
+@dataclass(frozen=True)
+class CurvedConstraint:
+    """A constraint h >= 0 on parameters by name, where h is twice differentiable.
+
+    Attributes:
+        h: formula of parameters' names: ``"XX2 * ZZ2 >= XZ2**2"``; in Python also a function whose arguments are named
+            as the parameters.
+        slope: of a function h: function of the same arguments that returns the derivative by each of them.
+        name: of the constraint, for messages.
+    """
+
+    h: Annotated[str | Callable[..., float], Expect("a formula, or in Python a function"), _Json({"type": "string"})]
+    slope: Annotated[Callable[..., Any] | None, Expect("a function, in Python alone"), _Json({"not": {}})] = None
+    name: Text = ""
+
+
 Bounds = Annotated[
     tuple[Annotated[float, Real(infinite=True)], Annotated[float, Real(infinite=True)]],
     Expect("two numbers, [lower, upper]; -inf or inf for no bound"), Checked(_in_order),
@@ -60,6 +81,7 @@ class ConstraintSettings:
         bodies: bodies must be physically consistent; replaces `inertia`.
         bounds: name of a parameter → [lower, upper]; equal bounds fix it.
         sum: constraints on weighted sums of parameters.
+        curved: constraints on functions of parameters.
     """
 
     signs: Flag = True
@@ -67,6 +89,7 @@ class ConstraintSettings:
     bodies: Flag = False
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
     sum: tuple[WeightedSum, ...] = ()
+    curved: tuple[CurvedConstraint, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,6 +76,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     weights = { Fv5 = 1.0, Fv6 = -1.0 }
     equal = 0.0
     name = "wrist joints alike"
+    [[constraints.curved]]           # a twice differentiable function of parameters, h >= 0; numbers, + - * / **, sqrt,
+    h = "XX2R * ZZ2R >= XZ2R**2"     # exp, log, sin, cos, tanh; in Python also a function with its derivatives `slope`
     [files."run_load.npz"]           # for this file only: payload, gains, reference; keys of filter and recording
     payload = ["tool"]
 """

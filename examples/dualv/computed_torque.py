@@ -16,9 +16,9 @@ import numpy as np
 import run_kernels
 
 from calib.dynamics import rigid_body
-from calib.dynamics.drives import added_inertia
 from calib.errors import CannotSimulate, UsageError
 from calib.records import frozen
+from calib.rooms.closed_loop.simulation import added_inertia
 from calib.rooms.parallel.mechanism.closure import compiled
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, preload_directions

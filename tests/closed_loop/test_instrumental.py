@@ -13,7 +13,7 @@ from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import JointRange
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
-from calib.identification.constraint_settings import ConstraintSettings
+from calib.identification.constraint_settings import ConstraintSettings, CurvedConstraint
 from calib.identification.rows import make_case
 from calib.robot import mdh
 from calib.rooms.alternatives.parameter_constraints import make_constraints
@@ -160,6 +160,19 @@ def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_ot
     assert held.fit.estimate.values[place] == pytest.approx(limit, rel=1e-6)
     assert held.fit.estimate.sigma[place] < 1e-9 * plain.fit.estimate.sigma[place]
     assert held.constrained is not None and held.constrained.findings[0].code == "on-its-bound"
+
+
+@pytest.mark.parametrize("method", ["iv", "didim"])
+def test_a_curved_constraint_holds_in_every_round(method):
+    case = log(1e-3, 3)
+    _, model, base = arm()
+    curved = (CurvedConstraint("Fv1 * Fv2 >= 0.7"), CurvedConstraint("ZZ1R * Fc1 <= 100"))
+    asked = ConstraintSettings(signs=False, inertia=10, curved=curved)
+    constraints = make_constraints(asked, model, base, base.names, [None] * base.b)
+    held = found(case, method=method, constraints=constraints, limit=20)
+    value = dict(zip(held.fit.estimate.names, held.fit.estimate.values))
+    assert value["Fv1"] * value["Fv2"] == pytest.approx(0.7, rel=1e-6)
+    assert held.constrained is not None and [one.name for one in held.constrained.binding] == ["Fv1 * Fv2 >= 0.7"]
 
 
 @pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])

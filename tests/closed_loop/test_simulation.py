@@ -13,7 +13,7 @@ from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain
 from calib.rooms.cells import known_robots
-from calib.rooms.closed_loop import controllers
+from calib.rooms.closed_loop import controllers, simulation
 from calib.rooms.closed_loop.controllers import Reference
 from calib.rooms.closed_loop.simulation import Plant, Sensing, feed_forward, forward_dynamics, simulate, tracking_error
 from calib.transforms import displace
@@ -53,10 +53,16 @@ def test_forward_dynamics_undo_inverse_dynamics_with_drives(chain):
     columns = np.zeros((len(terms), chain.n, 50))
     drives.fill(terms, columns, [q.T, v.T, zero.T, None], np.zeros((0, 50)))
     taken = np.einsum("kjn,k->nj", columns, amounts)
-    added = drives.added_inertia(terms, amounts, chain.n)
+    added = simulation.added_inertia(terms, amounts, chain.n)
     found = forward_dynamics(Plant(bodies, terms, np.concatenate([inertial, amounts])), q, v, tau)
     needed = rigid_body.inverse_dynamics(bodies, inertial, q, v, found) + found @ added + taken
     assert np.abs(needed - tau).max() < 1e-10 * np.abs(found).max()
+
+
+def test_motors_and_couplings_add_inertia():
+    terms = (*drives.standard(["Ia"] * 6), *drives.coupled(4, 5)[:1])
+    added = simulation.added_inertia(terms, np.arange(1.0, 8.0), 6)
+    assert added[4, 5] == added[5, 4] == 7.0 and added[2, 2] == 3.0
 
 
 def test_it_runs_like_pinocchios_aba_under_rk4():

@@ -4,7 +4,8 @@ A row is lower <= aᵀ β <= upper over the columns that are estimated. A standa
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
 over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `MIN_EIGENVALUE`, S making the mean diagonal one.
-Bodies that can exist are a cone (`calib.rooms.alternatives.body_cone`), which M(q) > 0 follows from.
+Bodies that can exist are a cone (`calib.rooms.alternatives.body_cone`), which M(q) > 0 follows from. A user's own
+functions h(β) >= 0 may bend (`calib.rooms.alternatives.curved`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from calib.identification.methods.method import IdentificationProblem
 from calib.records import Frozen, frozen
 from calib.rooms.alternatives.body_cone import BodyCone, cone_of
 from calib.rooms.alternatives.constrained import Constrained, Definite, contradicting, restricted, within
+from calib.rooms.alternatives.curved import Curved, make_curved, tangents
 
 MIN_EIGENVALUE = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
 RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4  # factor and limit of it where an estimate cannot be simulated (our choice)
@@ -44,6 +46,7 @@ class Constraints(Frozen):
         plane: name of the row that replaces the cone (`touched`); empty without one.
         least: lower bound of the smallest eigenvalue of S M(q) S, see `raised`.
         likely: indices of the postures whose constraint was binding in a similar problem.
+        curved: constraints h(β) >= 0; tangents: names of the rows that replace them (`touched`).
     """
 
     names: tuple[str, ...]
@@ -55,17 +58,22 @@ class Constraints(Frozen):
     plane: str = ""
     least: float = MIN_EIGENVALUE
     likely: np.ndarray | None = None
+    curved: tuple[Curved, ...] = ()
+    tangents: tuple[str, ...] = ()
 
-    def solve(self, factor: np.ndarray) -> Constrained:
+    def solve(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constrained:
         """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.rooms.alternatives.constrained.within`.
+
+        Args:
+            free: (p,) β without constraints, from which the scale of M(q) is taken; None: that of the factor.
 
         Raises:
             NotConverged: with the last β, if no positive definite inertia satisfies the other constraints.
         """
-        if self.cone is not None:
-            return self.touched(factor).solve(factor)
+        if self.cone is not None or self.curved:
+            return self.touched(factor).solve(factor, free)
         p = len(factor) - 1
-        free = np.linalg.solve(factor[:p, :p], factor[:p, p])
+        free = np.linalg.solve(factor[:p, :p], factor[:p, p]) if free is None else free
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
         with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
             wanted = _definite(self.inertia, free, self.least, self.likely)
@@ -83,11 +91,13 @@ class Constraints(Frozen):
         return replace(self, least=least) if len(self.inertia) and least <= MAX_EIGENVALUE else None
 
     def touched(self, factor: np.ndarray) -> Constraints:
-        """Return the constraints with the cone of consistent bodies replaced by its tangent plane at the optimum.
+        """Return the constraints with curved ones and the cone of consistent bodies replaced by planes at the optimum.
 
         Raises:
-            NotConverged: where no physically consistent bodies satisfy the other constraints.
+            NotConverged: where no estimate, or no physically consistent bodies, satisfy the other constraints.
         """
+        if self.curved:
+            return self._flattened(factor).touched(factor)
         if self.cone is None:
             return self
         with _unsatisfied(f"no bodies that can exist satisfy {self}: remove bounds"):
@@ -98,6 +108,28 @@ class Constraints(Frozen):
         return replace(
             self, cone=None, plane=named, names=(*self.names, named), matrix=np.vstack([self.matrix, plane.normal]),
             lower=np.append(self.lower, plane.bound), upper=np.append(self.upper, np.inf),
+        )  # fmt: skip
+
+    def _flattened(self, factor: np.ndarray) -> Constraints:
+        """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
+        others, m = replace(self, curved=()), len(self.curved)
+        start = others.solve(factor).values
+        free = np.append(np.linalg.solve(factor[:-1, :-1], factor[:-1, -1]), np.zeros(m))
+
+        def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
+            wider = np.pad(self.matrix, ((0, 0), (0, m)))
+            return replace(
+                others, names=("",) * len(rows) + self.names, matrix=np.vstack([rows, wider]),
+                lower=np.append(lower, self.lower), upper=np.append(np.full(len(lower), np.inf), self.upper),
+                inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
+            ).solve(triangle, free)  # fmt: skip
+
+        names = tuple(one.name for one in self.curved)
+        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {others}: remove one of them"):
+            normals, bounds = tangents(self.curved, factor, start, solve)
+        return replace(
+            others, tangents=names, names=(*self.names, *names), matrix=np.vstack([self.matrix, normals]),
+            lower=np.append(self.lower, bounds), upper=np.append(self.upper, np.full(m, np.inf)),
         )  # fmt: skip
 
 
@@ -150,7 +182,8 @@ def make_constraints(
         )
     cone = cone_of(model, base) if settings.bodies and model.inertial else None
     inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, len(names))
-    return Constraints(tuple(words), matrix, low, high, inertia, cone)
+    curved = tuple(make_curved(one, lambda weights: _row(weights, base, names)) for one in settings.curved)
+    return Constraints(tuple(words), matrix, low, high, inertia, cone, curved=curved)
 
 
 def constraints_of(problem: IdentificationProblem) -> Constraints:
@@ -206,9 +239,13 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
     for k in np.flatnonzero(found.binding & (places >= 0)):
         row = constraints.matrix[places[k]]
         bound = (constraints.upper if upper[k] else constraints.lower)[places[k]]
+        name, origin = constraints.names[places[k]], 0.0
+        if name in constraints.tangents:  # told as h, by its plane, above zero
+            origin = bound
         binding.append(Binding(
-            constraints.names[places[k]], float(found.multipliers[k]), float(row @ free.estimate.values),
-            float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound), bool(same[places[k]]),
+            name, float(found.multipliers[k]), float(row @ free.estimate.values - origin),
+            float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound - origin),
+            bool(same[places[k]]),
         ))  # fmt: skip
     tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))

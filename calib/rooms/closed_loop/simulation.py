@@ -15,14 +15,14 @@ Shiriaev & Jubien 2019, section 7): an error of torque that the feedback swallow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_banded
 
 from calib.dynamics.bodies import Bodies, upright_turn
-from calib.dynamics.drives import DriveTerm, added_inertia
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import mass_matrix
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
@@ -33,6 +33,17 @@ from calib.rooms.closed_loop.controllers import Reference
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LINEAR = ("acceleration", "velocity", "one")  # shapes that the kernels hold as matrices; the others are acts
 LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (check their unit), or the delay"
+
+
+def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
+    """Return the constant inertia (n, n) that acceleration terms add to that of the bodies: diag(Ia) and couplings."""
+    result = np.zeros((n, n))
+    for one, value in zip(terms, values, strict=True):
+        if one.shape == "acceleration":
+            for row, motion in one.acts:
+                for joint, weight in motion:
+                    result[row, joint] += weight * value
+    return result
 
 
 @dataclass(frozen=True, eq=False)
