@@ -222,7 +222,7 @@ def tangents(
 
     for _ in range(MAX_ROUNDS):
         normals, heights = np.array([one.normal(b) for one in curved]), np.array([one.value(b) for one in curved])
-        bend = -sum(mu / each * one.curvature(b) for mu, each, one in zip(multipliers, size, curved))
+        bend = -np.sum([mu / each * one.curvature(b) for mu, each, one in zip(multipliers, size, curved)], axis=0)
         planes = np.hstack([normals / size[:, None], np.eye(m)])
         rows = np.vstack([planes, np.eye(p + m)[p:]])
         found = solve(
