@@ -18,6 +18,7 @@ from calib.identification.identify_options import IdentifyOptions, IdentifySetti
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
+from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import plain
 from calib.robot.calibrated import CalibratedChain
@@ -117,6 +118,7 @@ def identify_dynamics(
     method: str | None = None,
     friction: str | None = None,
     options: IdentifyOptions | str | Path | None = None,
+    excitation: str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
     seed: int = 0,
@@ -136,6 +138,7 @@ def identify_dynamics(
         validate: recordings of other motion.
         method, friction: in place of the settings'; see `methods`.
         options: the settings as a TOML file (``calib formats identify-options``).
+        excitation: folder of `design_excitation`: reference of recordings that have none, for methods with a [loop].
         seed: of everything random.
         on_read: called with what was read, before the identification begins.
         progress: called with a few words now and then.
@@ -159,7 +162,8 @@ def identify_dynamics(
         )  # fmt: skip
     given = inputs.gather(
         cast(Any, robot), listed(recordings), listed(validate), options=chosen, method=method, friction=friction,
-        base=base, tip=tip, seed=seed, progress=progress,
+        base=base, tip=tip, seed=seed, designed=[] if excitation is None else [coefficients.read(Path(excitation))],
+        progress=progress,
     )  # fmt: skip
     if on_read is not None:
         on_read(given)

@@ -36,7 +36,8 @@ def identify_dynamics(
         friction: auto, standard, or one step: coupling, load, presliding, stribeck, asymmetric, root, cubic, ripple,
             cable
         options: TOML: drives, payloads, gains, filters, identification
-        excitation: folder of calib excite: its prediction is compared with the result
+        excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
+            recordings that have none (methods with a [loop])
     """
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
@@ -54,6 +55,7 @@ def identify_dynamics(
     with progress() as show:
         found = identified(
             robot, recordings, validate=validate or (), method=method, friction=friction, options=options, base=base,
+            excitation=excitation,
             tip=tip, seed=seed, on_read=read, progress=show,
         )  # fmt: skip
         show("writing")

@@ -22,7 +22,10 @@ position error on the joint side::
     velocity_cutoff = 200.0          # low-pass of the measured velocity [Hz]
     reference_velocity = "derivative"  # of q_ref at the instant; or "difference": over the period before it
     feedforward = "none"             # none; cad: the robot's own inertias; recording: column tau_ff
-    reference = "recording"          # the column q_ref (q_des, q_cmd, …); or a file, see below
+    reference = "recording"          # the column q_ref (q_des, q_cmd, …), or the session's designed motion (of the
+                                     # command: --excitation FOLDER); or a file, see below
+    timing = "checked"               # of the reference, by the motors' torques: checked: refused where it is late or
+                                     # early; estimated: moved; stated: as it is. A designed motion is always moved
     design = [1.2, 1.5]              # inertias for which the gains are stated [kg m²], if they follow the estimate
     inertia = [0.4, 0.5]             # of the robot the simulation starts from [kg m²]; default kd² / (2 kp)
     instruments = "iv"               # iv, or didim: the simulated motion alone
@@ -61,6 +64,7 @@ FEEDBACK, CAD, IDENTIFIED, FLOOR = "feedback", "cad", "model", "floor"  # what i
 
 CONTROLLERS = ("pd", "cascade", "identify")
 SPEEDS = ("derivative", "difference")
+TIMINGS = ("checked", "estimated", "stated")
 AHEAD = ("none", "cad", "recording")
 INSTRUMENTS = ("iv", "didim")
 NEEDED = {"pd": ("kp", "kd"), "cascade": ("position", "velocity"), "identify": ()}
@@ -95,6 +99,7 @@ class LoopSettings:
     reference_velocity: Annotated[str, OneOf(SPEEDS)] = "derivative"
     feedforward: Annotated[str, OneOf(AHEAD)] = "none"
     reference: Name = "recording"
+    timing: Annotated[str, OneOf(TIMINGS)] = "checked"
     design: Gains = ()
     inertia: Gains = ()
     instruments: Annotated[str, OneOf(INSTRUMENTS)] = "iv"

@@ -14,7 +14,7 @@ tau_link   tau_link, tau_l, tau_sensor, link_torque
 tau_motor  tau_motor, tau_m, motor_torque
 q_link     q_link, link_position
 q_ref      q_ref, q_des, q_cmd, q_desired, q_reference, q_command, q_target, position_reference, position_command,
-           desired_position, reference_position, target_position, target_q
+           desired_position, reference_position, target_position, target_q (UR's RTDE), q_d (Franka)
 tau_ff     tau_ff, tau_feedforward, torque_feedforward
 ========== =============================================================================================
 
@@ -46,7 +46,7 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "q_link": ("q_link", "link_position"),
     "q_ref": (
         "q_ref", "q_des", "q_cmd", "q_desired", "q_reference", "q_command", "q_target", "position_reference",
-        "position_command", "desired_position", "reference_position", "target_position", "target_q",
+        "position_command", "desired_position", "reference_position", "target_position", "target_q", "q_d",
     ),
     "tau_ff": ("tau_ff", "tau_feedforward", "torque_feedforward"),
 }  # fmt: skip

@@ -90,6 +90,7 @@ class Motion:
         tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
             filtered; or None.
         sampling, cutoffs: what was found; notes: for the user; jumps: the recording's, in words.
+        located: where a designed motion that is the reference was found to begin [s]; None: another reference.
     """
 
     t: np.ndarray
@@ -119,6 +120,7 @@ class Motion:
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
     jumps: tuple[str, ...] = ()
+    located: float | None = None
 
     def __len__(self) -> int:
         return len(self.t)
@@ -127,6 +129,10 @@ class Motion:
     def n(self) -> int:
         """The number of joints."""
         return self.q.shape[1]
+
+    def part(self, rows: slice) -> "Motion":
+        """Return the motion of a slice of its samples."""
+        return replace(self, **{name: value[rows] for name in ROWS if (value := getattr(self, name)) is not None})
 
     def in_band(self, values: np.ndarray) -> np.ndarray:
         """Return `values` (N, ...) low-passed to the identification band, at the full rate, segment by segment."""

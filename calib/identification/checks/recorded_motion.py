@@ -43,6 +43,7 @@ class LocatedMotion:
 
     Attributes:
         start, stop: of the complete repetitions with a short margin [s], in the recording's time.
+        began: of the first of them, where the positions match best [s]: later than asked for by the tracking lag.
         periods: number of complete repetitions.
         tracking: (n,) rms of recorded minus designed positions [rad or m].
         likeness: smallest share of the motion's variance that a recorded period explains.
@@ -51,6 +52,7 @@ class LocatedMotion:
 
     start: float
     stop: float
+    began: float
     periods: int
     tracking: tuple[float, ...]
     likeness: float
@@ -70,7 +72,8 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     edge_time = 0.25  # kept before and after the motion [s], for the filters' borders
     return LocatedMotion(
         start=max(float(recording.t[0]), float(start) - edge_time), stop=min(float(recording.t[-1]), float(stop) +
-        edge_time), periods=found.periods, tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
+        edge_time), began=float(start) + STEP * found.lag, periods=found.periods,
+        tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
         loosest=int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9))),
     )  # fmt: skip
 

@@ -16,8 +16,9 @@ from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
-from calib.errors import MeasurementError, NoPosture, UsageError, suggestion
+from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, suggestion
 from calib.extensions import offered
+from calib.identification.checks.recorded_motion import DesignedMotion, locate
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions
@@ -26,6 +27,7 @@ from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.procedure.robot_kinds import Mechanism, joints_of
+from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.description import remarks
@@ -114,6 +116,7 @@ def gather(
     base: str | None = None,
     tip: str | None = None,
     seed: int = 0,
+    designed: Sequence[DesignedMotion] = (),
     progress: Progress | None = None,
 ) -> IdentificationInputs:
     """Return the inputs of an identification from files: the robot, and all recordings as motions.
@@ -125,6 +128,7 @@ def gather(
         method, friction: in place of the options'.
         base, tip: links of a URDF.
         seed: for everything random.
+        designed: motions of which a recording without a reference contains one, for options with a [loop].
     """
     say = progress or (lambda words: None)
     options = _with_choices(options or IdentifyOptions(), method, friction, seed)
@@ -146,7 +150,7 @@ def gather(
         say(f"reading {name}")
         like = motions[0] if len(motions) >= len(recordings) else None
         motion = read_motion(each, joints, options.file_settings(path), like)
-        motions.append(_referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
+        motions.append(_referred(motion, each, joints, options, designed) if like is None else motion)
     notes = [
         *(remarks(chain, bodies=False) if arm else ()),
         *(f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes),
@@ -271,14 +275,36 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
 
 
-def _referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
-    """Return the motion with the reference trajectory of a separate file, if the options name one."""
-    own, loop = options.file_settings(path), options.settings.loop
-    named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
-    if not named or loop is None:
+def _referred(
+    motion: Motion, given: str | Path | Recording, joints: Joints, options: IdentifyOptions,
+    designed: Sequence[DesignedMotion],
+) -> Motion:  # fmt: skip
+    """Return the motion with its reference: of a file that the options name, its own, or a designed motion."""
+    own, loop = options.file_settings(_path(given)), options.settings.loop
+    if loop is None:
         return motion
-    beside = Path(options.source).parent / named
-    return with_reference(motion, beside if beside.exists() else Path(named), Joints(chain.joint_names), own.recording)
+    if named := own.reference or loop.reference * (loop.reference != "recording"):
+        beside = Path(options.source).parent / named
+        return with_reference(motion, beside if beside.exists() else Path(named), joints, own.recording)
+    return _with_design(motion, given, joints, own, designed) if designed and motion.q_ref is None else motion
+
+
+def _with_design(
+    motion: Motion, given: str | Path | Recording, joints: Joints, own: FileSettings, designed: Sequence[DesignedMotion]
+) -> Motion:
+    """Return the part of a motion in which whole periods of a designed motion were played, with it as the reference.
+
+    They are looked for in the whole file: a cut may contain less than a period.
+    """
+    whole = given if isinstance(given, Recording) else read_recording(parse_cut(str(given))[0], joints, own.recording)
+    for design in designed:
+        if (found := locate(whole, design)) is None:
+            continue
+        part = slice(*np.searchsorted(motion.t, [found.began, found.began + found.periods * design.period]))
+        if part.start < part.stop:
+            q_ref = frozen(design.orders(motion.t[part] - found.began)[0])
+            return replace(motion.part(part), q_ref=q_ref, located=found.began)
+    refuse_data(motion.file, "has no reference positions (q_ref), and contains none of the designed motions whole")
 
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:

@@ -252,7 +252,10 @@ def _gathered(
 ) -> inputs.IdentificationInputs:
     """Return the inputs of the identification: calibrated robot, training recordings, validation recordings."""
     options, seed = options_of(session), session.settings.seed
-    return inputs.gather(session.fit.path, training, unseen, options=options, seed=seed, progress=say)
+    designed = [motion for name, motion in designed_motions(session).items() if name == "training"]
+    return inputs.gather(
+        session.fit.path, training, unseen, options=options, seed=seed, designed=designed, progress=say
+    )
 
 
 def identify(session: Session, say: Say) -> list[str]:

@@ -181,7 +181,8 @@ class DynamicsSection:
         torques: motor, link (sensors behind the gears), or both
         friction: or standard, or one step of the ladder; see calib identify --friction
         method: or ols, irls, tls, …; see calib study --list-methods
-        options: a TOML file next to this one; see `calib formats identify-options`
+        options: a TOML file next to this one; see `calib formats identify-options`; for methods with a [loop] the
+            designed motion is the reference of recordings without columns q_ref
         holdout: share at the end of each recording that is held out if there is no validation recording; 0:
             none
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none

@@ -5,15 +5,16 @@ inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot
 reference. Its motion then takes the place of the recorded one: the same instants, the same low-pass.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import Decimator, border, curvature, low_pass, slope
-from calib.data.signals.motion import ROWS, Motion
+from calib.data.signals.motion import Motion
 from calib.dynamics.bodies import Bodies
 from calib.errors import CalibError, NotConverged, UsageError, refuse_data
 from calib.identification.loop import Controller, LoopSettings
@@ -27,6 +28,7 @@ from calib.rooms.closed_loop.controllers import (
     stated_controller,
 )
 from calib.rooms.closed_loop.simulation import Plant, SimulatedRun, feed_forward
+from calib.rooms.closed_loop.timing import check_no_copy, reference_shift
 
 DEGREES = 180.0 / np.pi
 
@@ -84,17 +86,24 @@ def close_loops(
     for case in cases:
         _check_reference(case.motion)
     stretches = [
-        (case, part, *_make_reference(part.motion, loop.rate))
+        part
         for case in cases
         for part in (take(case, slice(a, b)) for a, b in segments(case.motion.segment))
         if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
     ]
     if not stretches:
         refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
-    controller, identified, notes = _controller(loop, max((s[1:3] for s in stretches), key=lambda s: len(s[0].motion)))
+    ordered = sorted(stretches, key=lambda part: -len(part.motion))
+    controller, identified, notes = _controller(loop, ordered[0])
+    shifts: dict[str, float] = {}
+    for part in ordered:  # the longest part of each recording tells
+        if part.name not in shifts and loop.timing != "stated":
+            shifts[part.name], said = _shift(part, loop, partial(_fed_forward, controller, loop, cad, bodies))
+            notes += said
     design = loop.per_joint("design", bodies.n) if loop.design else None
     pairs = []
-    for _, part, reference, every in stretches:
+    for part in stretches:
+        reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
         own = _fed_forward(controller, loop, cad, bodies, part.motion, reference, every)
         if loop.reference_velocity == "difference":
             late = np.diff(reference.q, axis=0) / reference.period  # by half a period
@@ -105,10 +114,7 @@ def close_loops(
 
 def take(case: Case, part: slice) -> Case:
     """Return the part of a case in the slice `part`."""
-    rows = {name: value[part] for name in ROWS if (value := getattr(case.motion, name)) is not None}
-    return replace(
-        case, motion=replace(case.motion, **rows), target=case.target[part], present=case.present[part]
-    )  # fmt: skip
+    return replace(case, motion=case.motion.part(part), target=case.target[part], present=case.present[part])
 
 
 def _check_reference(motion: Motion) -> None:
@@ -117,8 +123,8 @@ def _check_reference(motion: Motion) -> None:
         refuse_data(
             motion.file,
             "has no reference positions (columns q_ref1 …, q_des, q_cmd, or [recording] names = { q_ref = '…' }); the "
-            "simulation of the closed loop needs them. Log them, or give a file: "
-            "[loop] reference = '…'; without a reference use wls or irls",
+            "simulation of the closed loop needs them. Log them, or give a file: [loop] reference = '…', or the folder "
+            "of the designed motion: --excitation FOLDER; without a reference use wls or irls",
         )
     finite = np.isfinite(motion.q_ref).all(axis=0)
     if not finite.all():
@@ -128,6 +134,8 @@ def _check_reference(motion: Motion) -> None:
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
         _compare(motion, motion.q_ref[:, j], int(j))
+    if motion.located is None:
+        check_no_copy(motion, low_passed(np.asarray(motion.q_ref), motion))
 
 
 def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
@@ -156,8 +164,54 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     )
 
 
-def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: float = 4.0) -> tuple[Reference, float]:
+def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller]) -> tuple[float, tuple[str, ...]]:
+    """Return by how much later than stated the reference of a recording was played [s], and notes.
+
+    A stated time is kept, and refused where the torques contradict it.
+
+    Raises:
+        MeasurementError: for a reference that is late or early by the motors' torques.
+        UsageError: for a designed motion without motor torques to time it by.
+    """
+    motion, estimated = part.motion, part.motion.located is not None or loop.timing == "estimated"
+    if not part.torque_rows.with_motors:
+        if estimated:
+            raise UsageError(
+                f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
+                "use rows = 'both', or log the reference (q_ref)"
+            )
+        return 0.0, ()
+    reference, every = _make_reference(motion, loop.rate)
+    band = min(loop.band, 0.5 * float(motion.cutoff.min()), 0.2 * motion.rate)
+    found = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
+    shown = f"{1e3 * abs(found.seconds):.3g} ± {1e3 * found.sigma:.2g} ms"
+    if estimated:
+        begin = (motion.located or 0.0) + found.seconds
+        where = "" if motion.located is None else f"the designed motion begins at {begin:.5f} s, "
+        way = "later" if found.seconds > 0.0 else "earlier"
+        return found.seconds, (
+            f"{part.name}: {where}the reference was moved {shown} {way}; the controller explains "
+            f"{100 * (1 - found.left):.3g} % of the torques, one σ of time changes them by {100 * found.effect:.2g} %",
+        )
+    min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5  # [s], and shares of the torques (our choice)
+    late = abs(found.seconds) > max(5.0 * found.sigma, min_shift)
+    if late and found.left < max_left and found.before > min_gain * found.left:
+        refuse_data(
+            motion.file,
+            f"its reference (q_ref) is {'late' if found.seconds < 0.0 else 'early'} by {shown}: so "
+            f"moved, the controller of [loop] explains {100 * (1 - found.left):.3g} % of the torques, as logged "
+            f"{100 * (1 - min(found.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
+            "and share, which may look like this; timing = 'stated' takes it as it is",
+        )
+    return 0.0, ()
+
+
+def _make_reference(
+    motion: Motion, rate: float | None = None, shift: float = 0.0, cutoff_factor: float = 4.0
+) -> tuple[Reference, float]:
     """Return the reference of a motion without gaps, resampled at the control rate, and the control periods per sample.
+
+    It is moved to later by `shift` [s].
 
     The logged positions are low-passed at `cutoff_factor` f_q and joined by a cubic spline, whose slopes are v and a.
 
@@ -171,8 +225,9 @@ def _make_reference(motion: Motion, rate: float | None = None, cutoff_factor: fl
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
     place = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
-    v, a = (spline(place, order) * motion.rate**order for order in (1, 2))
-    return Reference(motion.t[0] + place / motion.rate, spline(place), v, a), every
+    asked = np.clip(place - shift * motion.rate, 0.0, len(smooth) - 1.0)
+    q, v, a = (spline(asked, order) * motion.rate**order for order in range(3))
+    return Reference(motion.t[0] + place / motion.rate, q, v, a), every
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
@@ -204,11 +259,8 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
     return slice(max(edge, int(np.ceil(settling_time * motion.rate))), len(motion) - edge)
 
 
-def _controller(
-    loop: LoopSettings, longest: tuple[Case, Reference]
-) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
+def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
     """Return the controller (stated, or identified from the longest part), its identification result, and notes."""
-    case, reference = longest
     n = case.motion.n
     if loop.controller != "identify":
         return stated_controller(loop, n), None, ()
@@ -216,9 +268,13 @@ def _controller(
     if not case.torque_rows.with_motors:
         raise UsageError(f"[loop] controller = 'identify' needs motor torques, not rows = '{case.torque_rows.name}'")
     band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
-    found = identify_controller(
-        reference, motion.q, case.target[:, -n:], motion.rate, band, (1, 2) if loop.integral else (0, 1), loop.integral
-    )  # fmt: skip
+
+    def identified(shift: float) -> IdentifiedController:
+        reference, _ = _make_reference(motion, loop.rate, shift)
+        orders = (1, 2) if loop.integral else (0, 1)
+        return identify_controller(reference, motion.q, case.target[:, -n:], motion.rate, band, orders, loop.integral)
+
+    found = identified(_best_shift(identified) if motion.located is not None or loop.timing == "estimated" else 0.0)
     kp, kd = found.controller.kp, found.controller.kd
     bad = np.flatnonzero((kp <= 0.0) | (kd <= 0.0))
     shown = ", ".join(f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, found.explained))
@@ -230,6 +286,20 @@ def _controller(
         )
     note = f"controller identified from {case.name} up to {band:.3g} Hz, kp/kd (explained torque): {shown}"
     return completed(found.controller, loop, n), found, (note,)
+
+
+def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
+    """Return the shift of the reference [s] with which an identified controller explains the torques best."""
+    from scipy.optimize import minimize_scalar  # slow to load
+
+    def left(shift: float) -> float:
+        return -float(np.mean(identified(shift).explained))
+
+    reach, step = 0.03, 0.002  # [s] around where positions match best (our choice)
+    middle = min(np.arange(-reach, reach + step, step), key=left)
+    return float(
+        minimize_scalar(left, bounds=(middle - step, middle + step), method="bounded", options={"xatol": 1e-6}).x
+    )
 
 
 def _fed_forward(

@@ -78,3 +78,24 @@ def test_logs_of_controllers_are_read_whatever_parts_the_columns(tmp_path, mark,
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     found = read_recording(tmp_path / "log.csv")
     assert found.kind == "current" and np.abs(found.q - series["q"]).max() < 1e-8
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "actual_q_{0} target_q_{0} actual_current_{0} target_qd_{0} target_current_{0} target_moment_{0}",  # UR's RTDE
+        "state.q[{0}] state.q_d[{0}] state.tau_J[{0}] state.dq_d[{0}] state.tau_J_d[{0}] cmd.tau_J_d[{0}]",  # libfranka
+        "q{0} q_d{0} tau_J{0} dq_d{0} tau_J_d{0} ddq_d{0}",
+    ],
+)
+def test_the_reference_of_ur_and_franka_logs_is_read(tmp_path, names):
+    series = falling(True)
+    head = ["timestamp", *(name.format(k) for name in names.split() for k in (0, 1))]
+    parts = [series["q"], series["q"] + 0.01, series["tau"], *(7.0 * series["q"],) * 3]
+    np.savetxt(
+        tmp_path / "log.csv", np.column_stack([series["t"], *parts]), delimiter=",", header=",".join(head), comments=""
+    )
+    found = read_recording(tmp_path / "log.csv")
+    assert found.q_ref is not None and np.abs(found.q_ref - series["q"] - 0.01).max() < 1e-8
+    assert np.abs(found.q - series["q"]).max() < 1e-8 and np.abs(found.effort - series["tau"]).max() < 1e-8
+    assert found.v is None
