@@ -50,7 +50,8 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
         dynamics = self.found.dynamics
-        return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)))
+        q, v, a = (np.asarray(x, dtype=float) for x in (q, v, a))
+        return dynamics.model.torque(dynamics.values, q, v, a)
 
     @one_blas_thread()
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
