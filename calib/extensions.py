@@ -12,6 +12,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
+    drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of
+                           a robot that is not a serial arm (`calib.identification.gains.DriveGains`)
     image_folders          a module: `read_images` reads a folder of images as a block of measurements
     camera_guess           a module: lenses of images completed, images as poses
     optics                 of kinds of measurement that are not the core's: their instruments' parameters

@@ -30,6 +30,7 @@ with the noise. (`didim`: W is Z.) For other methods the sensitivity is that of 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -234,17 +235,28 @@ def sensitivity(
 
     The last two columns turn gravity about the base's x and y axes [per rad].
     """
-    say = progress or (lambda words: None)
-    how = estimator(found)
-    p, count = len(how.pull), len(chain.elements) + len(TILTS)
+    p, count = len(found.names), len(chain.elements) + len(TILTS)
     if not found.dynamics.model.torque_rows.has_bodies:  # no bodies: rows that no geometry reaches
         return np.zeros((p, count)), np.zeros(count), np.zeros(count)
-    moved = _neighbours(found, chain)
-    decimator = common_decimator(cases, found.settings)
-    step = -(-sum(len(case.motion) for case in cases) // SAMPLES)
-    pulled = np.zeros((p, count))
+    return solve_sensitivity(found, cases, partial(_differences, found, _neighbours(found, chain)), SAMPLES, progress)
+
+
+def solve_sensitivity(
+    found: Identification, cases: Sequence[Case], differences: Callable[..., tuple[np.ndarray, np.ndarray]],
+    samples: int, progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the results of `sensitivity` for any robot, K changes of whose geometry `differences` evaluates.
+
+    Args:
+        differences: takes a case, samples of it, R⁻¹ (y - W φ) and the decimator; returns ∂(W φ - y)/∂g (M, rows, K)
+            and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
+        samples: at the full rate; longer recordings are represented by pieces.
+    """
+    say, how = progress or (lambda words: None), estimator(found)
+    p, decimator = len(how.pull), common_decimator(cases, found.settings)
+    step = -(-sum(len(case.motion) for case in cases) // samples)
     used: list[ObservationRows] = []
-    changes: list[np.ndarray] = []
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
     instruments: list[np.ndarray] = []
     own_rows = found.fitted.instruments or tuple((case, part, None) for part, case in zip(found.rows, cases))
     for case, part, z in own_rows:
@@ -252,26 +264,25 @@ def sensitivity(
             say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
             used.append(cut(part, own))
             residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
-            weighed = residual * used[-1].present / how.deviation**2
-            change, pull = _differences(found, moved, case, span, weighed, decimator)
-            changes.append(change)
-            pulled[: found.base.b] += pull
+            change, pull = differences(case, span, residual * used[-1].present / how.deviation**2, decimator)
+            all_rows = np.broadcast_to(change, (*residual.shape, change.shape[2]))  # power: rows by recording
+            parts.append((all_rows.reshape(-1, change.shape[2]), pull))
             instruments += [] if z is None else [z[own].reshape(-1, p)]
     matrix, scale = (np.concatenate(x) for x in zip(*[(stacked(part), weights(how, part)) for part in used]))
-    change = np.concatenate([x.reshape(-1, count) for x in changes])
+    change, pulled = np.concatenate([x for x, _ in parts]), sum(pull for _, pull in parts)
     share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for _, part, _ in own_rows))
-    known = np.sqrt(share) * np.hstack([how.beforehand, np.zeros((len(how.beforehand), count))])
+    known = np.sqrt(share) * np.pad(how.beforehand, ((0, 0), (0, change.shape[1])))
     if instruments:
         factor = retriangulate(np.hstack([np.concatenate(instruments), matrix, change]) * scale[:, None])[:p, p:]
         unit = np.linalg.norm(factor[:, :p], axis=0)
-        solved = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
+        again = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:]) / unit[:, None]
     else:
         factor = retriangulate(np.vstack([known, np.hstack([matrix, change]) * scale[:, None]]))
         inverse = inverted(factor[:p, :p])
-        solved = inverse @ (inverse.T @ pulled - factor[:p, p:])
+        again = inverse @ (inverse[: found.base.b].T @ pulled - factor[:p, p:])
     seen = scale > 0.0
-    after = change + matrix @ solved
-    return solved, _rms(change[seen]), _rms(after[seen])
+    after = change + matrix @ again
+    return again, _rms(change[seen]), _rms(after[seen])
 
 
 def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:

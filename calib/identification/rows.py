@@ -187,7 +187,7 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
                 matrix[part] = _regressor(model, case, part, states)[:, :, columns]
             continue
         if model.torque_rows is POWER:
-            blocks = (_power_block(model, seen, case, part, states, slice(start, stop)) for part in spans)
+            blocks = (power_block(model, seen, case, part, states, slice(start, stop)) for part in spans)
         else:
             entries = (_regressor(model, case, part, states).transpose(2, 1, 0) for part in spans)
             blocks = (each[seen, row[own]] for each in entries)
@@ -288,7 +288,7 @@ def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarra
     return model.regressor(*given, **case.deflected(part))
 
 
-def _power_block(
+def power_block(
     model: RegressorModel, columns: np.ndarray, case: Case, part: slice, states: np.ndarray, segment: slice
 ) -> np.ndarray:
     """Return entries (k, N_i) of the power regressor: d/dt h of energies, vᵀ W of the other columns.

@@ -1,6 +1,12 @@
-"""Motions of a platform for the tests of parallel robots."""
+"""Motions of a platform for the tests of parallel robots, and what encoders and motors show of them."""
+
+from collections.abc import Collection
 
 import numpy as np
+
+from calib.data.recordings.recording import Recording
+from calib.rooms.parallel.mechanism.closure import ClosedRobot
+from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
 
 
 def sines(t: np.ndarray, frequencies: tuple[float, ...], size, rng: np.random.Generator) -> np.ndarray:
@@ -14,3 +20,30 @@ def sines(t: np.ndarray, frequencies: tuple[float, ...], size, rng: np.random.Ge
         phase = rng.uniform(0, 6, len(own))
         parts += own * np.stack([np.sin(w * t + phase), w * np.cos(w * t + phase), -(w**2) * np.sin(w * t + phase)])
     return parts
+
+
+def truth(known: ClosedRobot, drives: str = "Fv Fc") -> tuple:
+    """Return the model of a robot that may carry payload 5, of 5.37 kg and off its centre, and its parameters."""
+    model = make_parallel_model(known, [drives], v0=0.05, payloads=["5"])
+    own = {"Ia": 0.01, "Fv": 0.05, "Fc": 0.3}
+    values = np.concatenate([model.known_parameters(), [own[one.name[:2]] for one in model.terms]])
+    for name, value in {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}.items():
+        values[model.names.index(name)] = value
+    return model, values
+
+
+def recorded(
+    known: ClosedRobot, carried: Collection[str] = (), *, seed: int = 0, samples: int = 1000, preload: float = 0.0,
+    noise: float = 0.1, gains: np.ndarray | float = 1.0, encoder: float = 1e-6, values: np.ndarray | None = None,
+) -> Recording:  # fmt: skip
+    """Return a recording at 1 kHz of a robot of `truth`, with noise on torques or currents, by the model alone."""
+    model, own = truth(known)
+    rng, t = np.random.default_rng(seed), np.arange(samples) / 1000.0
+    x, v, a = sines(t, (1.5, 2.5, 4.0, 5.5), 0.04 * (known.robot.upper - known.robot.lower), rng)
+    plan = PlatformRegressor(model, np.arange(model.p), own if values is None else values, preload, carried)
+    motion = plan.motion(x, v, a)
+    q = motion.posture.q[:, known.robot.actuated] + encoder * rng.normal(size=(samples, known.robot.n))
+    effort = (plan.torques(motion) + noise * rng.normal(size=q.shape)) / gains
+    kind = "torque" if np.ndim(gains) == 0 else "current"
+    name = f"{'load' if carried else 'empty'}{seed}.csv"
+    return Recording(t, q, effort, kind, known.robot.joint_names, file=name)

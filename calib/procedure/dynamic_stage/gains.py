@@ -12,6 +12,7 @@ from calib.data.schema import Joints
 from calib.data.signals.motion import Motion, make_motion
 from calib.dynamics.bodies import STANDARD
 from calib.errors import UsageError
+from calib.extensions import needed
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions
@@ -78,8 +79,6 @@ def find_gains(
             f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): one model cannot "
             "use both A and N m; state gains for all of them"
         )
-    if not isinstance(chain, Chain):
-        raise UsageError(f"{bare[0]}: currents without drive gains; state gains = [...] (N m/A) in the options file")
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare])
 
@@ -144,6 +143,8 @@ def _identify(
     known: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
+    if not isinstance(chain, Chain):
+        return needed("drive_gains")(chain, cases, settings, known, reference)
     model = make_model(chain, settings)
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known if name not in [model.names[k] for k in base.kept]]

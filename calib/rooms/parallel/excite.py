@@ -23,7 +23,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, Id
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, DRIVES, ExcitationSettings
 from calib.procedure.robot_kinds import refuse_unread
-from calib.robot.calibrated import ROBOT
+from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.robot.chain import Joint
 from calib.robot.tables import dumps
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
@@ -43,7 +43,7 @@ from trajectories.setpoints import Setpoints
 SAMPLES = 100  # instants over the period while searching
 READ = ("period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook")  # of the settings
 FIGURES = "plot_*.png"
-MOTION = (ROBOT, METRICS, PLANNED, coefficients.NAME, FIGURES)
+MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, FIGURES)
 
 
 @dataclass(frozen=True, eq=False)

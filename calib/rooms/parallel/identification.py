@@ -33,6 +33,7 @@ from calib.procedure.dynamic_stage.verdict import (
 )
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.robot_kinds import refuse_unread
+from calib.rooms.parallel.geometry_share import propagate
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.robots import ParallelMechanism
@@ -102,7 +103,20 @@ def identify_parallel(
     noticed = (*parameter_findings(found), *settle(noticed))
     findings = ModelFindings(resting_parameters(found), noticed=noticed)
     judged = assess(inputs, found, findings)
-    return ParallelDynamics(**vars(judged), inputs=inputs, found=found, findings=findings, seed=settings.seed)
+    carried = None
+    if robot.covariance is not None:
+        (progress or (lambda words: None))("the geometry's share of the covariance")
+        torques = [actuator_torques(inputs, case) for case in inputs.cases]
+        carried = propagate(found, robot.covariance, inputs.cases, torques, progress)
+    return ParallelDynamics(
+        **vars(judged), inputs=inputs, found=found, findings=findings, carried=carried, seed=settings.seed
+    )
+
+
+def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
+    """Return the torques (N, n) of the actuators in a recording [N m or N; A where no gain is known]."""
+    gains = inputs.currents.for_motion(case.motion, inputs.options.file_settings(case.motion.file))
+    return np.asarray(case.motion.effort if gains is None else case.motion.effort * gains)
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:

@@ -32,10 +32,12 @@ from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.folder import RESIDUALS
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import refuse_unread
+from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.geometric_fit import (
+    LoopCovariance,
     LoopFit,
     contradictions,
     fit_loops,
@@ -49,7 +51,7 @@ if TYPE_CHECKING:
     from calib.procedure.report.page import Section
 
 READ = ("holdout", "tolerance", "seed")  # of the settings
-FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, RESIDUALS)
+FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS)
 HEADER = ("name", "unit", "value", "sigma")
 
 
@@ -81,7 +83,7 @@ class ParallelFit(Judged):
     @property
     def robot(self) -> ParallelMechanism:
         """The calibrated robot, as input of identification, excitation and planning."""
-        return ParallelMechanism(self.found.known, self.nominal.source)
+        return ParallelMechanism(self.found.known, self.nominal.source, LoopCovariance.fitted(self.found))
 
     @property
     def estimate(self) -> Estimate:
@@ -139,6 +141,7 @@ class ParallelFit(Judged):
             files.write_table(folder / ESTIMATE, HEADER, list(self._table()))
             write_covariance(folder / COVARIANCE, found.names, found.covariance)
             files.write_table(folder / RESIDUALS, *self._residuals())
+            self.robot.write_covariance(folder)
             files.write_json(folder / METRICS, self.to_dict())
 
         check_fit_target(Path(out), [self.nominal.source])

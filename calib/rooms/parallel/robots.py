@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.robot.calibrated import ROBOT
+from calib.folders import read_covariance, write_covariance
+from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import ClosedRobot, closed
+from calib.rooms.parallel.mechanism.geometric_fit import LoopCovariance
 from calib.rooms.parallel.mechanism.parallel_robot import ParallelRobot
 
 if TYPE_CHECKING:
@@ -30,10 +32,17 @@ INSTEAD = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParallelMechanism:
-    """A parallel robot whose loops close at home, and the file that describes it."""
+    """A parallel robot whose loops close at home, and the file that describes it.
+
+    Attributes:
+        known: the robot.
+        source: its file.
+        covariance: of its loops' constants, as a fit states it; None: the geometry is taken as exact.
+    """
 
     known: ClosedRobot
     source: Path
+    covariance: LoopCovariance | None = None
     kind = "parallel robot"
     instead = INSTEAD
 
@@ -43,22 +52,36 @@ class ParallelMechanism:
         return self.known.robot
 
     def write(self, folder: Path) -> None:
-        """Write the robot as ``robot.toml`` into a folder."""
+        """Write the robot as ``robot.toml`` into a folder, with the covariance of its geometry if known."""
         parallel_robot.write(folder / ROBOT, self.known.robot, f"from {self.source}")
+        self.write_covariance(folder)
+
+    def write_covariance(self, folder: Path) -> None:
+        """Write the covariance of the geometry, if known, as ``chain_covariance.csv`` into a folder."""
+        if self.covariance is not None:
+            write_covariance(folder / COVARIANCE, self.covariance.names, self.covariance.matrix)
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
         """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.excite.read_model` reads it."""
         from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.shapes import V0
+<<<<<<< HEAD
         from calib.folders import COVARIANCE
         from calib.identification.model_file import regrouping
+=======
+        from calib.folders import COVARIANCE as OF_PARAMETERS
+>>>>>>> 886ef3f5 (Parallel robots: the covariance of their geometry goes into their dynamics)
 
         model = dynamics.model
         return {
             "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
             "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
             "values": dict(zip(model.names, map(float, dynamics.values))),
+<<<<<<< HEAD
             "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base), "covariance": COVARIANCE,
+=======
+            "base": dict(zip(base.names, expressions(base))), "covariance": OF_PARAMETERS,
+>>>>>>> 886ef3f5 (Parallel robots: the covariance of their geometry goes into their dynamics)
         }  # fmt: skip
 
     def __repr__(self) -> str:
@@ -85,4 +108,8 @@ def find(robot: object) -> ParallelMechanism | None:
         path = parallel_robot.library().get(str(robot))
     elif path.suffix != ".toml" or not parallel_robot.is_parallel(path):
         return None
-    return None if path is None else ParallelMechanism(closed(parallel_robot.read(path)), path)
+    if path is None:
+        return None
+    beside = path.with_name(COVARIANCE)
+    covariance = LoopCovariance(*read_covariance(beside)) if path.name == ROBOT and beside.is_file() else None
+    return ParallelMechanism(closed(parallel_robot.read(path)), path, covariance)

@@ -13,14 +13,17 @@ plane) is left out. Parameters that depend on each other, gauge included, are re
 prior of `SPREAD`, and keep its covariance where the data do not identify them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.errors import NotConverged, Unidentifiable
+from calib.errors import NotConverged, Unidentifiable, refuse_robot
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
+from calib.records import frozen
 from calib.rooms.parallel.mechanism.closure import (
     ClosedRobot,
     Posture,
@@ -71,6 +74,38 @@ class LoopFit:
     before: float
     after: float
     iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class LoopCovariance:
+    """Covariance (K, K) [m², rad²] of K constants of a parallel robot's loops, by name.
+
+    Constants that no relation of encoders and platform shows (where along its axis a planar leg lies, how the angle of
+    a passive joint is counted) are choices of frames, without uncertainty. Those that could be shown, but were not by
+    the poses of a fit, keep the uncertainty that was assumed before it.
+    """
+
+    names: tuple[str, ...]
+    matrix: np.ndarray
+
+    @classmethod
+    def fitted(cls, found: LoopFit) -> LoopCovariance:
+        """Return the covariance of a fit, without the part that is a choice of frames."""
+        directions = visible_directions(found.known, found.parameters)
+        across = directions @ directions.T
+        names = tuple(one.name for one in found.parameters)
+        return cls(names, frozen(across @ found.estimate.covariance @ across))
+
+    def of(self, known: ClosedRobot) -> tuple[LoopParameter, ...]:
+        """Return the constants of a robot that the names are of.
+
+        Raises:
+            RobotError: for a name that none of its loops has.
+        """
+        found = {one.name: one for one in loop_parameters(known)}
+        if missing := [name for name in self.names if name not in found]:
+            refuse_robot(known.robot.name, f"none of its loops has '{missing[0]}', which its covariance is of")
+        return tuple(found[name] for name in self.names)
 
 
 def loop_parameters(known: ClosedRobot) -> tuple[LoopParameter, ...]:
@@ -139,6 +174,18 @@ def fit_loops(
     names, units = (tuple(getattr(one, key) for one in parameters) for key in ("name", "unit"))
     estimate = Estimate(names, units, changes, covariance, std, len(residual) - rank)
     return LoopFit(known, parameters, estimate, out, before, float(np.sqrt(np.mean(residual**2))), iteration)
+
+
+def visible_directions(known: ClosedRobot, parameters: Sequence[LoopParameter], postures: int = 100) -> np.ndarray:
+    """Return orthonormal directions (p, k) of the constants that relate encoders to the platform somewhere in its box.
+
+    Across them, constants change without effect: they are choices of frames.
+    """
+    robot = known.robot
+    coordinates = np.random.default_rng(0).uniform(robot.lower, robot.upper, (postures, robot.r))
+    readings = known.place(coordinates).q[:, robot.actuated]
+    _, sizes, directions = np.linalg.svd(_observed(known, readings, coordinates, parameters)[1], full_matrices=False)
+    return directions[sizes > TOLERANCE * sizes[0]].T
 
 
 def changed(robot: ParallelRobot, parameters: Sequence[LoopParameter], values: np.ndarray) -> ParallelRobot:

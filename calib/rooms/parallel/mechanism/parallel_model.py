@@ -166,7 +166,7 @@ class ParallelModel:
     ) -> np.ndarray:  # fmt: skip
         """Return W (N, rows, p) at the encoders' q, v, a (N, n); other arguments as `IdentificationModel.regressor`."""
         motion = self.moved(q, v, a)
-        return self._on_rows(self.platform_regressor(motion, carried), motion)
+        return self.on_rows(self.platform_regressor(motion, carried), motion)
 
     def torque(
         self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None,
@@ -174,11 +174,12 @@ class ParallelModel:
     ) -> np.ndarray:  # fmt: skip
         """Return the torques, forces or power (N, rows) for parameters (p,), computed without the regressor."""
         motion = self.moved(q, v, a)
-        return self._on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
+        return self.on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
 
-    def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
-        """Return the whole robot's motion from the encoders' q, v, a (N, n)."""
-        return of_readings(self.known, self.known.locate(q), np.asarray(v, dtype=float), np.asarray(a, dtype=float))
+    def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
+        """Return the whole robot's motion from the encoders' q, v, a (N, n); `near`: postures to start from."""
+        posture = self.known.locate(q, near)
+        return of_readings(self.known, posture, np.asarray(v, dtype=float), np.asarray(a, dtype=float))
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
@@ -298,7 +299,7 @@ class ParallelModel:
             return None
         return np.concatenate([*parts, robot.platform[None], np.zeros((len(self.payloads), 10))]).ravel()
 
-    def _on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
+    def on_rows(self, W: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the regressor (N, rows, p) of the torque rows from the one in platform coordinates, W (N, r, p)."""
         if self.torque_rows.name == PLATFORM:
             return W

@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib import files
 from calib.config_types import shown
@@ -209,6 +210,12 @@ class ParallelRobot(Frozen):
     def with_legs(self, legs: tuple[Leg, ...]) -> ParallelRobot:
         """Return the robot with its legs replaced, e.g. by calibrated ones."""
         return replace(self, legs=legs)
+
+    def tilted(self, turn: np.ndarray) -> ParallelRobot:
+        """Return the robot with gravity turned by a rotation vector (3,) [rad] in the base's axes."""
+        gravity = Rotation.from_rotvec(turn).apply(np.array(self.gravity))
+        legs = tuple(replace(leg, chain=replace(leg.chain, gravity=gravity)) for leg in self.legs)
+        return replace(self, legs=legs, gravity=gravity)
 
 
 KIND = "parallel"
