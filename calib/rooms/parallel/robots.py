@@ -65,23 +65,15 @@ class ParallelMechanism:
         """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.excite.read_model` reads it."""
         from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.shapes import V0
-<<<<<<< HEAD
-        from calib.folders import COVARIANCE
-        from calib.identification.model_file import regrouping
-=======
         from calib.folders import COVARIANCE as OF_PARAMETERS
->>>>>>> 886ef3f5 (Parallel robots: the covariance of their geometry goes into their dynamics)
+        from calib.identification.model_file import regrouping
 
         model = dynamics.model
         return {
             "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
             "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
             "values": dict(zip(model.names, map(float, dynamics.values))),
-<<<<<<< HEAD
-            "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base), "covariance": COVARIANCE,
-=======
-            "base": dict(zip(base.names, expressions(base))), "covariance": OF_PARAMETERS,
->>>>>>> 886ef3f5 (Parallel robots: the covariance of their geometry goes into their dynamics)
+            "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base), "covariance": OF_PARAMETERS,
         }  # fmt: skip
 
     def __repr__(self) -> str:
