@@ -73,7 +73,8 @@ class ParallelMechanism:
             "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
             "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
             "values": dict(zip(model.names, map(float, dynamics.values))),
-            "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base), "covariance": OF_PARAMETERS,
+            "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base),
+            "covariance": OF_PARAMETERS,
         }  # fmt: skip
 
     def __repr__(self) -> str:
