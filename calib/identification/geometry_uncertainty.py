@@ -31,6 +31,7 @@ with the noise. (`didim`: W is Z.) For other methods the sensitivity is that of 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -66,7 +67,7 @@ class _Estimator:
     pull: np.ndarray
 
 
-def estimator(found: Identification) -> _Estimator:
+def estimator(found: Identification[Any]) -> _Estimator:
     """Return an identification's estimator: weights of its rows and prior."""
     fitted = found.fitted
     p = fitted.pooled.parameters
@@ -242,7 +243,7 @@ def sensitivity(
 
 
 def solve_sensitivity(
-    found: Identification, cases: Sequence[Case], differences: Callable[..., tuple[np.ndarray, np.ndarray]],
+    found: Identification[Any], cases: Sequence[Case], differences: Callable[..., tuple[np.ndarray, np.ndarray]],
     samples: int, progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return the results of `sensitivity` for any robot, K changes of whose geometry `differences` evaluates.

@@ -96,7 +96,7 @@ class _Differences:
         robot, steps = model.known.robot, STEP * directions.T
         pairs = [(on(changed(robot, parameters, one)), on(changed(robot, parameters, -one))) for one in steps]
         pairs += [(on(robot.tilted(axis)), on(robot.tilted(-axis))) for axis in STEP * np.eye(3)[: len(TILTS)]]
-        return cls(found, pairs, scipy.linalg.block_diag(directions.T, np.eye(len(TILTS))), torques)
+        return cls(found, pairs, np.array(scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))), torques)
 
     def __call__(
         self, case: Case, span: slice, weighed: np.ndarray, decimator: Decimator
