@@ -23,6 +23,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     fit_notes              functions: a fit → findings on it; image_coverage, reprojection: figures of its images
     image_words            what is said of images as they arrive
     recordings             functions: a session's folder → the name of the recording written there
+    steps, endings         of a session: steps after the certificate; functions: a complete session → lines to print
+    geometry_spread        function: see `calib.procedure.excitation.inputs.GeometrySpread`
 
 A room that is deleted takes its commands, methods and robots along; the rest works without.
 """

@@ -48,14 +48,16 @@ def plain_text(cell: str) -> str:
 
 
 def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
-    """Return the rows of a CSV file as named tuples `kind`, whose fields are the columns.
+    """Return the rows of a CSV file as named tuples `kind`, whose fields are the columns; defaults may be missing.
 
     Raises:
         ValueError: where a column is missing or a cell is no number where one belongs.
         OSError: where the file is missing.
     """
     with path.open(newline="", encoding="utf-8") as file:
-        rows, hints = csv.DictReader(file), get_type_hints(kind)
+        rows = csv.DictReader(file)
+        missing = vars(kind)["_field_defaults"].keys() - set(rows.fieldnames or ())
+        hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in missing}
         return tuple(kind(**{name: _cell(hint, row, name, str(path)) for name, hint in hints.items()}) for row in rows)
 
 

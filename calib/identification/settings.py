@@ -135,7 +135,11 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
     v0 = per_joint(settings.v0, chain.n, "v0")
     own = list(drives.standard(sets, v0, linear))
     for coupling in settings.couplings:
-        own += drives.coupled(*coupling.joints, v0=v0[coupling.joints[1]], label=coupling.label or None)
+        made = drives.coupled(*coupling.joints, v0=v0[coupling.joints[1]], label=coupling.label or None)
+        for name in {one.name for one in made} & {one.name for one in own}:
+            other = "_".join(str(j + 1) for j in coupling.joints)
+            raise UsageError(f'coupling: parameter {name} is a joint\'s own; add another label: label = "{other}"')
+        own += made
     own += [replace(one, linear=linear[one.acts[0][0]]) if one.acts else one for one in settings.terms]
     return IdentificationModel(bodies, tuple(own), settings.torque_rows)
 

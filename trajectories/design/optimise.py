@@ -123,9 +123,9 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
         if (missed := unmet(problem, values)) is not None:  # every limit was kept, so a hard goal stood in the way
             lacking, goal, value = missed
             return NothingFeasible(
-                f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {_counted(starts)}, though "
-                f"all limits were kept: the nearest motion has {value:.4g}; relax it, give it a weight, or take a "
-                "longer period",
+                f"the hard goal {goal.words or f'{goal.objective.name} ≤ {goal.goal:g}'} was not reached in "
+                f"{_counted(starts)}, though all limits were kept: the nearest motion has {goal.stated(value):.4g}; "
+                "relax it, give it a weight, or take a longer period",
                 goal.objective.name, lacking, "of the goal",
             )  # fmt: skip
     worst = max(problem.constraints, key=lambda c: float((c.values(motion) / c.scale).max()), default=None)

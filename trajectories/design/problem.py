@@ -13,7 +13,15 @@ import numpy as np
 
 from trajectories.basis import Basis, Family, SampledMotion, sample_times
 from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
-from trajectories.design.objectives import Excitation, Objective, Observed, Value, observed
+from trajectories.design.objectives import (
+    Excitation,
+    FrictionCoverage,
+    Objective,
+    Observed,
+    TorqueSlack,
+    Value,
+    observed,
+)
 from trajectories.errors import BadInput, require
 
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
@@ -21,11 +29,12 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """Goal F ≤ goal + weight · γ. If weight is None, |goal| is used; weight 0 makes the goal hard."""
+    """Goal F ≤ goal + weight · γ. If weight is None, |goal| is used; weight 0 makes the goal hard. `words` state it."""
 
     objective: Objective
     goal: float
     weight: float | None = None
+    words: str = ""
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.goal) or (self.weight is not None and not 0 <= self.weight < np.inf):
@@ -34,6 +43,12 @@ class AttainmentGoal:
     @property
     def share(self) -> float:
         return abs(self.goal) if self.weight is None else self.weight
+
+    def stated(self, value: float) -> float:
+        """Return a value F as `words` state it: mean torque over its limit, share of time covered, else F itself."""
+        if isinstance(self.objective, FrictionCoverage):
+            return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
+        return 1.0 - value if isinstance(self.objective, TorqueSlack) else value
 
     def attainment(self, value: float) -> float:
         """Return the γ at which F = value just meets the goal; 0 or infinite for a hard goal."""

@@ -20,6 +20,7 @@ from calib.robot.chain import Chain
 from trajectories.errors import BadInput
 from trajectories.recall import Recalled, find_periods, sliding_products
 
+EDGE_TIME = 0.25  # kept before and after the motion [s], for the filters' borders
 STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
 SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
 UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
@@ -69,10 +70,9 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
     played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
     tracking = np.sqrt(np.mean(played**2, axis=0))
-    edge_time = 0.25  # kept before and after the motion [s], for the filters' borders
     return LocatedMotion(
-        start=max(float(recording.t[0]), float(start) - edge_time), stop=min(float(recording.t[-1]), float(stop) +
-        edge_time), began=float(start) + STEP * found.lag, periods=found.periods,
+        start=max(float(recording.t[0]), float(start) - EDGE_TIME), stop=min(float(recording.t[-1]), float(stop) +
+        EDGE_TIME), began=float(start) + STEP * found.lag, periods=found.periods,
         tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
         loosest=int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9))),
     )  # fmt: skip

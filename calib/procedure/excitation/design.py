@@ -18,7 +18,7 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.playback import Playback, check_start, play
-from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell, task_regressors
+from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell, task_states
 from calib.procedure.excitation.settings import AIMS, COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
 from calib.robot.calibrated import CalibratedChain
 from calib.workers import finishing
@@ -37,7 +37,7 @@ from trajectories.design.objectives import (
 )
 from trajectories.design.optimise import design
 from trajectories.design.pareto import Front, proposed_goals, sweep
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values
 from trajectories.design.search import SearchResult
 from trajectories.design.verify import Verification, dense_motion, ensured
 from trajectories.errors import NothingFeasible
@@ -84,14 +84,15 @@ def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, gi
     sigmas = np.ones(len(exact.joint_of_row)) if condition.sigmas is None else condition.sigmas
     if aim == "torque":
         require(np.isfinite(limits).all(), "goal 'torque': needs torque limits of all joints", UsageError)
-        rows = (task_regressors(given, settings.seed) / limits[exact.joint_of_row][:, None])[:, exact.limited.ravel()]
+        task = exact.regressor(*task_states(given, settings.seed))[:, :, given.columns.kept]
+        rows = (task / limits[exact.joint_of_row][:, None])[:, exact.limited.ravel()]
         task = np.einsum("nri,nrj->ij", rows, rows) / rows[:, :, 0].size
     else:
         require(values is not None, "goal 'parameters': needs masses, or a model (--model)", UsageError)
         columns, known = given.columns, cast(np.ndarray, values)[given.columns.kept]
         counted = (known != 0.0) & np.isin(columns.names, columns.aimed_names)
         task = np.diag(np.divide(1.0, known**2, out=np.zeros(len(known)), where=counted))
-    if given.prior is None and np.isfinite(limits).all():
+    if given.prior is None and given.limits.noise is None and np.isfinite(limits).all():
         sigmas = sigmas * limits[exact.joint_of_row]
     return replace(condition, index="trace", sigmas=sigmas, task=task, columns=given.columns.columns)
 
@@ -111,8 +112,9 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
             if text in AIMS and weight is None:
                 continue
             name, value = split_goal(text)
-            objective, goal = _objective(name, value, given, condition, settings.shortest)
-            result.append(AttainmentGoal(objective, goal, weight))
+            twice = sum(split_goal(other)[0] == name for other in texts if other not in AIMS) > 1
+            require(not twice, f"goal '{text}': '{name}' is stated twice; leave one out", UsageError)
+            result.append(AttainmentGoal(*_objective(name, value, given, condition, settings.shortest), weight, text))
     return result
 
 
@@ -219,7 +221,7 @@ class Designed:
         problem: that was solved last, with the family of motions.
         found: the motion; `proof`: its margins, checked independently.
         condition: raw and normalised, of `INSTANTS` samples over the period with the model's own Coulomb sign.
-        goals: name, goal, weight and what was reached.
+        goals: the stated ones: name, number asked for, weight, and number reached (by `exact` of the inputs' model).
         front: trade-offs, where asked for.
         playback: what a controller is to run.
         notes: what a user should know.
@@ -319,15 +321,15 @@ def search_motion(
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
+        values = _reached(problem, goals, found, given)
     outlook, predicted = None, ()
     with suppress(KeyboardInterrupt):
         say("predicting sigmas of other periods")
         of_period = lambda period: _excitation_problem(given, replace(settings, period=period, shortest=None))[0]  # noqa: E731
         outlook, predicted = foretell(given, settings, problem, found, of_period)
-    pairs = zip(problem.goals, found.values)
-    reached = tuple((goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in pairs)
     cut = ("interrupted before any motion met the goals",) if goals and not problem.goals else ()
-    cut += _missed(problem, found, given)
+    cut += _missed(goals, values, given)
+    reached = tuple((*split_goal(goal.words), goal.share, goal.stated(value)) for goal, value in zip(goals, values))
     return Designed(
         given, settings, problem, found, proof, condition_found,
         reached, front, played,
@@ -336,15 +338,35 @@ def search_motion(
     )  # fmt: skip
 
 
-def _missed(problem: ExcitationProblem, found: SearchResult, given: ExcitationInputs) -> tuple[str, ...]:
-    """Return a note for each goal that the motion misses by more than 1 %."""
+def _reached(
+    problem: ExcitationProblem, goals: list[AttainmentGoal], found: SearchResult, given: ExcitationInputs
+) -> tuple[float, ...]:
+    """Return the goals' values of a motion at `INSTANTS`, with the model's own Coulomb sign."""
+    if not goals:
+        return ()
+    motion = dense_motion(problem.family, found.x, _instants(problem.family, found), found.factor)
+    denser = []  # as the condition's: information of earlier motions counts per sample
+    for goal in goals:
+        if isinstance(one := goal.objective, Excitation) and one.existing is not None:
+            goal = replace(goal, objective=replace(one, existing=one.existing * (INSTANTS / problem.samples)))
+        denser.append(goal)
+    Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
+    return tuple(exact_values(replace(problem, goals=tuple(denser)), motion, Y).tolist())
+
+
+def _instants(family: Family, found: SearchResult) -> np.ndarray:
+    return family.period * found.factor / INSTANTS * np.arange(INSTANTS)
+
+
+def _missed(goals: list[AttainmentGoal], values: Sequence[float], given: ExcitationInputs) -> tuple[str, ...]:
+    """Return a note for each goal that a motion with these values misses by more than 1 %."""
     words = [
-        f"goal {goal.objective.name} is missed: {value:.4g} for {goal.goal:.4g}"
-        for goal, value in zip(problem.goals, found.values)
+        f"goal {goal.words} is missed: {goal.stated(value):.4g}"
+        for goal, value in zip(goals, values)
         if value > goal.goal + 0.01 * abs(goal.goal)
     ]
     idle = "without friction light joints have hardly any torque: state [friction] in the limits file, or a model"
-    known = given.model.friction or not any(isinstance(goal.objective, TorqueSlack) for goal in problem.goals)
+    known = given.model.friction or not any(isinstance(goal.objective, TorqueSlack) for goal in goals)
     return tuple(words if known or not words else [*words, idle])
 
 
@@ -407,8 +429,7 @@ def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, 
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
     """
-    times = family.period * found.factor / INSTANTS * np.arange(INSTANTS)
-    motion, columns = dense_motion(family, found.x, times, found.factor), given.columns
+    motion, columns = dense_motion(family, found.x, _instants(family, found), found.factor), given.columns
     Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
     alone = condition_numbers(Y, columns.sigmas, columns=columns.aimed)
     if given.prior is None:

@@ -179,13 +179,12 @@ def design_lines(designed: Designed) -> list[str]:
         *together,
         *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
         f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
-        f"all limits are respected, at {designed.proof.instants} instants and between them; smallest margins:",
+        f"all limits are respected, at {designed.proof.instants} instants and between them; smallest margins: "
+        + "; ".join(
+            f"{name} {one.margin:.3g} {one.unit} ({one.label}, {one.time:.2f} s)"
+            for name, one in designed.proof.worst.items()
+        ),
     ]
-    for name, one in designed.proof.worst.items():
-        how = "bound" if one.proved else "estimate"
-        result.append(
-            f"  {name:12} {one.margin:.4g} {one.unit} ({one.label}, t = {one.time:.2f} s; between instants: {how})"
-        )
     played = designed.playback
     parts = ["the approach"] if played.approach is not None else []
     parts.append(counted(played.repeat, "period"))

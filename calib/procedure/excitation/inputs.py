@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -11,13 +11,14 @@ from calib.config import Tables
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import Base, columns_at_rest, information, standard_name
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
+from calib.dynamics.bodies import STANDARD, Bodies, bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.load_cases import LoadCases
 from calib.dynamics.regressor_model import Loads
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of, require
+from calib.extensions import offered
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.identify_options import FileSettings
 from calib.identification.model_file import from_table, read_table, refuse_currents, refuse_other_arm
@@ -32,6 +33,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from trajectories.constraints import BoxLimit
 
+MANY_POSTURES = 400
 SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
 
 
@@ -89,6 +91,19 @@ class IdentifiableColumns:
         return slice(None) if self.columns is None else self.columns
 
 
+class GeometrySpread(Protocol):
+    """Principal errors of a calibrated geometry, g_1 … g_r: √λ_i u_i of its covariance Σ λ_i u_i u_iᵀ."""
+
+    @property
+    def before(self) -> np.ndarray:
+        """Changes (b, r) of the parameters of an earlier identification by each error; zero without one."""
+        ...
+
+    def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques' changes (N, rows, r) by each error at fixed base parameters `values` (b,)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class PriorMotions:
     """Information matrix of earlier motions, recorded or designed.
@@ -119,6 +134,7 @@ class ExcitationInputs:
         locked: joint index -> its fixed value; None: the search chooses it.
         columns: that the motion can identify.
         prior: motions that count already; None without any.
+        geometry: its uncertainty, of a calibrated robot whose torques can be predicted; None elsewhere.
     """
 
     chain: Chain
@@ -127,6 +143,7 @@ class ExcitationInputs:
     locked: Mapping[int, float | None]
     columns: IdentifiableColumns
     prior: PriorMotions | None
+    geometry: GeometrySpread | None = None
 
     @property
     def errors_known(self) -> bool:
@@ -158,13 +175,23 @@ def read_inputs(
     """
     require(after is None or model is None, "after: its folder is also the model; leave --model out", UsageError)
     model = model or after
+    if settings.drives and (model is not None or options is not None):
+        raise UsageError(
+            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
+        )
     chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source, predicted=model is not None)
+    if settings.noise is not None and (after is not None or known.noise is not None):
+        raise UsageError(f"noise: {after or '[noise] of the limits file'} states the torque errors; leave --noise out")
     dynamics = read_model(chain, model, settings.drives, known, options, settings.loads)
+    dynamics = replace(dynamics, notes=(*dynamics.notes, *_unheld(dynamics, known)))
+    noise = None if known.noise is None or after is not None else known.noise[dynamics.exact.joint_of_row]
     locked = _read_locked(settings.lock, chain, known.positions)
-    prior = read_prior(settings.existing, dynamics, chain, after)
-    columns = identifiable(dynamics, chain, locked, prior)
-    return ExcitationInputs(chain, known, dynamics, locked, _selected(columns, dynamics, settings, model), prior)
+    spreads = [find(robot, source, chain, dynamics, after) for find in offered("geometry_spread")]
+    spread = next(iter(spreads), None)
+    prior = read_prior(settings.existing, dynamics, chain, after, noise, spread)
+    columns = _selected(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
+    return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread)
 
 
 def read_model(
@@ -198,7 +225,7 @@ def read_model(
         options = replace(options, torque_rows=MOTOR, sets=())
     if options is None:
         linear = [joint.kind == "prismatic" for joint in chain.joints]
-        model = IdentificationModel(bodies_of(chain), drives.standard([sets] * chain.n, V0, linear))
+        model = IdentificationModel(bodies_of(chain), drives.standard([sets or MOTOR.drives] * chain.n, V0, linear))
     else:
         model = make_model(chain, options)
     model, left = _differentiable(model)
@@ -221,6 +248,27 @@ def read_model(
         if not known:
             notes.append("friction is unknown (no model, no [friction]): torques are predicted without it")
     return excited_model(model, cases, values, bool(known), notes)
+
+
+def _unheld(model: ExcitedModel, limits: MotionLimits) -> list[str]:
+    """Return a note if gravity is beyond the torque limits in most postures (payload too heavy, wrong masses).
+
+    Raises:
+        UsageError: where it is in all.
+    """
+    if model.values is None:
+        return []
+    exact, box = model.exact, limits.positions
+    low, high = np.maximum(box.lower, -np.pi), np.minimum(box.upper, np.pi)
+    q = low + (high - low) * np.random.default_rng(0).random((MANY_POSTURES, len(low)))
+    shares = np.abs(exact.regressor(q, 0.0 * q, 0.0 * q) @ model.values) / exact.of_rows(limits.torque)
+    beyond, row = float(np.mean(shares.max(axis=1) > 1.0)), int(shares.max(axis=0).argmax())
+    words = (
+        f"gravity is beyond the torque limits in {beyond:.0%} of the postures, up to {shares.max():.2g} times at "
+        f"{exact.row_names[row]}: take a lighter payload, or correct masses or limits"
+    )
+    require(beyond < 1.0, words, UsageError)
+    return [words] if beyond > 0.5 else []
 
 
 def _designable(rows: TorqueRows) -> bool:
@@ -249,7 +297,9 @@ def _loads(texts: Sequence[str], model: IdentificationModel, with_payloads: bool
     for text in texts:
         labels = () if text == "none" else tuple(part.strip() for part in text.split("+"))
         for label in labels:
-            one_of(label, known, f"load '{text}': payload", UsageError)
+            where = f"load '{text}': payload"
+            require(known, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
+            one_of(label, known, where, UsageError)
         result.append(labels)
     return tuple(result)
 
@@ -274,9 +324,8 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     loads = _loads(texts, found.model, with_payloads=False)
     run = {label for carried in loads for label in carried or ()}
     values = dict(zip(found.model.names, found.values))
-    bodies = bodies_of(chain).with_gravity(np.asarray(found.model.bodies.gravity))
-    for label in table.get("payloads", ()):
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1) if label in run else bodies
+    carried = [label for label in table.get("payloads", ()) if label in run]
+    bodies = bodies_with(chain, found.model.bodies.gravity, carried)
     rows = found.model.torque_rows if _designable(found.model.torque_rows) else MOTOR
     model, notes = _differentiable(IdentificationModel(bodies, found.model.columns, rows))
     parameters = np.array([values[name] for name in model.names])
@@ -288,6 +337,14 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
     if covariance is None:
         notes.append(f"{folder}/covariance.csv has other columns than the design: no torque margin for uncertainty")
     return replace(made, covariance=covariance, notes=tuple(notes))
+
+
+def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> Bodies:
+    """Return the bodies of a chain, gravity (3,) in its base frame [m/s²], with payloads at its tip."""
+    bodies = bodies_of(chain).with_gravity(np.asarray(gravity))
+    for label in payloads:
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+    return bodies
 
 
 def excited_model(
@@ -312,6 +369,10 @@ def excited_model(
     smooth = replace(model, terms=tuple(smoothed))
     found = base_parameters.find(model, loads=loads) if base is None else base
     chosen = None if values is None else found.transform @ values
+    own = {model.names[k].removeprefix(name) for k in found.kept for name in STANDARD}
+    lost = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0 and label not in own]
+    if lost:
+        notes = (*notes, f"payload {', '.join(lost)}: not identifiable from these loads; run others, too: --load none")
     return ExcitedModel(
         LoadCases(smooth, found, loads), LoadCases(model, found, loads), chosen, None, friction, tuple(notes)
     )
@@ -355,11 +416,18 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
 
 
 def identifiable(
-    model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None
-) -> IdentifiableColumns:
-    """Return the columns that a motion with locked joints, together with earlier motions, can identify."""
+    model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None,
+    noise: np.ndarray | None = None,
+) -> IdentifiableColumns:  # fmt: skip
+    """Return the columns that a motion with locked joints, together with earlier motions, can identify.
+
+    Args:
+        noise: (rows,) by which torque rows are divided, where no earlier motion states it; None: 1.
+    """
     names = model.exact.names
-    known, sigmas = (None, None) if prior is None else (prior.information, prior.sigmas)
+    known, sigmas = (
+        (None, noise) if prior is None else (prior.information, noise if prior.sigmas is None else prior.sigmas)
+    )
     if not locked:
         return IdentifiableColumns(None, sigmas, names)
     still = np.isin(model.exact.joint_of_row, list(locked))
@@ -403,12 +471,16 @@ def _selected(
 
 
 def read_prior(
-    paths: Sequence[str], model: ExcitedModel, chain: Chain, after: Path | None = None
-) -> PriorMotions | None:
+    paths: Sequence[str], model: ExcitedModel, chain: Chain, after: Path | None = None,
+    noise: np.ndarray | None = None, geometry: GeometrySpread | None = None,
+) -> PriorMotions | None:  # fmt: skip
     """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
 
     Recordings are filtered and differentiated as `calib identify` does it. What an identification `after` knows, its
-    prior included, is the inverse of its covariance.
+    prior included, is the inverse of its covariance, without the part of the geometry.
+
+    Args:
+        noise: (rows,) by which torque rows are divided where no identification states it; None: 1.
 
     Raises:
         UsageError, MeasurementError: for a path that is neither, or belongs to another robot.
@@ -418,19 +490,19 @@ def read_prior(
     total, seconds, sigmas = np.zeros((len(model.exact.names),) * 2), 0.0, None
     names, trained = [], ()
     if after is not None:
-        total, sigmas = _known(after, model)
+        total, sigmas = _known(after, model, geometry)
         names, trained = ["what is identified"], tuple(IdentificationFolder(after).metrics().identification)
     for text in paths:
         if Path(text).name in trained:
             raise UsageError(f"existing {text}: {after} was identified from this recording; leave it out")
         designed = (Path(text) / coefficients.NAME).exists()
         q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
-        total += information(model.exact, q, v, a, sigmas) / rate
+        total += information(model.exact, q, v, a, noise if sigmas is None else sigmas) / rate
         seconds += len(q) / rate
     return PriorMotions((*names, *paths), seconds, total, sigmas)
 
 
-def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:
+def _known(folder: Path, model: ExcitedModel, geometry: GeometrySpread | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (b, b) of an identification, and the square root of its torque error density (rows,)."""
     density, covariance = IdentificationFolder(folder).metrics().error_density, model.covariance
     if density is None or len(density) != model.exact.model.rows:
@@ -440,7 +512,9 @@ def _known(folder: Path, model: ExcitedModel) -> tuple[np.ndarray, np.ndarray]:
             f"{folder}/covariance.csv is missing or lacks columns of the design; if the model has payloads, state each "
             "run's load (--load none --load tool)"
         )
-    spread = np.sqrt(np.diag(covariance))
+    if geometry is not None:
+        covariance = covariance - geometry.before @ geometry.before.T
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     # what a constraint holds has no spread and gains nothing: as if known to a millionth (our choice)
     spread = np.where(spread > 0.0, spread, np.maximum(1e-6 * np.abs(cast(np.ndarray, model.values)), 1e-12))
     unit = covariance / np.outer(spread, spread)

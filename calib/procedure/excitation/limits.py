@@ -18,6 +18,8 @@ waypoints keeps what is stated only. Besides, per joint or ``all``::
     [friction]                       # where there is no identified model: Fv [N m s/rad], Fc [N m], per joint
     Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
     Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
+    [noise]                          # standard deviation of a torque's error that no parameter explains, where there is
+    q1 = 2.5                         # no identified model [N m or N]; default 1 % of the torque limit; weighs the rows
     [[point]]                        # a named point, which keeps [target]'s height and axis_distance
     name = "elbow"
     joint = 4                        # of the link behind this joint, or 0: of the tip
@@ -35,7 +37,7 @@ import numpy as np
 
 from calib.config import Tables, check_keys, read, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 from calib.geometry.observability import targets_of
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
@@ -54,6 +56,7 @@ from trajectories.setpoints import Setpoints
 MAX = {"velocity": 100.0, "acceleration": 3000.0, "torque": 1e5, "effort": 1e5}
 EXAMPLES = {"velocity": '[velocity] all = "90 deg/s"', "acceleration": "[acceleration] all = 5.0"}
 MAX_EXCESS = 0.01  # of a limit, by which a written sample may be beyond it: rounding to whole samples
+DEFAULT_NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
 DEFAULT_RISE = 2.0  # [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
 DEFAULT_ORIGIN = f"default, {DEFAULT_RISE:g}/s times the speed limit, since none is stated"
 PLACE = "in the limits file (--limits, or [dynamics] limits in session.toml)"
@@ -180,6 +183,7 @@ class LimitsFile(ConstraintsFile):
     jerk: Mapping[str, Numeric] = field(default_factory=dict)
     torque: Mapping[str, Numeric] = field(default_factory=dict)
     friction: FrictionTable | None = None
+    noise: Mapping[str, Numeric] = field(default_factory=dict)
     point: tuple[PointTable, ...] = ()
     frequency: FrequencyTable = field(default_factory=FrequencyTable)
 
@@ -196,6 +200,7 @@ class MotionLimits:
         friction: (2, n) Fv and Fc; None where the file does not say.
         resonance: [rad/s] or None.
         notes: what a user should know.
+        noise: (n,) standard deviation of the torques' errors [N m or N]; None where the file does not say.
     """
 
     constraints: tuple[MotionConstraint, ...]
@@ -206,6 +211,7 @@ class MotionLimits:
     friction: np.ndarray | None
     resonance: float | None
     notes: tuple[str, ...]
+    noise: np.ndarray | None = None
 
     @property
     def positions(self) -> BoxLimit:
@@ -264,6 +270,11 @@ def read_motion_limits(
     deviations = number(torque_table.get("deviations", 2.0), f"{where}: torque.deviations")
     if not 0.0 <= deviations < np.inf:
         raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
+    noise = None
+    if stated.noise:
+        noise = _per_joint(stated.noise, f"{where}: noise", chain, None, ("torque", "force"))
+        noise = np.where(np.isfinite(noise), noise, DEFAULT_NOISE * torque)
+        require((noise > 0.0).all(), f"{where}: noise: expected standard deviations above 0", UsageError)
     points = _points(stated.point, chain, where)
     friction = _friction(stated.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
@@ -281,7 +292,15 @@ def read_motion_limits(
         sets = (("kept", found.checked), ("NOT checked", found.unchecked))
         notes += [f"{words}: {', '.join(names)}" for words, names in sets if names]
     return MotionLimits(
-        tuple(constraints), bounds, torque, margin, deviations, friction, stated.frequency.resonance, tuple(notes)
+        tuple(constraints),
+        bounds,
+        torque,
+        margin,
+        deviations,
+        friction,
+        stated.frequency.resonance,
+        tuple(notes),
+        noise,
     )
 
 
@@ -400,7 +419,7 @@ def _per_joint(
         quantities: of a revolute joint's limit, and of a prismatic one's.
     """
     numbered = {f"q{j + 1}": j for j in range(chain.n)} | {name: j for j, name in enumerate(chain.joint_names)}
-    check_keys(stated, ("all", "share", *(MARGINS if "torque" in quantities else ()), *numbered), where)
+    check_keys(stated, ("all", "share", *(MARGINS if where.endswith("torque") else ()), *numbered), where)
     bounds = np.full(chain.n, np.inf) if default is None else default.copy()
     for name in [name for name in stated if name != "share"]:
         for j in range(chain.n) if name == "all" else [numbered[name]]:

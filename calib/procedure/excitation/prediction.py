@@ -5,9 +5,13 @@ rows per joint leaves the base parameters with the covariance
 
     C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
 
-and a torque on other motion with the variance Y C Yᵀ. R counts the rows that `calib identify` keeps: twice the band
+and a torque on other motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, the same in all
+logs, adds to both (`calib.identification.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ²,
+with earlier motions C (C_before⁻¹ S_before g - …), and torques by Y S g + (∂Y/∂g φ) g. A design minimises the part of
+the torques' errors alone. R counts the rows that `calib identify` keeps: twice the band
 that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term
-holds. It is taken as a share of the torque limits, stated or `DEFAULT_NOISE`; all sigmas go with it in proportion.
+holds. It is taken as the limits file states it ([noise]), or as a share of the torque limits, stated or
+`DEFAULT_NOISE`; all sigmas but the geometry's part go with it in proportion.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +28,7 @@ from calib.errors import UsageError, require
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
-from calib.procedure.excitation.limits import DEFAULT_RISE
+from calib.procedure.excitation.limits import DEFAULT_NOISE, DEFAULT_RISE
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import sentence
 from calib.procedure.measuring.prediction import sigma_ratio
@@ -35,7 +39,6 @@ from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.verify import dense_motion
 
 NAME = "prediction.csv"
-DEFAULT_NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
 OUTLOOK_EVALUATIONS = 240  # for a motion of another period, which is only looked at (our choice)
 PERIODS = (5.0, 10.0, 20.0, 40.0)
 PERIOD_SAMPLES = 500  # over a period
@@ -61,7 +64,7 @@ class MotionPrediction:
 class PredictedSigma(NamedTuple):
     """A row of ``prediction.csv``: a parameter, its value if known, and the sigma predicted for the motion as run.
 
-    `sigma_before` is that of an identification that the motion adds to.
+    `sigma_before` is that of an identification that the motion adds to; `sigma_geometry` the geometry's part of sigma.
     """
 
     name: str
@@ -70,6 +73,14 @@ class PredictedSigma(NamedTuple):
     sigma: float
     rsd: float | None
     sigma_before: float | None = None
+    sigma_geometry: float | None = None
+
+
+class Task(NamedTuple):
+    """Regressors (N, rows, c) at states of a typical task, and the torques' changes (N, rows, r) by the geometry."""
+
+    regressors: np.ndarray
+    felt: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +91,8 @@ class MotionOutlook:
         noise: (n,) taken as the torques' error [N m or N]; noise_share: of the torque limits.
         own: of the motion as it is to be run; by_period: of other lengths. Longer ones run the same motion again,
             shorter ones are designed quickly.
-        before: torque_sigma_share of an identification that the motion adds to; None without one.
+        before: torque_sigma_share of an identification that the motion adds to, and torque_sigma_before (n,) [N m or
+            N] its torque_sigma; None without one.
     """
 
     noise_share: float
@@ -88,6 +100,7 @@ class MotionOutlook:
     own: MotionPrediction
     by_period: tuple[MotionPrediction, ...]
     before: float | None = None
+    torque_sigma_before: Array | None = None
 
 
 def foretell(
@@ -103,12 +116,14 @@ def foretell(
         given, settings, problem, found: the robot, what was asked for, what was solved, and the motion.
         problem_of: a period [s] -> the problem with it.
     """
-    limits, share = given.limits.torque, DEFAULT_NOISE if settings.noise is None else settings.noise
+    limits, noise = given.limits.torque, given.limits.noise
     if not np.isfinite(limits).all():
         return None, ()
-    sigmas = share * limits
-    task = task_regressors(given, settings.seed)
-    predict = partial(_prediction, given, sigmas, task)
+    if noise is None:
+        noise = (DEFAULT_NOISE if settings.noise is None else settings.noise) * limits
+    share = float(np.sqrt(np.mean((noise / limits) ** 2)))
+    task = task_of(given, settings.seed)
+    predict = partial(_prediction, given, noise, task)
     own, spread = predict(problem.family, found.x, found.factor, settings.repeat)
     others, evaluations = [], min(OUTLOOK_EVALUATIONS, settings.evaluations // 4)
     own_period = problem.family.period * found.factor
@@ -120,17 +135,24 @@ def foretell(
         others += [] if shorter is None else [predict(shorter[0], shorter[1].x, shorter[1].factor, 1.0)[0]]
     model, kept = given.model, given.columns.kept
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
-    before, earlier = None, [None] * len(spread)
+    before, earlier = (None, None), [None] * len(values[kept])
     if given.errors_known:
-        root = _root(_known(given))
-        before, earlier = _torque_sigma(given, task, root)[1], np.linalg.norm(root, axis=1).tolist()
-    parts = given.columns.names, np.array(model.exact.units)[kept].tolist(), values[kept].tolist(), spread.tolist()
+        before, earlier = known_sigmas(given, task)
+    parts = given.columns.names, np.array(model.exact.units)[kept].tolist(), values[kept].tolist(), earlier
+    sigmas = (np.linalg.norm(part, axis=1).tolist() for part in (np.hstack(spread), spread[1]))
     rows = []
-    for name, unit, value, sigma, sigma_before in zip(*parts, earlier):
+    for name, unit, value, sigma_before, sigma, geometry in zip(*parts, *sigmas):
         known = np.isfinite(value) and value != 0.0
         known_rsd = 100.0 * sigma / abs(value) if known else None
-        rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd, sigma_before))
-    return MotionOutlook(share, sigmas, own, tuple(others), before), rows
+        part = None if given.geometry is None else geometry
+        rows.append(PredictedSigma(name, unit, value if known else None, sigma, known_rsd, sigma_before, part))
+    return MotionOutlook(share, noise, own, tuple(others), before[1], before[0]), rows
+
+
+def known_sigmas(given: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
+    """Return the σ of torques on a task (see `_torque_sigma`), and of the parameters, that an identification states."""
+    parts = _root(_known(given)), _shifts_before(given)
+    return _torque_sigma(given, task, *parts), np.linalg.norm(np.hstack(parts), axis=1).tolist()
 
 
 def _known(given: ExcitationInputs) -> np.ndarray:
@@ -148,15 +170,36 @@ def _root(W: np.ndarray) -> np.ndarray:
     return (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None]
 
 
-def _torque_sigma(given: ExcitationInputs, task: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the σ of each joint's predicted torque (n,), largest over the loads, and the rms of σ / torque limit."""
-    squares = np.mean(np.sum((task @ root) ** 2, axis=2), axis=0)
+def _felt(given: ExcitationInputs, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the torques' changes (N, rows, r) by the principal errors of the geometry; r = 0 for an exact one."""
+    if given.geometry is None or given.model.values is None:
+        return np.zeros((len(q), len(given.model.exact.joint_of_row), 0))
+    return given.geometry.felt(given.model.values, q, v, a)
+
+
+def _shifts_before(given: ExcitationInputs) -> np.ndarray:
+    """Return what the principal errors of the geometry did to the parameters (c, r) of an earlier identification."""
+    return (
+        np.zeros((len(given.columns.names), 0)) if given.geometry is None else given.geometry.before[given.columns.kept]
+    )
+
+
+def _torque_sigma(
+    given: ExcitationInputs, task: Task, root: np.ndarray, shifts: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the σ of each joint's predicted torque (n,), largest over the loads, and the rms of σ / torque limit.
+
+    Args:
+        root: (c, c) of the parameters' covariance; shifts: (c, r) of the parameters by the geometry's errors.
+    """
+    errors = np.concatenate([task.regressors @ root, task.regressors @ shifts + task.felt], axis=2)
+    squares = np.mean(np.sum(errors**2, axis=2), axis=0)
     torque = np.sqrt(squares[given.model.exact.limited].max(axis=0))
     return torque, float(np.sqrt(np.mean((torque / given.limits.torque) ** 2)))
 
 
-def task_regressors(given: ExcitationInputs, seed: int) -> np.ndarray:
-    """Return the regressors (TASK_STATES, n, c) at random states of a typical task."""
+def task_states(given: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v, a (TASK_STATES, n) of a typical task."""
     box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
     low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)
     speeds = np.array([joint.velocity for joint in given.chain.joints])
@@ -164,25 +207,40 @@ def task_regressors(given: ExcitationInputs, seed: int) -> np.ndarray:
     q, v, a = low + (high - low) * rng.random((TASK_STATES, n)), *(2.0 * rng.random((2, TASK_STATES, n)) - 1.0)
     for j, value in given.locked.items():
         q[:, j], v[:, j], a[:, j] = 0.0 if value is None else value, 0.0, 0.0
-    return given.model.exact.regressor(q, fast * v, DEFAULT_RISE * fast * a)[:, :, given.columns.kept]
+    return q, fast * v, DEFAULT_RISE * fast * a
+
+
+def task_of(given: ExcitationInputs, seed: int) -> Task:
+    """Return the typical task of `task_states`."""
+    states = task_states(given, seed)
+    return Task(given.model.exact.regressor(*states)[:, :, given.columns.kept], _felt(given, *states))
 
 
 def _prediction(
-    given: ExcitationInputs, noise: np.ndarray, task: np.ndarray, family: Family, x: np.ndarray, factor: float,
+    given: ExcitationInputs, noise: np.ndarray, task: Task, family: Family, x: np.ndarray, factor: float,
     repeat: float,
-) -> tuple[MotionPrediction, np.ndarray]:  # fmt: skip
-    """Return the prediction for `repeat` periods of a motion, and the sigmas (c,) of the parameters."""
+) -> tuple[MotionPrediction, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+    """Return the prediction for `repeat` periods of a motion, and the two parts of the parameters' errors.
+
+    They are a root (c, c) of the covariance by the torques' errors, and the shifts (c, r) by the geometry's errors.
+    """
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     rows, sigmas = 2.0 * _band(motion, period) * period * repeat, given.columns.sigmas
     if sigmas is None or not given.errors_known:
-        sigmas = noise[given.model.exact.joint_of_row] * (1.0 if sigmas is None else sigmas)
-        weight, earlier = rows / PERIOD_SAMPLES, np.zeros((0, task.shape[2]))
+        own = noise[given.model.exact.joint_of_row]
+        sigmas = own if sigmas is None else np.where(np.isinf(sigmas), np.inf, own)
+        weight, earlier = rows / PERIOD_SAMPLES, np.zeros((0, task.regressors.shape[2]))
     else:
         weight, earlier = period * repeat / PERIOD_SAMPLES, _known(given)
-    Y = given.model.exact.regressor(motion.q, motion.v, motion.a)[:, :, given.columns.kept] / sigmas[:, None]
-    root = _root(np.concatenate([np.sqrt(weight) * Y.reshape(-1, Y.shape[2]), earlier]))
-    return MotionPrediction(period * repeat, rows, *_torque_sigma(given, task, root)), np.linalg.norm(root, axis=1)
+    kept, factors = given.columns.kept, np.sqrt(weight) / sigmas[:, None]
+    Y = (given.model.exact.regressor(motion.q, motion.v, motion.a)[:, :, kept] * factors).reshape(
+        -1, len(task.regressors[0, 0])
+    )
+    felt = (_felt(given, motion.q, motion.v, motion.a) * factors).reshape(len(Y), -1)
+    root = _root(np.concatenate([Y, earlier]))
+    shifts = root @ (root.T @ (earlier.T @ (earlier @ _shifts_before(given)) - Y.T @ felt))
+    return MotionPrediction(period * repeat, rows, *_torque_sigma(given, task, root, shifts)), (root, shifts)
 
 
 def _band(motion: SampledMotion, period: float) -> float:
@@ -258,7 +316,7 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
         UsageError: if the folder contains no prediction, or one of other parameters.
     """
     check_folder(folder)
-    noise = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction.noise_share
+    outlook = read_json(folder / METRICS, "give the folder that calib excite wrote", _Predicted).prediction
     try:
         predicted = {row.name: row.sigma for row in read_rows(PredictedSigma, folder / NAME)}
     except ValueError as error:
@@ -266,9 +324,11 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
     limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
     rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
     known = len(rms) == len(limits) and np.isfinite(rms / limits).all()
+    known &= outlook.before is None  # else the errors were known
     residual = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
-    stated = dict(zip(outcome.found.names, outcome.found.fitted.estimate.sigma.tolist()))
-    found = sigma_ratio(predicted, stated, residual=residual, assumed=noise)
+    estimate = outcome.found.fitted.estimate if outcome.carried is None else outcome.carried
+    stated = dict(zip(outcome.found.names, estimate.sigma.tolist()))
+    found = sigma_ratio(predicted, stated, residual=residual, assumed=outlook.noise_share)
     if found is None:
         raise UsageError(
             f"{folder} contains none of the {len(stated)} identified parameters: it belongs to another robot"

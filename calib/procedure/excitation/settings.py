@@ -67,7 +67,8 @@ class ExcitationSettings:
         shortest: shortest period that the search may use [s]; default: the period is fixed
         harmonics: frequencies per joint, or control points of splines; default 12, or as many as are below resonance
         family: fourier (Fourier series) or bspline (splines)
-        drives: drive terms to identify, if neither an identified model nor options state them
+        drives: drive terms to identify, if neither an identified model nor options state them; default Ia Fv Fc off,
+            as of calib identify
         loads: payloads of one run: none, a label, or labels with +; the same motion runs once with each; repeatable.
             Default: none, then each payload of the options
         columns: parameters that the motion has to determine, or essential: those that the identification of the
@@ -84,7 +85,8 @@ class ExcitationSettings:
         slower: factor of a slow rehearsal, written next to the motion; 1: none
         existing: a recording (log.npz@0:9.4 cuts) or folder of an earlier design, to complement; repeatable
         lock: a joint that does not move: joint4, or joint4=0.5 [rad or m]; repeatable
-        noise: expected torque residual as a share of the torque limits; only for predicted sigmas; default 0.01
+        noise: expected torque residual as a share of the torque limits; only for predicted sigmas; default 0.01, or
+            that of each joint in the limits file ([noise])
         outlook: also predict the sigmas of motions with other periods
     """
 
@@ -94,7 +96,7 @@ class ExcitationSettings:
     shortest: Period | None = None
     harmonics: Harmonics | None = None
     family: Annotated[str, OneOf(("fourier", "bspline"))] = "fourier"
-    drives: Text = "Fv Fc off"
+    drives: Text = ""
     loads: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     rate: Rate = 1000.0

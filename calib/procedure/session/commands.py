@@ -17,7 +17,7 @@ from calib.config import parse
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
-from calib.extensions import needed
+from calib.extensions import needed, offered
 from calib.folders import CERTIFICATE, SESSION
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
@@ -249,12 +249,14 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return the closing lines of a complete session; with verdict fail, the exported robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
-    level = session.verdicts().level
+    level, further = session.verdicts().level, [line for ending in offered("endings") for line in ending(session)]
     if level == "fail":
-        return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
+        said = (f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
+        return ("", *said, *further)
     why = VERDICT if session.path(VERDICT).exists() else f"{robot.parent.name}/README.txt"
     held = "" if level == "pass" else f" (verdict {level}: {why} says why)"
-    return ("", f"done; certificate: {page}", f"robot: {robot}{held}" if robot.exists() else "no robot was exported")
+    made = f"robot: {robot}{held}" if robot.exists() else "no robot was exported"
+    return ("", f"done; certificate: {page}", made, *further)
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:

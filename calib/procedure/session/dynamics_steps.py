@@ -18,6 +18,7 @@ from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import CalibError, Finding, finding, refuse_data
 from calib.identification.checks.recorded_motion import (
+    EDGE_TIME,
     DesignedMotion,
     LocatedMotion,
     another_motion,
@@ -33,7 +34,7 @@ from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.findings import UNJUDGED, Verdict, lines_of
 from calib.procedure.robot_kinds import joints_of
-from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Say, Session
+from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
 from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
@@ -111,7 +112,10 @@ def record(session: Session, say: Say) -> list[str]:
     cuts, notes = {}, []
     for path in session.brought("training"):
         say(f"reading {path.name}")
-        found, said = _check_recording(session, path, "training")
+        rounds = [
+            name for name in designed_motions(session) if name.startswith(ROUND) and path in _logs_of(session, name)
+        ]
+        found, said = _check_recording(session, path, ["training", *rounds][-1])
         cuts[path.name] = found
         notes += said
     files.write_json(session.path(CUTS), cuts)
@@ -142,8 +146,8 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     found, loose = check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
     worst = max(found.tracking)
     notes.append(
-        f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s; deviation up to "
-        f"{1e3 * worst:.2g} mrad rms"
+        f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s ({EDGE_TIME:g} s before it, "
+        f"for the filters); deviation up to {1e3 * worst:.2g} mrad rms"
     )
     return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in lines_of(loose)]
 
@@ -224,8 +228,22 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
     """Return the session's designed motions by name; empty if no motion was designed."""
     if not session.settings.dynamics.plan:
         return {}
-    folders = {name: session.path(f"6-excitation/{name}") for name in ("training", "validation")}
-    return {name: coefficients.read(folder) for name, folder in folders.items() if folder.exists()}
+    folders = [session.path(f"6-excitation/{name}") for name in ("training", "validation")]
+    folders += sorted(session.path("6-excitation").glob(f"{ROUND}[0-9]*"))
+    return {folder.name: coefficients.read(folder) for folder in folders if folder.exists()}
+
+
+def next_round(session: Session) -> str:
+    """Return the name of the round after those whose logs are there: round2, round3 …"""
+    number = 2
+    while _logs_of(session, f"{ROUND}{number}"):
+        number += 1
+    return f"{ROUND}{number}"
+
+
+def _logs_of(session: Session, name: str) -> list[Path]:
+    """Return the training recordings whose names begin with that of a further motion."""
+    return [path for path in session.brought("training") if path.stem.lower().startswith(name)]
 
 
 def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
@@ -278,7 +296,8 @@ def identify(session: Session, say: Say) -> list[str]:
         "condition "
         f"number {raw:.3g}, with unit columns {normalised:.3g}; {fitted.raw.total:.2f} % of the torque unexplained"
     ]
-    designed = session.path("6-excitation/training")
+    before = f"{ROUND}{int(next_round(session).removeprefix(ROUND)) - 1}"
+    designed = session.path(f"6-excitation/{before if before in designed_motions(session) else 'training'}")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
         notes.append(prediction.compared_with_identification(designed, outcome))
     later = lines_of([one for one in outcome.noticed if one.code == "no-unseen-motion"])  # `predict` judges

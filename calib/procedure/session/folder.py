@@ -8,10 +8,11 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
                  some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
 4-fit/  5-validation/
-6-excitation/    training and validation: two motions for the robot to play, at the controller's rate
+6-excitation/    training and validation: two motions for the robot to play, at the controller's rate; round2 …: further
+                 ones, where tolerance_percent or sigma_percent asks for more than these brought
 7-recorded/      what people bring: the logs of them, training.csv (any name; .npz or a ROS bag, too), and files whose
-                 name starts with validation; a file whose name holds a payload's label was recorded with it on board:
-                 `calib formats recordings`
+                 name starts with validation or round2 …; a file whose name holds a payload's label was recorded with it
+                 on board: `calib formats recordings`
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
 9-export/        the calibrated robot in the forms other programs read; README.txt says which file is for whom
 certificate.html
@@ -61,6 +62,7 @@ PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
 PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
 POSES, UNSEEN, WAYS = "poses.csv", "validation.csv", "poses_run.csv"  # as planned, in 2-poses
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
+ROUND = "round"  # of further motions: round2, round3 …
 LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3")
 BROUGHT = {  # what people bring: where to, and how its name begins
     "measured": ("3-measured", ""), "validation": ("3-measured", "validation"), "drift": ("3-measured", "drift"),
@@ -144,6 +146,12 @@ class Session:
     def dynamic(self) -> bool:
         """Whether the session identifies the dynamics."""
         return self.settings.dynamics.wanted
+
+    @property
+    def needs(self) -> bool:
+        """Whether the session says how well torques or parameters have to be known."""
+        section = self.settings.dynamics
+        return self.dynamic and section.plan and bool(section.tolerance_percent or section.sigma_percent)
 
     @property
     def geometric(self) -> bool:

@@ -186,6 +186,8 @@ class DynamicsSection:
         holdout: share at the end of each recording that is held out if there is no validation recording; 0:
             none
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none
+        sigma_percent: largest standard deviation of essential parameters that is wanted [%]; 0: none. Where joints are
+            above tolerance_percent, or parameters above this, a further motion is designed (6-excitation/round2)
         payloads: masses [kg] of bodies at the flange by label, as loaded = 3.28
     """
 
@@ -208,6 +210,7 @@ class DynamicsSection:
     options: Beside = ""
     holdout: Holdout = 0.0
     tolerance_percent: NotNegative = 0.0
+    sigma_percent: NotNegative = 0.0
     payloads: Mapping[str, Annotated[float, Real(above=0, words="its mass [kg], a number above 0")]] = field(
         default_factory=dict
     )

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import SessionError
+from calib.extensions import offered
 from calib.files import fingerprint
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.coefficients import NAME as MOTION
@@ -64,7 +65,7 @@ class SessionStep:
             ``session.toml`` names; ``measured`` …: what people brought (`BROUGHT`).
         makes: names or patterns of what it makes.
         settings: sections of ``session.toml`` it depends on, or keys of one (``dynamics.period,rate``).
-        stage: ``geometry`` or ``dynamics``, where only sessions with that have it.
+        stage: ``geometry`` or ``dynamics``, where only sessions with that have it; ``need``: those that state one.
         brings: what people bring before it, and in words.
         kept: what it is not made again for, once that is brought, and in words; empty: always made again.
     """
@@ -139,7 +140,8 @@ STEPS = (
     ),
     SessionStep(
         "excite", "design the motions to record", dynamics_steps.excite, "fit/robot.toml dynamics:limits",
-        "6-excitation/*/*", "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed", "dynamics",
+        "6-excitation/training/* 6-excitation/validation/*",
+        "dynamics.plan,validation,period,harmonics,rate,starts,evaluations,limits seed", "dynamics",
         kept=(("training", "unseen"), "these motions were already recorded; `calib redo excite` designs new ones"),
     ),
     SessionStep(
@@ -188,8 +190,8 @@ class State:
 
 def _steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session, without those of stages that the settings exclude."""
-    left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric}
-    return tuple(step for step in STEPS if not left_out.get(step.stage))
+    left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric, "need": not session.needs}
+    return tuple(step for step in (*STEPS, *offered("steps")) if not left_out.get(step.stage))
 
 
 def find(session: Session, name: str) -> SessionStep:
@@ -202,8 +204,9 @@ def find(session: Session, name: str) -> SessionStep:
     for number, step in enumerate(there, 1):
         if name in (step.name, str(number)):
             return step
-    if stage := next((step.stage for step in STEPS if step.name == name), ""):
-        key = "wanted = true under [dynamics]" if stage == "dynamics" else "what measures under [instrument]"
+    if stage := next((step.stage for step in (*STEPS, *offered("steps")) if step.name == name), ""):
+        keys = {"dynamics": "wanted = true under [dynamics]", "need": "sigma_percent under [dynamics]"}
+        key = keys.get(stage, "what measures under [instrument]")
         raise SessionError(f"this session does not include the {stage}; for '{name}' write {key} in session.toml")
     raise SessionError(f"unknown step '{name}'; steps: {', '.join(step.name for step in there)}")
 
@@ -326,6 +329,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 
 def forget(session: Session, step: SessionStep) -> None:
-    """Mark a step and all steps after it to be run again."""
+    """Mark a step and all steps after it to be run again, but not a design that people have carried out."""
     there = _steps_of(session)
-    session.write_state(read_state(session).without(*(later.name for later in there[there.index(step) :])))
+    again = (later for later in there[there.index(step) :] if later is step or not session.brought(*later.kept[0]))
+    session.write_state(read_state(session).without(*(later.name for later in again)))

@@ -19,7 +19,8 @@ from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import asks, new_session
-from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
+from calib.procedure.session.dynamics_steps import next_round
+from calib.procedure.session.folder import MARK, ROUND, SETTINGS, Session, locked, open_session
 from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.library import load
@@ -183,12 +184,15 @@ def simulate_next(folder: Path, say: Say) -> None:
         )
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
-        if waiting is None:
+        step = "" if waiting is None else waiting.step.name
+        if waiting is None and next_round(session) in dynamics_steps.designed_motions(session):
+            step = "record"
+        elif waiting is None:
             _compare_with_truth(session, _cells_of(session)[0], say)
             return
-        if waiting.kind != steps.WAITING:
+        elif waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for no files; next: {command_line('next', folder)}")
-        _bring_for(session, waiting.step.name, say)
+        _bring_for(session, step, say)
     say(f"next: {command_line('next', folder)}")
 
 
@@ -246,7 +250,8 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
     """Simulate recordings of the designed motions."""
     _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)
-    for name, number, running in LOGS:
+    rounds = ((name, int(name.removeprefix(ROUND)) + 10, 720.0) for name in motions if name.startswith(ROUND))
+    for name, number, running in (*LOGS, *rounds):
         if name not in motions:
             continue
         t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate

@@ -1,0 +1,69 @@
+"""What the uncertainty of a calibrated geometry does to the torques that a motion is designed for."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data import csv_table
+from calib.dynamics.load_cases import LoadCases
+from calib.procedure.dynamic_stage.geometry_tables import SENSITIVITY
+from calib.procedure.excitation.inputs import ExcitedModel, bodies_with
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class GeometrySpread:
+    """Errors of a geometry, see `calib.procedure.excitation.inputs.GeometrySpread`.
+
+    Attributes:
+        moved: r pairs of models, on the geometry with +g_i and with -g_i.
+        before: (b, r) S g_i.
+    """
+
+    moved: tuple[tuple[LoadCases, LoadCases], ...]
+    before: np.ndarray
+
+    def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques' changes (N, rows, r) at fixed base parameters `values` (b,)."""
+        changes = [(up.regressor(q, v, a) - down.regressor(q, v, a)) @ values / 2.0 for up, down in self.moved]
+        return np.stack(changes, axis=2)
+
+
+def geometry_spread(
+    robot: object, source: Path, chain: Chain, model: ExcitedModel, after: Path | None
+) -> GeometrySpread | None:
+    """Return the principal errors of a geometry, and what they did to the parameters of an identification.
+
+    Args:
+        robot, source: as given, and its file; chain: as designed for.
+        model: that predicts the torques.
+        after: folder of the identification; its geometry's covariance counts.
+    """
+    stored, path = None if after is None else after / SENSITIVITY, source if after is None else after / calibrated.ROBOT
+    exact, values = model.exact, model.values
+    if after is None and isinstance(robot, CalibratedChain):
+        covariance = robot.covariance
+    else:
+        covariance = calibrated.read(path).covariance if path.suffix == ".toml" else None
+    if covariance is None or values is None or not (stored is None or stored.is_file()):
+        return None
+    sizes, axes = np.linalg.eigh(covariance)
+    errors = (axes * np.sqrt(np.maximum(sizes, 0.0)))[:, sizes > 1e-12 * sizes[-1]]
+    own = exact.model.bodies
+    payloads = [label for label, c in zip(own.labels, own.coordinates) if c < 0]
+
+    def moved(step: np.ndarray) -> LoadCases:
+        bodies = bodies_with(chain.with_values(np.asarray(chain.values) + step), own.gravity, payloads)
+        return replace(exact, model=replace(exact.model, bodies=bodies))
+
+    before = np.zeros((len(exact.names), errors.shape[1]))
+    if stored is not None:
+        names, *columns = csv_table.read_table(stored).cells  # an element each, then two tilts
+        rows = dict(zip(names.tolist(), np.column_stack(columns[: len(errors)]) @ errors))
+        if not set(exact.names) <= set(rows):
+            return None
+        before = np.array([rows[name] for name in exact.names])
+    return GeometrySpread(tuple((moved(one), moved(-one)) for one in errors.T), before)

@@ -1,0 +1,140 @@
+"""A further motion, where joints or parameters fall short of what ``session.toml`` asks for.
+
+Asked are ``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
+motion is designed after the identification, into ``6-excitation/round2`` (``round3`` once round2 was recorded …); a log
+whose name begins like that folder is identified together with all others.
+
+More motion lowers the error of a joint's torque only by the part that the parameters' σ has in it: of an error e with
+the parts s before and s' after the motion, √(e² - s² + s'²) remains. Where even s' = 0 would gain less than `MIN_GAIN`,
+more motion does not help: what is left is not modelled.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.errors import CalibError, command_line, listing
+from calib.folders import read_estimate
+from calib.procedure.excitation import design, prediction
+from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation.coefficients import RUN, SAMPLES
+from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
+from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.session.dynamics_steps import next_round, options_of
+from calib.procedure.session.folder import ROUND, Say, Session, read_state
+from calib.procedure.session.steps import SessionStep
+
+MIN_GAIN = 0.02  # of a joint's error: a smaller gain is no reason to record more (our choice)
+
+
+class _Parameter(NamedTuple):
+    name: str
+    rsd: float | None
+    essential: float | None
+
+
+class _Short(NamedTuple):
+    """A joint whose torque is worse than asked for: index, error on unseen motion [%], torque rms [N m or N]."""
+
+    joint: int
+    error: float
+    size: float
+
+    def left(self, before: np.ndarray, after: np.ndarray) -> float:
+        """Return the error [%] that remains once the torques' σ (n,) by the parameters has fallen."""
+        then, now = (100.0 * one[self.joint] / self.size for one in (before, after))
+        return float(np.sqrt(max(self.error**2 - then**2 + now**2, 0.0)))
+
+
+def extend(session: Session, say: Say) -> list[str]:
+    """Design a further motion where joints or parameters fall short, and return what it will bring as notes."""
+    section, place, round_name = session.settings.dynamics, session.identification, next_round(session)
+    short, weak = _short_joints(session), _weak_parameters(session)
+    if not short and not weak:
+        return ["no further motion is needed: joints and parameters are as asked for"]
+    payloads = tuple(options_of(session).settings.payloads)
+    settings = ExcitationSettings(
+        period=section.period, harmonics=section.harmonics, rate=section.rate, starts=section.starts,
+        evaluations=section.evaluations, repeat=section.repeats, outlook=False, columns=weak,
+        seed=session.settings.seed + int(round_name.removeprefix(ROUND)), loads=("none", *payloads) if payloads else (),
+    )  # fmt: skip
+    try:
+        given = read_inputs(session.fit.path, settings, limits=session.named(section.limits), after=place.path)
+        before = prediction.known_sigmas(given, prediction.task_of(given, settings.seed))[0][0]
+        helped = [one for one in short if one.left(before, 0.0 * before) < (1.0 - MIN_GAIN) * one.error]
+        notes = _unmodelled(given, [one for one in short if one not in helped])
+        if not helped and not weak:
+            return notes
+        aim = "parameters" if weak else "torque"
+        designed = design.search_motion(given, replace(settings, goals=(aim,)), progress=say)
+    except (CalibError, ValueError) as error:
+        return [f"joints or parameters fall short, but no further motion could be designed: {error}"]
+    if designed.found.interrupted:
+        raise KeyboardInterrupt
+    motion_folder.write_design(designed, session.path(f"6-excitation/{round_name}"))
+    return [*_gains(designed, helped, weak), *notes]
+
+
+def _short_joints(session: Session) -> list[_Short]:
+    """Return the joints whose motor torque is worse than tolerated, where the torques together are."""
+    report, asked = session.identification.unseen.read(), session.settings.dynamics.tolerance_percent
+    worst = max((report.proofs or report.fit).values(), key=lambda one: one.raw.relative_error_percent.total).raw
+    if not asked or worst.relative_error_percent.total <= asked:
+        return []
+    n = session.identification.dynamics().model.n
+    errors, rms = worst.relative_error_percent.joints[-n:], worst.rms[-n:]  # the motors' rows come last
+    rows = enumerate(zip(errors.tolist(), (100.0 * rms / errors).tolist()))
+    return [_Short(j, error, size) for j, (error, size) in rows if error > asked]
+
+
+def _weak_parameters(session: Session) -> tuple[str, ...]:
+    """Return the essential parameters whose relative σ is above the one asked for, and that a design can aim at."""
+    place, asked = session.identification, session.settings.dynamics.sigma_percent or np.inf
+    without = {one.name for one in place.dynamics().model.columns if not one.form.slopes}
+    rows = read_estimate(place.path, _Parameter)
+    return tuple(
+        one.name for one in rows if one.essential is not None and (one.rsd or 0.0) > asked and one.name not in without
+    )
+
+
+def _unmodelled(given: ExcitationInputs, joints: list[_Short]) -> list[str]:
+    """Return a note on the joints that more motion does not help."""
+    words = listing(f"{given.chain.joint_names[one.joint]} {one.error:.2g} %" for one in joints)
+    return [f"more motion does not help {words}: what is left is not modelled (friction, elasticity)"] if joints else []
+
+
+def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[str, ...]) -> list[str]:
+    """Return a note on what a motion will bring to joints and parameters, the worst first."""
+    outlook, names = designed.outlook, designed.inputs.chain.joint_names
+    rows = sorted(designed.predicted, key=lambda one: -(one.rsd or 0.0))
+    seconds = designed.playback.run.duration
+    if outlook is None or outlook.torque_sigma_before is None:
+        return []
+    errors = (outlook.torque_sigma_before, outlook.own.torque_sigma)
+    parts = [f"torque error of {names[one.joint]} from {one.error:.2g} to {one.left(*errors):.2g} %" for one in joints]
+    parts += [
+        f"σ of {one.name} from {100.0 * one.sigma_before / abs(one.value):.2g} to {one.rsd:.2g} %"
+        for one in rows
+        if one.name in parameters and one.value and one.sigma_before and one.rsd is not None
+    ]
+    return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
+
+
+def promised(session: Session) -> tuple[str, ...]:
+    """Return what a further motion will bring to a complete session, and how to carry it out; empty without one."""
+    name, notes = next_round(session), read_state(session).notes(STEP.name)
+    folder = session.path(f"6-excitation/{name}")
+    if not session.needs or not notes or not folder.exists():
+        return ()
+    played = folder / (RUN if session.settings.dynamics.repeats > 1 else SAMPLES)
+    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}.csv')}; then: "
+    return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
+
+
+STEP = SessionStep(
+    "extend", "see whether more motion is needed", extend,
+    "fit/robot.toml dynamics:limits dynamics:options 8-dynamics/estimate.csv 8-dynamics/unseen/report.json",
+    f"6-excitation/{ROUND}*/*",
+    "dynamics.tolerance_percent,sigma_percent,period,harmonics,rate,starts,evaluations,repeats seed", "need",
+)  # fmt: skip
