@@ -181,7 +181,7 @@ def excite_parallel(
         UsageError: for options that only serial arms know.
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
-    made, values = read_model(robot, model, settings.drives)
+    made, values = read_model(robot, model, settings.drives or "Fv Fc off")
     return design_parallel(robot, made, values, settings, map=map, progress=progress)
 
 

@@ -25,6 +25,7 @@ from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.inputs import identifiable, read_inputs, read_model, read_prior
 from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.planning import plan
+from calib.procedure.excitation.prediction import foretell
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.kinematics import forward
 from trajectories.basis import SampledMotion
@@ -396,6 +397,21 @@ def test_other_solvers_end_within_the_limits_too(solver):
     assert found.proof.feasible and np.isfinite(found.condition.raw)
 
 
+def test_stated_noise_weighs_rows_and_predicts():
+    """The default share of the torque limits, stated by joint, predicts the same; --noise beside it is refused."""
+    limits = read_inputs("lwr4plus", SHORT).limits.torque
+    noise = {f"q{j + 1}": 0.01 * x for j, x in enumerate(limits)}
+    given = read_inputs("lwr4plus", SHORT, limits={"noise": noise})
+    assert np.allclose(given.columns.sigmas, 0.01 * limits)
+    few = replace(SHORT, evaluations=10, outlook=False)
+    found = design.excite("lwr4plus", few, limits={"noise": noise})
+    share = found.outlook.own.torque_sigma_share
+    same = foretell(read_inputs("lwr4plus", few), few, found.problem, found.found, lambda period: found.problem)[0]
+    assert share == pytest.approx(same.own.torque_sigma_share) and found.outlook.noise_share == pytest.approx(0.01)
+    with pytest.raises(UsageError, match="leave --noise out"):
+        read_inputs("lwr4plus", replace(SHORT, noise=0.02), limits={"noise": {"all": 1.0}})
+
+
 def test_designs_for_predicted_sigmas_predict_smaller_ones():
     """Of torques on the typical task, and of the parameters relative to their values."""
     found = {goal: design.excite("lwr4plus", replace(SHORT, goals=goal)) for goal in ((), ("torque",), ("parameters",))}
@@ -431,6 +447,11 @@ def test_a_goal_out_of_reach_is_named():
         (PAYLOAD, {"loads": ("lode",)}, "did you mean 'load'"),
         (PAYLOAD, {"columns": ("ZZ9",)}, "'ZZ9' is not one of"),
         (PAYLOAD, {"columns": ("essential",)}, "needs --model"),
+        (PAYLOAD, {"drives": "Fv"}, "states the drive terms"),
+        (PAYLOAD, {"goals": ("raw=50", "raw=60")}, "'raw' is stated twice"),
+        ({}, {"loads": ("load",)}, "have no payloads"),
+        ({"payload": {"load": {"mass": 200.0, "com": [0.0, 0.0, 0.05]}}}, {}, "take a lighter payload"),
+        ({"rows": "both", "coupling": [{"joints": [5, 6]}]}, {}, 'label = "5_6"'),
     ],
 )
 def test_models_that_no_motion_can_be_designed_for(options, settings, words):

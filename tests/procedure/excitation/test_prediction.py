@@ -10,11 +10,14 @@ import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError
+from calib.identification.geometry_uncertainty import propagate
 from calib.identification.identify_options import IdentifyOptions
 from calib.procedure.dynamic_stage import identify, inputs
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.robot.calibrated import CalibratedChain
+from calib.rooms.further_motion.geometry_spread import geometry_spread
 
 SHORT = ExcitationSettings(
     starts=1, evaluations=30, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,
@@ -48,6 +51,21 @@ def outcome(designed: design.Designed) -> identify.IdentificationOutcome:
     options = IdentifyOptions()
     options = replace(options, settings=replace(options.settings, friction="standard", prior="none", method="wls"))
     return identify.run(inputs.gather("lwr4plus", [log], options=options))
+
+
+def test_the_geometrys_part_is_that_of_an_identification(designed, outcome):
+    """Of independent errors of all elements: sigma_geometry as `propagate` finds it from the log."""
+    chain, given = outcome.inputs.chain, designed.inputs
+    sizes = np.where(np.array(chain.units) == "m", 2e-4, 1e-3)
+    robot = CalibratedChain(chain, covariance=np.diag(sizes**2))
+    spread = geometry_spread(robot, Path("robot.toml"), chain, given.model, None)
+    quick = replace(SHORT, outlook=False)
+    rows = prediction.foretell(
+        replace(given, geometry=spread), quick, designed.problem, designed.found, lambda _: None
+    )[1]
+    stated = dict(zip(outcome.found.names, propagate(outcome.found, robot, outcome.inputs.cases).sigma_geometry))
+    ratios = [row.sigma_geometry / stated[row.name] for row in rows if row.name in stated]
+    assert len(ratios) > 40 and 0.9 < np.median(ratios) < 1.1 and np.quantile(np.abs(np.log(ratios)), 0.9) < 0.3
 
 
 def test_sigmas_stated_are_those_predicted_within_a_factor(motion, outcome):

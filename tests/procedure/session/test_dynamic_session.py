@@ -18,7 +18,7 @@ from calib.identification.model_file import read_dynamics
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session import commands, steps
 from calib.procedure.session.dynamics_steps import check_motion, designed_motions
-from calib.procedure.session.folder import Session, open_session
+from calib.procedure.session.folder import Session, open_session, read_state
 from calib.robot.library import load_calibrated
 from calib.rooms.cells import demo
 from calib.rooms.cells.truth import torque_errors
@@ -89,6 +89,17 @@ def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> 
     assert stopped is not None and stopped.step.name == "record"
     assert not session.path("6-excitation").exists()
     assert "a different one for validation" in commands.asks(session, stopped)[0]
+
+
+def test_a_motion_that_was_recorded_stays_when_the_geometry_is_fitted_again(waiting: Session) -> None:
+    for brought, kept in ((False, False), (True, True)):
+        if brought:
+            waiting.path("7-recorded").mkdir(exist_ok=True)
+            waiting.path("7-recorded/training.csv").write_text("t\n0\n")
+        before = read_state(waiting)
+        steps.forget(waiting, steps.find(waiting, "fit"))
+        assert ("excite" in read_state(waiting).steps) is kept and "fit" not in read_state(waiting).steps
+        waiting.write_state(before)
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ def test_a_session_of_the_version_before_typed_settings_opens(old: Path) -> None
     assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": 3.28}
     then = tomllib.loads(OLD)
     then["fit"] |= {"deliverable": "urdf", "holdout": 0.0}
-    then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0}
+    then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0, "sigma_percent": 0.0}
     assert tomllib.loads(written(found)) == then, "nothing else is added, lost or spelled otherwise"
 
 
@@ -132,6 +132,7 @@ OWN = {
     "poses": {"fit", "validation", "plan", "constraints"},
     "dynamics": {
         "wanted", "plan", "validation", "harmonics", "repeats", "limits", "torques", "options", "tolerance_percent",
+        "sigma_percent",
         "payloads", "holdout",
     },
 }  # fmt: skip
