@@ -120,7 +120,7 @@ def test_a_parameter_on_its_bound_has_no_sigma(robot: Path, tmp_path: Path):
 def test_every_method_says_what_it_assumes():
     least_squares = {"ols", "wls", "irls", "iv", "didim"}
     others = {"tls", "ml", "cloe", "clie", "adaline", "hopfield", "ekf", "srekf", "ukf", "srukf", "cdkf",
-              "srcdkf"}  # fmt: skip
+              "srcdkf", "gtls", "set-membership"}  # fmt: skip
     assert set(METHODS) == least_squares | others | {f"pc-{name}" for name in least_squares}
     assert all(one.name == name and len(one.assumes) > 20 for name, one in METHODS.items())
     assert all("\n" not in one.description and one.description and one.source for one in METHODS.values())

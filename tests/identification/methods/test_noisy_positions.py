@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import planted_motion as planted
 import pytest
+from scipy.optimize import linprog
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.filtering import decimate
@@ -19,6 +20,7 @@ from calib.identification.rows import make_case, observe
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.rooms.alternatives.estimators import samples_of
 from calib.rooms.alternatives.samples import stack
+from calib.rooms.studies.methods.bounded_errors import intervals
 from calib.rooms.studies.methods.maximum_likelihood import noise_of_states
 from calib.rooms.studies.methods.networks import adaline, hopfield
 
@@ -54,6 +56,47 @@ def test_maximum_likelihood_is_nearer_the_truth_than_least_squares():
     problem = noisy(0, 1e-3)
     size = {name: np.linalg.norm(errors(name, problem)[0]) for name in ("wls", "tls", "ml")}
     assert size["ml"] < 0.5 * min(size["wls"], size["tls"])
+
+
+def test_generalised_total_least_squares_takes_what_noise_adds_to_the_columns():
+    """Nearer the truth than least squares and TLS, within its sigma; the same as wls where positions are exact."""
+    away = {name: [errors(name, noisy(seed, 3e-4)) for seed in range(3)] for name in ("wls", "tls", "gtls")}
+    size = {name: np.mean([np.linalg.norm(error) for error, _ in each]) for name, each in away.items()}
+    assert size["gtls"] < 0.8 * min(size["wls"], size["tls"])
+    assert 0.6 < np.sqrt(np.mean([(error / sigma) ** 2 for error, sigma in away["gtls"]])) < 1.4
+    exact = noisy(0, 0.0)
+    same, sigma = errors("gtls", exact)
+    assert np.abs((same - errors("wls", exact)[0]) / sigma).max() < 0.05
+
+
+def test_noise_that_hides_the_columns_is_told():
+    found = METHODS["gtls"].estimate(noisy(0, 2e-2))
+    assert found.status is EstimateStatus.RANK_DEFICIENT and "noise of the encoders alone" in str(found.failure)
+
+
+def test_intervals_of_bounded_errors_hold_the_truth_and_are_those_of_all_rows():
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        matrix, truth = rng.normal(size=(300, 3)), rng.normal(size=3)
+        target = matrix @ truth + rng.uniform(-0.1, 0.1, 300)
+        plain = np.linalg.lstsq(matrix, target)[0]
+        left = target - matrix @ plain
+        bound = max(0.1, np.abs(left).max())
+        lower, upper, _ = intervals(matrix / bound, left / bound)
+        assert (plain + lower <= truth).all() and (truth <= plain + upper).all()
+        for j, axis in enumerate(np.eye(3)):
+            system, limit = np.vstack([matrix, -matrix]), np.concatenate([bound + left, bound - left])
+            ends = [-linprog(-s * axis, system, limit, bounds=(None, None)).fun for s in (1.0, -1.0)]
+            assert upper[j] >= ends[0] - 1e-9 and -lower[j] >= ends[1] - 1e-9  # outside, if not all rows took part
+            assert upper[j] - lower[j] < 1.1 * sum(ends)
+
+
+@pytest.mark.slow
+def test_set_membership_is_certain_and_wide(problem):
+    found, plain = METHODS["set-membership"].estimate(problem), METHODS["wls"].estimate(problem)
+    away = np.abs(found.estimate.values - problem.base.transform @ planted.truth())
+    half = np.sqrt(3.0) * found.estimate.sigma
+    assert (away <= half).all() and np.median(half / plain.estimate.sigma) > 5.0
 
 
 def test_noise_of_filtered_states_is_what_filters_leave_of_white_noise():

@@ -51,7 +51,7 @@ class _MaximumLikelihood(Method):
 
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:
         std, _ = weighed(problem)
-        task = _noisy_states(problem, model)
+        task = noisy_states(problem, model)
         values, noise = wls(problem.pooled, std).estimate.values, std**2
         steps: list[float] = []
         min_noise = 1e-4  # of the residuals' standard deviation: torques are not free of noise
@@ -98,7 +98,7 @@ class _Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class _NoisyStates:
+class NoisyStates:
     """All samples: matrix (M, n, p), target and rows in use (M, n), recordings, and differentiable columns."""
 
     model: IdentificationModel
@@ -110,7 +110,7 @@ class _NoisyStates:
     parts: tuple[_Recording, ...]
 
 
-def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> _NoisyStates:
+def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
     """Return all samples of a problem, with the covariance of the noise in q, v and a."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     smooth = np.array([one is None or one.form.slopes for one in problem.terms], dtype=bool)
@@ -124,7 +124,7 @@ def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) ->
         q, v, a = (x[index] for x in (motion.q, motion.v, motion.a))
         parts.append(_Recording(part, q, v, a, noise, case.carried, there[columns]))
         first += len(index)
-    return _NoisyStates(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
+    return NoisyStates(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
 
 
 def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
@@ -145,7 +145,7 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
     return result * (motion.cutoffs.noise**2)[:, None, None]
 
 
-def _slopes(task: _NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
+def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
     """Return B (M, n, 3, n), the Jacobian of W β with respect to q, v and a of each joint."""
     used = task.smooth & (part.present > 0.0)
     order = np.argsort(task.columns[used])
@@ -163,7 +163,7 @@ def _slopes(task: _NoisyStates, part: _Recording, values: np.ndarray) -> np.ndar
     return out
 
 
-def _residuals(task: _NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the residuals r (M, n), and G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n), of a recording."""
     by_state = _slopes(task, part, values)
     spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
@@ -177,7 +177,7 @@ def _inverse(other: np.ndarray, noise: np.ndarray, used: np.ndarray) -> np.ndarr
     return np.where(both, np.linalg.inv(np.where(both, other + np.diag(noise), np.eye(len(noise)))), 0.0)
 
 
-def _torque_noise(task: _NoisyStates, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
+def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
     parts = [_residuals(task, part, values) for part in task.parts]
     residual, other = (np.concatenate(x) for x in zip(*((r, more) for r, _, more in parts)))
@@ -208,7 +208,7 @@ class _Round:
         return np.sqrt(sum(np.sum((own @ self.bread.T) ** 2, axis=(0, 1)) for own in self.white))
 
 
-def _step(task: _NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
+def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
     """Return the next round of the iteration, from parameters (p,) and torque noise (n,)."""
     p = len(values)
     cross, score, white, left = np.zeros((p, p)), np.zeros(p), [], []
@@ -217,7 +217,7 @@ def _step(task: _NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
         used = task.present[part.own]
         inverse = _inverse(other, noise, used)
         error = np.einsum("mkjr,mrs,ms->mkj", spread, inverse, residual)
-        rows = np.where(used[:, :, None], task.matrix[part.own] + _change(task, part, error), 0.0)
+        rows = np.where(used[:, :, None], task.matrix[part.own] + changed(task, part, error), 0.0)
         root = np.linalg.cholesky(np.where(used[:, :, None], inverse, np.eye(len(noise)))).transpose(0, 2, 1)
         white.append(root @ rows)
         left.append((root @ residual[:, :, None])[:, :, 0])
@@ -228,7 +228,7 @@ def _step(task: _NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
     return _Round(values + bread @ score, bread, tuple(white), tuple(left))
 
 
-def _change(task: _NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
+def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
     """Return W(x + error) - W(x) (M, n, p) at the kept samples, error (M, 3, n); zero where there is no derivative."""
     out = np.zeros_like(task.matrix[part.own])
     smooth = np.flatnonzero(task.smooth)
