@@ -104,9 +104,16 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
         )
 
 
-def methods() -> tuple[Method, ...]:
-    """Return the identification methods as records: ``name``, ``description``, ``source``, ``needs``."""
-    return tuple(METHODS.values())
+class MethodTable(tuple[Method, ...]):
+    """Identification methods as records: ``name``, ``description``, ``source``, ``assumes``; one per line in print."""
+
+    def __repr__(self) -> str:
+        return "\n".join(map(str, self))
+
+
+def methods() -> MethodTable:
+    """Return all identification methods: ``name``, ``description``, ``source``, ``assumes``."""
+    return MethodTable(METHODS.values())
 
 
 @checked

@@ -4,10 +4,10 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 
     friction = "auto"                # auto, standard, or a rung: coupling, load, presliding, stribeck, asymmetric,
                                      # root, cubic, ripple; with rows = "both" also cable
-    method = "wls"                   # ols, wls, irls, tls, ml, adaline, hopfield; ekf, ukf, cdkf and their square-root
-                                     # forms srekf …; iv, didim (called CLIE elsewhere), cloe, clie (the survey's)
-                                     # simulate the closed loop, see [loop]; pc-ols, pc-wls, pc-irls, pc-iv, pc-didim:
-                                     # under [constraints]; all names: below
+    method = "wls"                   # ols, wls, irls, tls, gtls, ml, adaline, hopfield, set-membership; ekf, ukf, cdkf
+                                     # and their square-root forms srekf …; iv, didim (called CLIE elsewhere), cloe,
+                                     # clie (the survey's) simulate the closed loop, see [loop]; pc-ols, pc-wls,
+                                     # pc-irls, pc-iv, pc-didim: under [constraints]; all names: below
     weights = "residuals"            # of the joints' rows in wls: from their residuals; repeats: from the variance over
                                      # the periods that `calib recall` averaged, relative between joints
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link

@@ -222,7 +222,7 @@ class Method(ABC):
     def __str__(self) -> str:
         needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""
         tuned = f"; tuned: {', '.join(self.tunes)}" if self.tunes else ""
-        return f"{self.name:10} {self.description} ({self.source}){needs}{tuned}"
+        return f"{self.name:14} {self.description} ({self.source}){needs}{tuned}"
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
