@@ -156,10 +156,12 @@ def test_single_objectives_propose_goals_and_a_front_trades_them():
     begin = SLACK.evaluate(motion, BASE.regressor(motion.q, motion.v, motion.a)).value
     (least, run), *_ = proposed_goals(spot, [SLACK], starts=0, evaluations=90, guesses=(first.x,))
     assert least < begin - 0.003 and run.values[0] == least
-    levels = [begin, (begin + least) / 2, 0.5 * least]  # the last is out of reach
-    front = sweep(spot, Excitation("cond", "normalised"), SLACK, levels, first.x, run.x, evaluations=80)
-    assert front.values.shape == (2, 2) and (front.values[:, 1] <= np.array(levels[:2]) + 1e-5).all()
-    assert front.best.any()
+    index = Excitation("cond", "normalised")
+    front = sweep(spot, index, SLACK, 4, (first, run), first, evaluations=120)
+    levels = np.linspace(begin, front.values[1, 1], 4)[1:-1]
+    inner = front.values[3:]
+    assert len(inner) and inner[-1, 1] <= levels[-1] + 1e-5 and (inner[:, 0] <= front.values[1, 0]).all()
+    assert (front.values[front.designed] == front.values[0]).all() and front.best.any()
 
 
 def test_coverage_alone_reaches_its_shares():

@@ -7,8 +7,8 @@ import numpy as np
 
 from trajectories.design.objectives import Objective
 from trajectories.design.optimise import design
-from trajectories.design.problem import AttainmentGoal, ExcitationProblem
-from trajectories.design.search import SearchResult, Stuck, one_start
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem, exact_values, stretched
+from trajectories.design.search import SearchResult, one_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +19,14 @@ class Front:
         names: of the k objectives.
         values: (m, k), not smoothed, of the motions found; `found` (m,) the motions.
         best: (m,) whether no other one is as good in everything and better in something.
+        designed: which of them the front was to stand beside.
     """
 
     names: tuple[str, ...]
     values: np.ndarray
     found: tuple[SearchResult, ...]
     best: np.ndarray
+    designed: int
 
 
 def proposed_goals(
@@ -50,44 +52,60 @@ def sweep(
     problem: ExcitationProblem,
     first: Objective,
     second: Objective,
-    levels: Sequence[float],
-    guess: np.ndarray,
-    other: np.ndarray | None = None,
+    count: int,
+    ends: Sequence[SearchResult],
+    designed: SearchResult,
     *,
-    evaluations: int = 240,
+    evaluations: int = 600,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Front:
-    """Minimise the first objective under second ≤ level (a hard goal) for each level, from the last motion.
+    """Return a front by the ε-constraint (Haimes, Lasdon & Wismer 1971): the first objective's minima under bounds.
+
+    Levels of the second objective, a hard goal, go evenly from its own optimum to where the first one's lies. Each is
+    searched from the best motion known that keeps the level, and from the motion nearest to it; the better one counts.
 
     Args:
-        levels: of the second objective, in the order they are tried (best from easy to hard).
-        guess: variables to start from (p,).
-        other: to try where the last motion does not lead to a level, best what the second objective alone reached.
+        count: of the levels, with both ends.
+        ends: what minimises the first objective alone, and the second.
+        designed: another motion, which the front shall stand beside.
+        evaluations: most of each search.
     """
-    runs, values = list[SearchResult](), list[np.ndarray]()
+    known = [*ends, designed]
+    values = [_of(problem, (first, second), run) for run in known]
+    levels = np.linspace(values[0][1], values[1][1], count)[1:-1]
     for number, level in enumerate(levels, 1):
-        goals = (AttainmentGoal(first, _level(problem, first, guess)), AttainmentGoal(second, float(level), 0.0))
-        run = one_start(replace(problem, goals=goals), evaluations, "slsqp", 0, guess)
-        if isinstance(run, Stuck) and other is not None:
-            run = one_start(replace(problem, goals=goals), evaluations, "slsqp", 0, other)
-        if not isinstance(run, Stuck) and np.isfinite(run.merit):
-            guess = np.append(run.x, run.factor) if problem.free_period else run.x
-            runs.append(run)
-            values.append(run.values)
+        table = np.array(values)
+        kept = np.where(table[:, 1] <= level, table[:, 0], np.inf)
+        goals = (AttainmentGoal(first, float(values[0][0])), AttainmentGoal(second, float(level), 0.0))
+        spot, best = replace(problem, goals=goals), None
+        for k in {int(np.argmin(kept)), int(np.argmin(np.abs(table[:, 1] - level)))}:
+            guess = np.append(known[k].x, known[k].factor) if problem.free_period else known[k].x
+            run = one_start(spot, evaluations, "slsqp", 0, guess)
+            if isinstance(run, SearchResult) and run.merit < (np.inf if best is None else best.merit):
+                best = run
+        if best is not None:
+            known.append(best)
+            values.append(best.values)
         if report:
-            report(number, len(levels), f"{len(runs)} motions on the Pareto front")
-    table = np.array(values).reshape(len(runs), 2)
-    return Front((first.name, second.name), table, tuple(runs), non_dominated(table))
+            report(number, len(levels), f"{len(known) - 1} motions on the Pareto front")
+    table = np.array(values)
+    return Front(
+        (first.name, second.name),
+        table,
+        tuple(known),
+        non_dominated(table),
+        next(k for k, run in enumerate(known) if run is designed),
+    )
+
+
+def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
+    """Return the objectives of a motion, not smoothed."""
+    spot = replace(problem, objectives=tuple((one, 1.0) for one in objectives), goals=())
+    motion = stretched(spot.basis().motion(run.x), run.factor)
+    return exact_values(spot, motion, problem.regressor(motion.q, motion.v, motion.a))
 
 
 def non_dominated(values: np.ndarray) -> np.ndarray:
     """Return which rows (m, k) are not dominated (no other row is as small everywhere and smaller somewhere)."""
     better = (values[:, None] <= values[None]).all(-1) & (values[:, None] < values[None]).any(-1)
     return np.logical_not(better.any(axis=0))
-
-
-def _level(problem: ExcitationProblem, objective: Objective, y: np.ndarray) -> float:
-    """Return the objective's value at an initial guess, as a goal to improve on."""
-    x = y[: problem.basis().p]
-    motion = problem.basis().motion(x)
-    return float(objective.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value)

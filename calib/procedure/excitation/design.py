@@ -157,9 +157,22 @@ def torque_slack(joints: tuple[int, ...], given: ExcitationInputs, where: str) -
     if values is None or not np.isfinite(limits[list(joints)]).all():
         raise UsageError(f"{where}: needs torque limits, and a model or masses to predict torques")
     exact = given.model.exact
+    values = values if given.model.friction else values + exact.base.transform @ _typical_friction(given)
     rows = tuple(exact.limited[:, list(joints)].ravel().tolist())
     label = f"torque slack of joints {', '.join(str(j + 1) for j in joints)}"
     return TorqueSlack(rows, values, exact.of_rows(limits), label=label)
+
+
+def _typical_friction(given: ExcitationInputs) -> np.ndarray:
+    """Return standard parameters (p,) of typical friction: `TYPICAL` shares of the torque limits at full speed."""
+    limits, model = given.limits, given.model.exact.model
+    sizes = {"sign": limits.torque, "velocity": limits.torque / limits.bounds.velocity}
+    side = "motor" if model.torque_rows.with_motors else "link"
+    found = np.zeros(model.p)
+    for k, one in enumerate(model.columns, model.inertial):
+        if one.side == side and one.shape in TYPICAL:
+            found[k] = TYPICAL[one.shape] * sizes[one.shape][one.acts[0][0]]
+    return np.where(np.isfinite(found), found, 0.0)
 
 
 @dataclass(frozen=True)
@@ -207,6 +220,7 @@ class DesignMetrics:
 
 
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
+TYPICAL = {"sign": 0.07, "velocity": 0.13}  # Coulomb and viscous friction, at full speed together `GUARD` (our choice)
 INSTANTS = 1000  # over the period, at which condition numbers are reported
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
@@ -317,7 +331,7 @@ def search_motion(
     front = None
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
-            front = _front(problem, given, found, goals, settings.front, report)
+            front = _front(problem, given, found, goals, settings.front, settings.evaluations, report)
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
@@ -365,9 +379,10 @@ def _missed(goals: list[AttainmentGoal], values: Sequence[float], given: Excitat
         for goal, value in zip(goals, values)
         if value > goal.goal + 0.01 * abs(goal.goal)
     ]
-    idle = "without friction light joints have hardly any torque: state [friction] in the limits file, or a model"
+    parts = f"{TYPICAL['sign']:.0%} of the torque limits, and {TYPICAL['velocity']:.0%} more at full speed"
+    idle = f"torque goals expect friction of {parts} (typical): state [friction] in the limits file, or a model"
     known = given.model.friction or not any(isinstance(goal.objective, TorqueSlack) for goal in goals)
-    return tuple(words if known or not words else [*words, idle])
+    return tuple(words if known else [*words, idle])
 
 
 def _excitation_problem(
@@ -493,15 +508,13 @@ def _front(
     found: SearchResult,
     goals: list[AttainmentGoal],
     count: int,
+    evaluations: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
-    """Return trade-offs: the first torque goal (default: wrist) is varied from its present to its best value."""
+    """Return trade-offs by the ε-constraint: the first torque goal (default: wrist) from idle to its best value."""
     slack = next((one.objective for one in goals if isinstance(one.objective, TorqueSlack)), None)
     slack = slack or torque_slack(wrist(given.chain.n), given, "front")
-    motion = problem.basis().motion(found.x)
-    begin = slack.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value
-    bare = replace(problem, goals=())
-    (end, alone), *_ = proposed_goals(bare, [slack], starts=1, evaluations=150, guesses=(found.x,))
-    levels = np.linspace(begin, end, count + 1)[:-1].tolist() if end < begin else [begin]
-    index = problem.objectives[-1][0]  # the normalised condition number, or the aim in its place
-    return sweep(problem, index, slack, levels, found.x, alone.x, report=report)
+    bare, index = replace(problem, goals=()), problem.objectives[-1][0]  # normalised condition number, or the aim
+    ends = proposed_goals(bare, [index, slack], starts=1, evaluations=300, guesses=(found.x,))
+    known = [run for _, run in ends]
+    return sweep(problem, index, slack, count, known, found, evaluations=evaluations, report=report)

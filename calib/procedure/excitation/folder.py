@@ -72,8 +72,9 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         if draw is not None:
             draw(designed, folder)
         if designed.front is not None and len(designed.front.values):
-            rows = [[*map(float, row), bool(best)] for row, best in zip(designed.front.values, designed.front.best)]
-            files.write_table(folder / "front.csv", [*designed.front.names, "not dominated"], rows)
+            front = designed.front
+            rows = [[*map(float, row), bool(front.best[k]), k == front.designed] for k, row in enumerate(front.values)]
+            files.write_table(folder / "front.csv", [*front.names, "not dominated", "designed"], rows)
         if designed.outlook is not None:
             prediction.write(designed.predicted, folder)
         files.write_json(folder / METRICS, design_metrics(designed))

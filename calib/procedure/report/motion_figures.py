@@ -96,13 +96,19 @@ def _history_figure(designed: Designed) -> Chart:
     return Chart([Panel([curve], title, "improving feasible motions", "objective")], 2.2, width=HALF_WIDTH)
 
 
-def _front_figure(front: Front) -> Chart:
-    """Return the chart of trade-offs between two goals; open points are dominated by other points."""
-    good = front.values[front.best]
-    good, rest = good[np.argsort(good[:, 1])], front.values[~front.best]
-    points = [line(good[:, 1], good[:, 0], "o-", size=4.0), line(rest[:, 1], rest[:, 0], "o", BEFORE, hollow=True)]
-    title = f"{len(good)} motions to choose from"
-    return Chart([Panel(points, title, front.names[1], front.names[0])], 2.5, width=HALF_WIDTH)
+def front_figure(front: Front) -> Chart:
+    """Return the chart of a condition number over the mean torque that it was traded for; open: dominated points."""
+    index, torque = front.values[:, 0], 1.0 - front.values[:, 1]
+    order = np.argsort(torque)
+    good, rest = order[front.best[order]], order[~front.best[order]]
+    own = front.designed
+    points = [
+        line(torque[good], index[good], "o-", size=4.0), line(torque[rest], index[rest], "o", BEFORE, hollow=True),
+        line(torque[[own]], index[[own]], "s", MARK, size=5.5), text("designed", torque[own], index[own]),
+    ]  # fmt: skip
+    title = f"{len(np.unique(front.values[good], axis=0))} motions to choose from"
+    words = f"mean {front.names[1].replace('slack ', '')} / limit"
+    return Chart([Panel(points, title, words, front.names[0])], 2.5, width=HALF_WIDTH)
 
 
 def _motion(designed: Designed) -> Any:
@@ -116,7 +122,7 @@ def design_figures(designed: Designed) -> dict[str, Chart]:
     if isinstance(designed.inputs.chain, Chain):
         figures["path"] = _path_figure(designed)
     if designed.front is not None and len(designed.front.values):
-        figures["front"] = _front_figure(designed.front)
+        figures["front"] = front_figure(designed.front)
     if (look := designed.outlook) is not None and look.by_period:
         curve = [(one.seconds, 100 * one.torque_sigma_share) for one in look.by_period]
         own = (look.own.seconds, 100 * look.own.torque_sigma_share)

@@ -441,6 +441,16 @@ def test_a_goal_out_of_reach_is_named():
     assert "goal joint7=0.5 is missed: " in said and "state [friction]" in said
 
 
+@pytest.mark.slow
+def test_a_torque_goal_works_before_friction_is_known():
+    """Typical friction stands in for what nobody knows yet, so that condition numbers do not pay for a goal in vain."""
+    settings = replace(SHORT, starts=2, evaluations=300, outlook=False)
+    plain = design.excite("lwr4plus", settings)
+    found = design.excite("lwr4plus", replace(settings, goals=("wrist=0.1",)))
+    assert found.goals[0][3] >= 0.1 and "torque goals expect friction" in " ".join(found.notes)
+    assert found.condition.normalised < 1.1 * plain.condition.normalised
+
+
 @pytest.mark.parametrize(
     ("options", "settings", "words"),
     [
