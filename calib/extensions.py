@@ -9,6 +9,8 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     loop_results           function: problem, estimate → `calib.identification.loop.LoopResults`
     link_motion            function: robot, case, settings → the case with its links' motion, moved by joint corrections
     deflection_sensitivity function: identification, robot, cases → derivative of the estimate by their coefficients
+    identified_masses      function: folder of an identification, chain → standard parameters (n, 10) of its bodies
+    return_masses          function: session → notes; hands identified masses to its fit
     track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`

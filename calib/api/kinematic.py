@@ -156,7 +156,7 @@ class GeometryFit(Judged, fit.Outcome):
         """Return poses at joint values (m, n), with gravity torques (m, n) [N m] if masses are known."""
         chain = self.inputs.chain
         q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
-        return PoseMeasurements(q, chain.joint_names, torque=gravity_of(chain, q))
+        return PoseMeasurements(q, chain.joint_names, torque=gravity_of(self.inputs.weighed, q))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

@@ -67,6 +67,10 @@ class Outcome:
     def robot(self) -> CalibratedChain:
         """Calibrated robot with covariance and corrections, for identification, excitation and export."""
         found = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
+        if found.corrections is not None and self.inputs.masses is not None:
+            reference = replace(found.deflection.reference or self.inputs.chain, inertias=self.inputs.masses)
+            bent = replace(found.deflection, reference=reference)
+            found = replace(found, corrections=replace(found.corrections, deflection=bent))
         return replace(found, source=str(self.inputs.source))
 
     @property

@@ -54,6 +54,7 @@ class Inputs:
         unseen: by the name of the file they come from.
         notes: remarks for the user on the interpretation of the files.
         earlier: the robot as its file has it, with what an earlier fit left there; None for a URDF.
+        masses: (n, 10) identified standard parameters that gravity torques are computed from; None: the arm's own.
     """
 
     chain: Chain
@@ -62,6 +63,12 @@ class Inputs:
     unseen: Mapping[str, Unseen] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     earlier: CalibratedChain | None = None
+    masses: np.ndarray | None = None
+
+    @property
+    def weighed(self) -> Chain:
+        """The nominal arm with the masses that gravity torques are computed from."""
+        return self.chain if self.masses is None else replace(self.chain, inertias=self.masses)
 
     @property
     def known(self) -> Deflection:
@@ -101,8 +108,10 @@ def gather(
     chain, source = load_robot(robot, files[0], options, base, tip)
     stored = source.suffix == ".toml"
     earlier = robot if isinstance(robot, CalibratedChain) else calibrated.read(source) if stored else None
+    masses = needed("identified_masses")(settings.masses, chain) if settings.masses else None
+    weighed = chain if masses is None else replace(chain, inertias=masses)
     blocks = _named(
-        [(path, block) for path, each in zip(files, measured) for block in read_file(each, chain, options)],
+        [(path, block) for path, each in zip(files, measured) for block in read_file(each, weighed, options)],
         options, settings.stations, settings.tools,
     )  # fmt: skip
     unseen: dict[str, Unseen] = {}
@@ -112,7 +121,11 @@ def gather(
         fit.append(kept)
         if aside is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(aside, held_out=True)
-    given = with_unseen(Inputs(chain, source, tuple(fit), unseen, remarks(chain), earlier), validate, options, settings)
+    notes = remarks(chain)
+    if masses is not None:
+        notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
+    given = Inputs(chain, source, tuple(fit), unseen, notes, earlier, masses)
+    given = with_unseen(given, validate, options, settings)
     if earlier is None or earlier.corrections is None:
         return given
     name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
@@ -135,7 +148,7 @@ def with_unseen(
     unseen, notes, fit = dict(given.unseen), list[str](), given.fit
     files = {Path(block.file).resolve() for block in fit}
     for each in validate:
-        for block in read_file(each, given.chain, options, fit):
+        for block in read_file(each, given.weighed, options, fit):
             again = _path(each).resolve() in files
             if again:
                 notes.append(f"{block.file} is also a fit file, so its errors do not count as validation")

@@ -34,6 +34,7 @@ class FitSettings:
         tolerance: largest rms on unseen poses [m; on the command line mm]; above it the verdict is fail
         deliverable: subject of the verdict: urdf (robot.urdf alone), or corrections (with joint_corrections.csv)
         seed: reproduces everything random
+        masses: folder of an identification: compliance is fitted to its gravity torques, not to the description's
 
     Raises:
         UsageError: for a value that is none of these.
@@ -49,6 +50,7 @@ class FitSettings:
     tolerance: Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None = None
     deliverable: Deliverable = DELIVERABLES[0]
     seed: Seed = 0
+    masses: Text = ""
 
 
 @checked

@@ -14,6 +14,7 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
                  name starts with validation or round2 …; a file whose name holds a payload's label was recorded with it
                  on board: `calib formats recordings`
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
+8-masses/        the identification whose masses the fit's gravity torques are made of, where it has compliance
 9-export/        the calibrated robot in the forms other programs read; README.txt says which file is for whom
 certificate.html
 verdict.json     the verdict of the session, of each stage, and of each exported file
@@ -55,6 +56,7 @@ FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
+MASSES = "8-masses"  # the identification whose masses the fit uses
 AS_GIVEN = "1-robot/as_given"  # the robot as it is described, where its geometry is not fitted
 CHECKED, VERDICT = "checked.txt", "verdict.json"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"

@@ -26,6 +26,7 @@ from calib.folders import write_staged
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.geometry.repeatability import drift_of, noise_of_difference
 from calib.geometry.weighing import Settings
+from calib.identification.model_file import MODEL
 from calib.procedure.findings import UNJUDGED, lines_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
@@ -41,6 +42,7 @@ from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.session.folder import (
+    MASSES,
     POSES,
     POSES_CHECKED,
     PREDICTED,
@@ -265,12 +267,12 @@ def drift(
 
 def _fit_settings(session: Session) -> FitSettings:
     """Return the fit settings of ``session.toml``; a value ``auto`` leaves the choice to the options file."""
-    section = session.settings.fit
+    section, masses = session.settings.fit, session.path(MASSES)
     model, loss = (None if value == "auto" else value for value in (section.model, section.loss))
     return FitSettings(
         model=model, loss=loss, stations=section.stations, tolerance=1e-3 * section.tolerance_mm or None,
         refit_frames=section.validation_frames == "own", seed=session.settings.seed, holdout=section.holdout,
-        deliverable=section.deliverable,
+        deliverable=section.deliverable, masses=str(masses) if (masses / MODEL).is_file() else "",
     )  # fmt: skip
 
 

@@ -149,6 +149,8 @@ class FitSection:
             pass only means better than the nominal robot
         deliverable: what the verdict rates: robot.urdf alone, or corrections: with joint_corrections.csv
         holdout: share of the measured poses that is held out if there is no validation file; 0: none
+        rounds: how often identified masses may return into the gravity torques of a fit with compliance, while
+            geometry or dynamics still moves by more than a tenth of its sigma; 0: never
     """
 
     model: Model = FitOptions.model
@@ -159,6 +161,7 @@ class FitSection:
     tolerance_mm: NotNegative = 0.0
     deliverable: Deliverable = FitSettings.deliverable
     holdout: Holdout = FitSettings.holdout
+    rounds: Annotated[int, Whole(0, 20)] = 3
 
 
 @strict

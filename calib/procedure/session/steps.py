@@ -30,6 +30,7 @@ from calib.procedure.session.folder import (
     CUTS,
     EXPORT,
     MARK,
+    MASSES,
     MOTION_CHECKED,
     POSES,
     POSES_CHECKED,
@@ -130,7 +131,8 @@ STEPS = (
         "geometry", ("measured", "a file of measured poses"),
     ),
     SessionStep(
-        "fit", "fit the geometry", geometry_steps.fit, "robot:file fit:options measured", "4-fit/*",
+        "fit", "fit the geometry", geometry_steps.fit, f"robot:file fit:options measured {MASSES}/dynamics.json?",
+        "4-fit/*",
         "robot instrument fit seed", "geometry",
     ),
     SessionStep(

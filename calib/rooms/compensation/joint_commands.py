@@ -79,12 +79,12 @@ class Fitted:
 
     @property
     def torques(self) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Gravity torques of the nominal arm, as used in the fit; None without deflection terms."""
+        """Gravity torques, as used in the fit; None without deflection terms."""
         if not any(term.basis == "torque" for term in self.cell.deflection.terms):
             return None
         from calib.dynamics.rigid_body import gravity_torques
 
-        return partial(gravity_torques, self.nominal.chain)
+        return partial(gravity_torques, self.cell.deflection.reference or self.nominal.chain)
 
 
 @dataclass(frozen=True, eq=False)
