@@ -76,7 +76,7 @@ def test_compliance_is_right_with_identified_masses_and_wrong_with_those_of_the_
 def test_masses_of_another_arm_or_of_no_folder_are_refused(identified, tmp_path):
     with pytest.raises(UsageError, match="has 7"):
         identified_masses(identified, calib.load("lwr4plus").chain)
-    with pytest.raises(Exception, match="no identified model|identif"):
+    with pytest.raises(Exception, match="identif"):
         identified_masses(tmp_path, planted.arm())
     assert largest_move(tmp_path, identified) == np.inf and largest_move(identified, identified) == 0.0
 

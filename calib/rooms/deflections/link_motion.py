@@ -12,7 +12,7 @@ filtered positions; its first and second differences in time are added to v and 
 bends the joint is that of the unbent arm.
 
 Terms that move other elements than joints (tilting axes, wobble) are left out of the dynamics, and so is everything
-where an identification simulates the closed loop, whose robot is rigid.
+where an identification simulates the robot, which is rigid there, and for rows of power.
 """
 
 from collections.abc import Sequence
@@ -27,6 +27,7 @@ from calib.dynamics.bodies import Bodies, standard_parameters
 from calib.dynamics.torque_rows import BODIES, POWER
 from calib.identification.geometry_uncertainty import STEP, cut, estimate, estimator, pieces, weights
 from calib.identification.identify import Identification, common_decimator
+from calib.identification.methods.registry import method_named
 from calib.identification.rows import Case, segments
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.calibrated import CalibratedChain, Deflection, evaluate, target_elements
@@ -37,7 +38,8 @@ SAMPLES = 10_000  # at the full rate; longer recordings are represented by piece
 
 def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
     """Return a case with its links' motion (`Case.link`) by the robot's joint corrections; unchanged without any."""
-    rigid = not settings.deflections or settings.loop is not None or settings.torque_rows is POWER
+    simulated = settings.loop is not None or method_named(settings.method).needs_simulation
+    rigid = simulated or not settings.deflections or settings.torque_rows is POWER
     chain, terms = robot.complete, joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:
         return case

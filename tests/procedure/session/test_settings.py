@@ -128,7 +128,7 @@ def test_a_wrong_value_is_named_with_what_is_expected(old: Path, before: str, af
 
 # keys of session.toml that mean something else than the commands' options of that name, or that these have not
 OWN = {
-    "fit": {"options", "validation_frames", "tolerance_mm"},
+    "fit": {"options", "validation_frames", "tolerance_mm", "rounds"},
     "poses": {"fit", "validation", "plan", "constraints"},
     "dynamics": {
         "wanted", "plan", "validation", "harmonics", "repeats", "limits", "torques", "options", "tolerance_percent",
