@@ -9,6 +9,7 @@ from calib.errors import UsageError
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import of_platform
+from calib.rooms.parallel.purpose import LoadedPlatform
 from calib.rooms.parallel.robots import find
 
 ROBOTS = ("dualv", "fivebar", "stewart")
@@ -114,3 +115,20 @@ def expressed(model: ParallelModel, base: bases.Base, name: str) -> dict[str, fl
 def test_redundant_actuators_have_no_motor_rows():
     with pytest.raises(UsageError, match="overconstraint"):
         rows_named(robot("dualv"), "motor")
+
+
+def test_the_rows_of_a_motion_under_several_loads_are_those_of_each_load():
+    """Functions of the platform's coordinates for designs, against the regressor at the encoders' motion."""
+    known = find("fivebar").known
+    model = make_parallel_model(known, ["Ia Fv Fc off"], payloads=["tool"])
+    values = np.concatenate([model.known_parameters(), np.full(len(model.terms), 0.1)])
+    values[model.names.index("Mtool")] = 2.0
+    loads, kept = ((), ("tool",)), np.arange(model.p)
+    plan = LoadedPlatform(model, kept, values, names=model.names, units=model.units, loads=loads)
+    x, v, a = np.random.default_rng(0).uniform(-0.05, 0.05, (3, 5, 2))
+    motion, own = plan.motion(x, v, 10 * a), known.robot.actuated
+    q = motion.posture.q[:, own], motion.v[:, own], motion.a[:, own]
+    wanted = np.concatenate([model.regressor(*q, carried=one) for one in loads], axis=1)
+    np.testing.assert_allclose(plan.regressor(x, v, 10 * a), wanted, atol=1e-9)
+    np.testing.assert_allclose(plan.torques(motion), wanted @ values, atol=1e-8)
+    assert plan.row_names[::2] == ("motor_left (no payload)", "motor_left (tool)")

@@ -9,6 +9,7 @@ from platform_sines import sines
 from without_figures import run
 
 import calib as api
+from calib.folders import read_covariance
 from calib.robot import library
 from calib.rooms.parallel.mechanism import parallel_robot
 from calib.rooms.parallel.mechanism.closure import closed
@@ -128,6 +129,31 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
     np.testing.assert_allclose(mean[:, 1:5], rows[:-1, 4:8], atol=1e-6)
 
 
+@pytest.mark.slow
+def test_a_motion_after_an_identification_adds_its_information_under_both_loads(folder, tmp_path):
+    """Predicted σ are those of (C⁻¹ + ∫ Σ WᵀW / s²)⁻¹, W of the encoders' rows; a payload's come from its own run."""
+    files, options = [folder / "empty.csv", folder / "load.csv"], folder / "options.toml"
+    assert calib("identify", "dualv", *files, "--options", options, "--out", tmp_path / "id", "--no-plots") == 0
+    settings = api.ExcitationSettings(
+        period=1.0, harmonics=2, starts=1, evaluations=4, outlook=False, loads=("none", "5"), columns=("essential",)
+    )
+    found = api.design_excitation("dualv", settings, after=tmp_path / "id")
+    names, covariance = read_covariance(tmp_path / "id")
+    density = json.loads((tmp_path / "id" / "metrics.json").read_text())["error_density"]
+    model = make_parallel_model(find("dualv").known, ["Fv Fc off"], v0=0.01, payloads=["5"])
+    kept = [model.names.index(name if name in model.names else name[:-1]) for name in names]
+    _, q, v, a = found.sampled(500.0)
+    total = np.linalg.inv(covariance)
+    for carried in ((), ("5",)):
+        W = model.regressor(q, v, a, carried=carried)[:-1][:, :, kept] / np.sqrt(density)[:, None]
+        total += np.einsum("nri,nrj->ij", W, W) / 500.0
+    wanted = np.sqrt(np.diag(np.linalg.inv(total)))
+    np.testing.assert_allclose([row.sigma for row in found.predicted], wanted, rtol=0.02)
+    np.testing.assert_allclose([row.sigma_before for row in found.predicted], np.sqrt(np.diag(covariance)), rtol=1e-4)
+    assert found.outlook.own.torque_sigma_share < found.outlook.before
+    assert (found.save(tmp_path / "motion", plots=False) / "prediction.csv").is_file()
+
+
 @pytest.mark.parametrize("line", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_plan_keeps_the_limits_and_passes_the_waypoints(folder, tmp_path, line):
     out = tmp_path / "plan"
@@ -187,7 +213,8 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
         (("fit", "dualv", "passive.csv"), "passive joint"),
         (("fit", "dualv", "three.csv"), "'motor1' is missing"),
         (("excite", "dualv", "--lock", "motor1"), "lock is for serial arms"),
-        (("excite", "dualv", "--options", "options.toml"), "options is for serial arms only"),
+        (("excite", "dualv", "--goal", "wrist=0.1"), "'wrist' is not one of raw, normalised"),
+        (("excite", "dualv", "--options", "options.toml", "--load", "tool"), "payload 'tool' is not one of 5"),
         (("plan", "dualv", "--waypoints", "empty.csv"), "neither the platform's coordinates (x, y, rz)"),
         (("plan", "dualv", "--waypoints", "outside.csv"), "waypoint 2: joint 1 at 0.3"),
         (("plan", "dualv", "--waypoints", "way.csv", "--shorten", 5), "shorten is for serial arms"),

@@ -190,7 +190,7 @@ def read_inputs(
     spreads = [find(robot, source, chain, dynamics, after) for find in offered("geometry_spread")]
     spread = next(iter(spreads), None)
     prior = read_prior(settings.existing, dynamics, chain, after, noise, spread)
-    columns = _selected(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
+    columns = selected_columns(identifiable(dynamics, chain, locked, prior, noise), dynamics, settings, model)
     return ExcitationInputs(chain, known, dynamics, locked, columns, prior, spread)
 
 
@@ -229,7 +229,7 @@ def read_model(
     else:
         model = make_model(chain, options)
     model, left = _differentiable(model)
-    cases = _loads(loads, model, with_payloads=True)
+    cases = loads_of(loads, [] if options is None else [*options.payloads], with_payloads=True)
     if options is not None and options.friction not in ("auto", "standard"):
         notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
     if chain.inertias is None and np.isfinite(limits.torque).any():
@@ -242,7 +242,7 @@ def read_model(
         side = "motor" if model.torque_rows.with_motors else "link"  # where all friction counts, as the limits do
         drive_values = [known[one.shape][one.acts[0][0]] if one.shape in known and one.side == side else 0.0
                         for one in model.columns]  # fmt: skip
-        payloads, said = _stated(options)
+        payloads, said = stated_payloads(options)
         values = np.concatenate([standard_parameters(chain), *payloads, drive_values])
         notes += said
         if not known:
@@ -276,7 +276,7 @@ def _designable(rows: TorqueRows) -> bool:
     return rows.has_bodies and rows.projection is None
 
 
-def _stated(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
+def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
     """Return the ten parameters of each payload, and notes on assumptions about the payloads."""
     result, notes = [], []
     for label, load in ({} if options is None else options.payloads).items():
@@ -288,9 +288,8 @@ def _stated(options: IdentificationSettings | None) -> tuple[list[tuple[float, .
     return result, notes
 
 
-def _loads(texts: Sequence[str], model: IdentificationModel, with_payloads: bool) -> Loads:
-    """Return the payload labels of each run; by default none, then each payload alone if `with_payloads`."""
-    known = [label for label, c in zip(model.bodies.labels, model.bodies.coordinates) if c < 0]
+def loads_of(texts: Sequence[str], known: Sequence[str], with_payloads: bool) -> Loads:
+    """Return the payload labels of each run; by default none, then each known one alone if `with_payloads`."""
     if not texts:
         return ((), *((label,) for label in known)) if with_payloads and known else (None,)
     result = []
@@ -321,7 +320,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str]) -> ExcitedMode
         require(found.model.torque_rows.has_bodies, "rows 'drive' contain no information on the bodies", ValueError)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
-    loads = _loads(texts, found.model, with_payloads=False)
+    loads = loads_of(texts, table.get("payloads", ()), with_payloads=False)
     run = {label for carried in loads for label in carried or ()}
     values = dict(zip(found.model.names, found.values))
     carried = [label for label in table.get("payloads", ()) if label in run]
@@ -443,7 +442,7 @@ def identifiable(
     return IdentifiableColumns(kept, sigmas, tuple(names[k] for k in kept), (note,) if gone else ())
 
 
-def _selected(
+def selected_columns(
     found: IdentifiableColumns, model: ExcitedModel, settings: ExcitationSettings, folder: Path | None
 ) -> IdentifiableColumns:
     """Return the identifiable columns that the settings request: by name, or the essential ones of an identification.

@@ -1,6 +1,5 @@
 """Design of an exciting motion of a parallel robot, by the search for serial arms in platform coordinates."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,29 +10,23 @@ import numpy as np
 
 from calib import files
 from calib.api.motions import ExcitationDesign, Sampled
-from calib.dynamics import base as bases
-from calib.dynamics.shapes import V0
-from calib.errors import RobotError, UsageError
+from calib.errors import UsageError, one_of, require
 from calib.folders import METRICS, check_target, write_staged
-from calib.identification.model_file import MODEL
-from calib.procedure.excitation import coefficients, folder
+from calib.identification.identify_options import IdentifySettings
+from calib.procedure.excitation import coefficients, folder, prediction
 from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.design import GUARD, INSTANTS, search_motion
-from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, IdentifiableColumns
+from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.limits import MotionBounds, MotionLimits
-from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, DRIVES, ExcitationSettings
+from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, ExcitationSettings
 from calib.procedure.robot_kinds import refuse_unread
 from calib.robot.calibrated import COVARIANCE, ROBOT
 from calib.robot.chain import Joint
 from calib.robot.tables import dumps
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
-from calib.rooms.parallel.mechanism.parallel_model import (
-    ParallelModel,
-    PlatformRegressor,
-    make_parallel_model,
-    rows_named,
-)
-from calib.rooms.parallel.mechanism.velocities import LoopMotion, loop_jacobians
+from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, PlatformRegressor
+from calib.rooms.parallel.mechanism.velocities import LoopMotion
+from calib.rooms.parallel.purpose import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
 from calib.rooms.parallel.robots import ParallelMechanism
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
@@ -41,9 +34,13 @@ from trajectories.design.verify import dense_motion
 from trajectories.setpoints import Setpoints
 
 SAMPLES = 100  # instants over the period while searching
-READ = ("period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook")  # of the settings
+READ = (
+    "period", "harmonics", "drives", "starts", "evaluations", "seed", "rate", "outlook", "goals", "hard", "loads",
+    "columns",
+)  # of the settings  # fmt: skip
+GOALS = ("raw", "normalised", "logdet", "smallest")
 FIGURES = "plot_*.png"
-MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, FIGURES)
+MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, prediction.NAME, FIGURES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +107,19 @@ class ParallelExcitation(ExcitationDesign):
         motion = self.plan.motion(track.q, track.v, track.a)
         own = self.robot.chain.actuated
         return Setpoints(
-            track.rate, motion.posture.q[:, own], motion.v[:, own], motion.a[:, own], self.plan.torques(motion)
+            track.rate, motion.posture.q[:, own], motion.v[:, own], motion.a[:, own], self._torques(motion)
         )
+
+    def _torques(self, motion: LoopMotion) -> np.ndarray:
+        """Return the torques of the actuators (N, n), each of the load under which it is largest."""
+        every = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
+        return np.take_along_axis(every, np.abs(every).argmax(axis=1, keepdims=True), axis=1)[:, 0]
 
     @property
     def peaks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest torque of each actuator (n,) [N m or N] and acceleration of each platform coordinate (r,)."""
         orders = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
-        return np.abs(self.plan.torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
+        return np.abs(self._torques(self.plan.motion(*orders))).max(axis=0), np.abs(orders[2]).max(axis=0)
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
@@ -128,6 +130,8 @@ class ParallelExcitation(ExcitationDesign):
         def more(place: Path) -> None:
             series = coefficients.table(self._series(), ROBOT, bounds.lines())
             files.write(place / coefficients.NAME, dumps(series))
+            if self.predicted:
+                prediction.write(self.predicted, place)
             if plots:
                 motion_figures.write_design(self, place)
 
@@ -167,22 +171,40 @@ def excite_parallel(
     settings: ExcitationSettings,
     *,
     model: Path | None = None,
+    options: IdentifySettings | str | Path | None = None,
+    after: Path | None = None,
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelExcitation:
     """Return an exciting motion of a parallel robot within the torque limits and platform box of its file.
 
     Args:
-        settings: period, harmonics, drives, starts, evaluations, seed, rate; the others are for serial arms.
+        settings: period, harmonics, drives, loads, columns, goals (`GOALS`), starts, evaluations, seed, rate; the
+            others are for serial arms.
         model: folder of an identification of the same robot, which predicts the torques and whose drive terms are to
             be identified; None: the file's inertias.
+        options: of the identification that will follow: rows, drives, friction of passive joints, payloads.
+        after: folder of an identification that the motion shall add to; it is the model, too.
 
     Raises:
         UsageError: for options that only serial arms know.
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
-    made, values = read_model(robot, model, settings.drives or "Fv Fc off")
-    return design_parallel(robot, made, values, settings, map=map, progress=progress)
+    for text in (*settings.goals, *settings.hard):
+        one_of(text.partition("=")[0], GOALS, "goals: of a parallel robot", UsageError)
+    require(after is None or model is None, "after: its folder is also the model; leave --model out", UsageError)
+    folder = model or after
+    if options is None and after is None and not settings.loads and not settings.columns:
+        made, values = read_model(robot, folder, settings.drives or "Fv Fc off")
+        return design_parallel(robot, made, values, settings, map=map, progress=progress)
+    require(options is None or folder is None, f"{folder} already states rows, drives and payloads; leave the options "
+            "out", UsageError)  # fmt: skip
+    made, values, loads, notes = of_options(robot, options, settings) if folder is None else of_folder(
+        robot, folder, settings
+    )  # fmt: skip
+    purpose = purpose_of(made, values, loads, notes, settings, folder, after)
+    found = design_parallel(robot, made, values, settings, purpose=purpose, map=map, progress=progress)
+    return found if after is None else foretold(found)
 
 
 def design_parallel(
@@ -193,6 +215,7 @@ def design_parallel(
     *,
     acceleration: np.ndarray | None = None,
     preload: float = 0.0,
+    purpose: Purpose | None = None,
     map: Callable = map,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelExcitation:
@@ -207,6 +230,7 @@ def design_parallel(
         settings: period, harmonics, starts, evaluations, seed, rate.
         acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
         preload: overconstraint of redundant actuators [N m or N].
+        purpose: what the motion is designed for; None: all base parameters, on the platform's coordinates.
 
     Raises:
         UsageError: where nothing limits an actuator's speed or torque.
@@ -214,27 +238,26 @@ def design_parallel(
     """
     known, own = model.known, model.known.robot
     bounds = actuator_bounds(known)
-    base = bases.find(ParallelModel(known, model.terms, rows_named(known), ()))
-    columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
-    plan: Any = PlatformRegressor(model, columns, values, preload)
+    purpose = purpose or whole(model, values, preload)
+    plan: Any = purpose.model.exact
+    rows = getattr(plan, "row_names", own.joint_names)
     coordinates = tuple(f"platform {name}" for name in own.freedom)
     constraints: list[MotionConstraint] = [BoxLimit(0, own.lower, own.upper, rows=coordinates)]
     if acceleration is not None:
         constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
     constraints += [
-        _ActuatorLimit(plan, plan.torques, (1.0 - GUARD) * bounds.torque, own.joint_names),
+        _ActuatorLimit(plan, plan.torques, np.resize((1.0 - GUARD) * bounds.torque, len(rows)), rows),
         _ActuatorLimit(plan, plan.speeds, bounds.velocity, own.joint_names, "velocity", "rad/s"),
     ]
     joints = tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in own.freedom)
     platform: Any = SimpleNamespace(name=own.name, n=own.r, joint_names=own.freedom, joints=joints)  # like an arm's
     free = np.full(own.r, np.inf)
-    sigmas = np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
     given = ExcitationInputs(
-        platform,
-        MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
-        ExcitedModel(plan, plan, None, None, False), {}, IdentifiableColumns(None, sigmas, base.names), None,
+        platform, MotionLimits(tuple(constraints), bounds, free, None, 0.0, None, None, ()),
+        replace(purpose.model, values=None, covariance=None), {}, purpose.columns, purpose.prior,
     )  # fmt: skip
-    asked = replace(settings, goals=("logdet",), harmonics=settings.harmonics or COARSE, samples=SAMPLES)
+    goals, harmonics = settings.goals or ("logdet",), settings.harmonics or COARSE
+    asked = replace(settings, goals=goals, harmonics=harmonics, samples=SAMPLES)
     return ParallelExcitation(**vars(search_motion(given, asked, map, progress)), robot=robot, plan=plan)
 
 
@@ -250,44 +273,6 @@ def actuator_bounds(known: ClosedRobot) -> MotionBounds:
     origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
     place = "in the robot's file: velocity and effort of the actuated joints"
     return MotionBounds(known.robot.name, joints, velocity, free, effort, origin, place)
-
-
-def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") -> tuple[ParallelModel, np.ndarray]:
-    """Return a model of a robot with its values (p,): identified, or the file's inertias without friction.
-
-    Args:
-        folder: of an identification; None: the robot's file, with the terms `drives` of each actuator.
-
-    Raises:
-        RobotError: where the folder holds no model, or one of other bodies.
-        UsageError: where the robot's file has no inertias.
-    """
-    if folder is None:
-        model = make_parallel_model(robot.known, (drives,), v0=0.05)
-        bodies = model.known_parameters()
-        if bodies is None:
-            raise UsageError(
-                f"{robot.source} has no inertias, so torque limits cannot be applied; state them there, or name an "
-                "identified model (--model)"
-            )
-        return model, np.append(bodies, np.zeros(len(model.terms)))
-    path, tree = folder / MODEL, robot.known.robot
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-        known = {str(name): float(value) for name, value in table["values"].items()}
-        texts = [" ".join(one for one in DRIVES if one + label in known) for label in tree.labels]
-        passive = next((text for j, text in enumerate(texts) if j not in tree.actuated and text), "")
-        model = make_parallel_model(
-            robot.known, [texts[j] for j in tree.actuated], v0=float(table.get("v0", V0)),
-            payloads=[str(label) for label in table.get("payloads", ())], passive=passive,
-        )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RobotError(
-            f"{path} contains no model of a parallel robot ({error!r}); give a folder of calib identify"
-        ) from error
-    if missing := [name for name in model.names[: model.inertial] if name not in known]:
-        raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
-    return model, np.array([known.get(name, 0.0) for name in model.names])
 
 
 def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:

@@ -59,11 +59,11 @@ from calib.robot.formats.simulators import mjcf_text, pinocchio_model, pose_attr
 from calib.robot.formats.urdf_tree import transform_body, with_comment
 from calib.robot.formats.urdf_write import add_joint, centred, numbers_text, put, write_new, xml_text
 from calib.robot.kinematics import joint_frames
-from calib.rooms.parallel.excite import read_model
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model
 from calib.rooms.parallel.mechanism.parallel_robot import Leg
 from calib.rooms.parallel.mechanism.velocities import LoopMotion, of_platform
+from calib.rooms.parallel.purpose import read_model
 from calib.rooms.parallel.robots import ParallelMechanism
 from calib.transforms import invert
 

@@ -88,7 +88,7 @@ def identify_parallel(
     rows = rows_named(known, "" if asked == "motor" else asked)
     chosen = {key: value for key, value in (("method", method), ("friction", friction)) if value is not None}
     options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
-    _refuse(options.settings, options)
+    refuse_options_of_arms(options.settings, options)
     settings = options.settings
     inputs = gather(robot, recordings, validate, options=options, seed=seed, progress=progress)
     if on_read is not None:
@@ -162,7 +162,7 @@ def _driven_joints(
     return tuple(name for name, own in zip(joints, taken) if own < MIN_ENERGY_SHARE * moved)
 
 
-def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
+def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOptions) -> None:
     """Raise an error for settings and options that apply to serial arms only."""
     read = {each.name for each in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)

@@ -62,7 +62,7 @@ class ParallelMechanism:
             write_covariance(folder / COVARIANCE, self.covariance.names, self.covariance.matrix)
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, Any]:
-        """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.excite.read_model` reads it."""
+        """Return the model as the content of ``dynamics.json``; `calib.rooms.parallel.purpose.read_model` reads it."""
         from calib.dynamics.base import expressions  # slow to load, as are the others; finding a robot needs none
         from calib.dynamics.shapes import V0
         from calib.folders import COVARIANCE as OF_PARAMETERS

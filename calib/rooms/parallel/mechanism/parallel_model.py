@@ -165,7 +165,10 @@ class ParallelModel:
         carried: Collection[str] | None = None, states: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
         """Return W (N, rows, p) at the encoders' q, v, a (N, n); other arguments as `IdentificationModel.regressor`."""
-        motion = self.moved(q, v, a)
+        return self.along(self.moved(q, v, a), carried)
+
+    def along(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return W (N, rows, p) along a motion of the whole robot."""
         return self.on_rows(self.platform_regressor(motion, carried), motion)
 
     def torque(
