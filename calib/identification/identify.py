@@ -27,7 +27,7 @@ from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, with_blocks
-from calib.identification.settings import IdentificationSettings, make_model, require_simulable
+from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.time_folds import regimes
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
@@ -135,8 +135,7 @@ def identify_model(
     settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
     require(cases, "no recording to identify the model from", UsageError)
     method = method_named(settings.method)
-    if method.needs_simulation:
-        settings = require_simulable(settings, method.needs_controller, method.takes_models)
+    settings = require_usable(settings, method)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)

@@ -1,9 +1,10 @@
 """Settings of the closed loop in which recordings were made: table [loop] of the options file.
 
 Instrumental variables (method iv) simulate that loop; with another method and a [loop], the same simulation tests
-whether least squares is biased. iv and didim take joint torque sensors (rows link, both) and stated friction steps
-(friction = "stribeck"), too; friction = "auto" is standard friction there. Gains are what the joints feel, torque per
-position error on the joint side::
+whether least squares is biased. iv, didim and cloe take joint torque sensors (rows link, both), clie rows both.
+friction = "auto": iv and didim simulate the steps chosen by least squares, cloe and clie standard friction; all take
+stated steps, cloe and clie those with derivatives (not load, presliding). Recordings may carry different payloads.
+Gains are what the joints feel, torque per position error on the joint side::
 
     [loop]
     controller = "pd"                # pd, cascade, or identify: gains read from the logs (ARX, see below)

@@ -18,6 +18,7 @@ from calib.errors import UsageError, refuse_option, require
 from calib.identification.constraint_settings import ConstraintSettings
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop import LoopSettings, check_loop, per_joint
+from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS
 from calib.robot.chain import Chain
 
@@ -159,32 +160,26 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
             raise UsageError(f"coupling: joint {coupling.joints[0] + 1} is coupled with itself; name two joints")
 
 
-def require_simulable(
-    settings: IdentificationSettings, with_loop: bool, with_models: bool = False
-) -> IdentificationSettings:
-    """Return the settings for a method that simulates: with standard friction, unless it supports the stated one.
-
-    Args:
-        with_loop: whether it simulates the closed loop, or the robot alone.
-        with_models: whether it takes joint torque sensors and stated richer friction, too.
+def require_usable(settings: IdentificationSettings, method: Method) -> IdentificationSettings:
+    """Return the settings for a method, with what it makes of friction = "auto".
 
     Raises:
-        UsageError: for a missing loop, torques other than the motors', or richer friction.
+        UsageError: for a missing loop, torque rows that the method does not take, or richer friction; the message
+            names all methods that do.
     """
-    place = f"method '{settings.method}'"
-    if with_loop and settings.loop is None:
+    place, rows, friction = f"method '{method.name}'", settings.torque_rows, settings.friction
+    if method.needs_controller and settings.loop is None:
         words = (
             "state the controller in the options file, [loop] controller = … (calib formats "
             "identify-options), and log or state the reference; from q and torque alone use wls or irls"
         )
         refuse_option(place, words)
-    rows = settings.torque_rows
-    if not (rows.has_bodies and rows.projection is None if with_models else rows.motors_alone):
-        kinds = "rows = 'motor', 'link' or 'both'" if with_models else "motor torques only"
-        refuse_option(place, f"supports {kinds}; rows = '{rows.name}' needs ols, wls, irls or tls")
-    if with_models and settings.friction != "auto":
-        return settings
-    if settings.friction not in ("auto", "standard"):
-        words = f"simulates standard friction only, not friction = '{settings.friction}'"
-        refuse_option(place, f"{words}; use wls (with a [loop], it is tested for bias)")
-    return replace(settings, friction="standard")
+    if not method.takes(rows):
+        known = ", ".join(name for name, one in METHODS.items() if one.takes(rows))
+        refuse_option(place, f"rows = '{rows.name}' is not supported; methods that do: {known}")
+    if friction == "auto":
+        return replace(settings, friction=method.auto_friction)
+    if friction != "standard" and not method.takes_models:
+        known = ", ".join(name for name, one in METHODS.items() if one.takes_models)
+        refuse_option(place, f"standard friction only, not friction = '{friction}'; methods that take it: {known}")
+    return settings

@@ -17,6 +17,7 @@ from calib.data.signals.filtering import Decimator
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
+from calib.dynamics.torque_rows import TorqueRows
 from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit
@@ -199,8 +200,9 @@ class Method(ABC):
         takes_prior: whether it uses a prior, ridges of richer friction, and a stated noise of the rows.
         needs_controller: whether it simulates the closed loop of a recording.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
-        takes_models: if it simulates: whether it takes joint torque sensors and stated richer friction, too.
+        takes_models: whether it takes joint torque sensors and richer friction; otherwise motor torques alone.
         takes_constraints: whether its estimate satisfies the options' [constraints].
+        auto_friction: what friction = "auto" is for it: auto, chosen by least squares, or standard.
     """
 
     name: str
@@ -212,12 +214,18 @@ class Method(ABC):
     takes_prior: bool = field(default=False, kw_only=True)
     needs_controller: bool = field(default=False, kw_only=True)
     needs_simulation: bool = field(default=False, kw_only=True)
-    takes_models: bool = field(default=False, kw_only=True)
+    takes_models: bool = field(default=True, kw_only=True)
     takes_constraints: bool = field(default=False, kw_only=True)
+    auto_friction: str = field(default="auto", kw_only=True)
 
     @abstractmethod
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's p columns, or a status with the reason of failure."""
+
+    def takes(self, rows: TorqueRows) -> bool:
+        """Return whether it estimates from these torque rows; who simulates a motion needs the bodies in them."""
+        simulable = rows.has_bodies and rows.projection is None
+        return rows.motors_alone or (self.takes_models and (simulable or not self.needs_simulation))
 
     def __str__(self) -> str:
         needs = "; needs the loop" if self.needs_controller else "; needs simulation" if self.needs_simulation else ""

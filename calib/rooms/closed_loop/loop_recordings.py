@@ -321,10 +321,19 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
     what tells W from Z is noise.
     """
-    index, motion = simulated_samples(case, run.t, loop), case.motion
-    q, less = (low_passed(run.q, motion, at) for at in (motion.cutoff, motion.velocity_cutoff))
-    v, a = slope(less, motion.rate), curvature(q, motion.rate)
-    return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
+    q, v, a = followed(run.q, case.motion, simulated_samples(case, run.t, loop))
+    return replace(case, motion=replace(case.motion, q=q, v=v, a=a))
+
+
+def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v, a (M, n, ...) of simulated positions, or of their derivatives, filtered like the recorded motion.
+
+    Args:
+        q: (N, n, ...) of the whole simulation.
+        index: (M,) samples to return.
+    """
+    own, less = (low_passed(q, motion, at) for at in (motion.cutoff, motion.velocity_cutoff))
+    return own[index], slope(less, motion.rate)[index], curvature(own, motion.rate)[index]
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:

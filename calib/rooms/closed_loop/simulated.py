@@ -57,7 +57,6 @@ class _Simulated(Method):
 
     needs_controller: bool = field(default=True, kw_only=True)
     needs_simulation: bool = field(default=True, kw_only=True)
-    takes_models: bool = field(default=True, kw_only=True)
     tunes: tuple[str, ...] = field(default=("tolerance 2.5 %", "10 rounds"), kw_only=True)
     instruments: str = ""
 
@@ -102,14 +101,15 @@ class _Simulated(Method):
         return attempted_in_loop(self.name, problem, loops, estimate)
 
 
+CHOSEN = "friction model (with friction = 'auto': steps chosen by least squares) are those of the robot"
 IV = _Simulated(
-    "iv", "the stated controller, reference and friction model are those of the robot",
+    "iv", f"the stated controller, reference and {CHOSEN}",
     description="instrumental variables from the simulated closed loop", source="Janot, Vandanjon & Gautier 2014",
 )  # fmt: skip
 DIDIM = _Simulated(
     "didim",
-    "the simulated robot moves like the real one: stated controller, reference and friction model are those of the "
-    "robot; measured positions are not used",
+    f"the simulated robot moves like the real one: stated controller, reference and {CHOSEN}; measured positions are "
+    "not used",
     "didim",
     description="least squares on the simulated motion alone (the slides' CLIE)",
     source="Gautier, Janot & Vandanjon 2013",

@@ -42,6 +42,8 @@ class _KalmanFilter(Method):
     """
 
     needs_simulation: bool = field(default=True, kw_only=True)
+    auto_friction: str = field(default="standard", kw_only=True)
+    takes_models: bool = field(default=False, kw_only=True)
     kind: Filter
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -54,12 +56,12 @@ class _KalmanFilter(Method):
         if not plain.found:
             return replace(plain, method=self.name)
         return attempted(
-            self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self.name))
+            self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self))
         )  # fmt: skip
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values, sigma = plain.estimate.values, plain.estimate.sigma
-        start = start_of(problem, self.name, values, _inertia(problem), lambda x: _moves(robot, problem, x))
+        start = start_of(problem, self, values, _inertia(problem), lambda x: _moves(robot, problem, x))
         start_sigmas = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
         wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques

@@ -23,6 +23,7 @@ import numpy as np
 from calib.data.signals.filtering import Decimator, curvature, kept, low_pass, slope
 from calib.data.signals.motion import Motion
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import TorqueRows
 from calib.errors import Diverged, NotConverged
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.triangles import condition_numbers
@@ -40,13 +41,17 @@ BLOCK = 1000  # samples at a time
 class _MaximumLikelihood(Method):
     """Identification by maximum likelihood with errors in variables."""
 
+    def takes(self, rows: TorqueRows) -> bool:
+        """Return whether it estimates from these torque rows: from those of the motors alone."""
+        return rows.motors_alone
+
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's columns, with the torque noise as weights.
 
         Raises:
             UsageError: for a model whose rows have no slopes by q, v and a.
         """
-        model = serial_arm(problem, self.name)
+        model = serial_arm(problem, self)
         return attempted(self.name, problem, lambda: self._estimate(problem, model))
 
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:

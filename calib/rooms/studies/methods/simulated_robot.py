@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.shapes import V0
 from calib.errors import CalibError, CannotSimulate, Diverged, UsageError, refused_as, require
 from calib.identification.loop import Controller
-from calib.identification.methods.method import IdentificationProblem
+from calib.identification.methods.method import IdentificationProblem, Method
 from calib.identification.rows import Case
 from calib.records import frozen, shaped
 from calib.rooms.closed_loop.controllers import Reference
@@ -58,7 +60,8 @@ def simulate_tangents(
     from calib.rooms.studies.methods import tangent_kernels
 
     for one in plant.terms:
-        require(one.form.slopes, f"term '{one.name}' ({one.shape}): no derivatives for this friction")
+        words = f"term '{one.name}' ({one.shape}): no derivatives of friction that hangs on past motion or on torques"
+        require(one.form.slopes, f"{words}; iv and didim take it")
     n, count, c = plant.bodies.n, len(reference.t), len(columns)
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = np.arange(c)
@@ -143,7 +146,8 @@ class BelievedRobot:
 
     Attributes:
         model: with richer friction, where the problem has any.
-        columns: (p,) place of each of the problem's parameters among the plant's.
+        columns: (p,) place of each of the problem's parameters among the plant's; without motor torques, those of the
+            motors follow.
         plant: with all parameters zero.
     """
 
@@ -164,28 +168,39 @@ class BelievedRobot:
         return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
 
 
-def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationModel:
-    """Return the model of a problem; raise unless it is a serial arm with motor torques.
+def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
+    """Return the model of a problem; raise unless it is a serial arm with torque rows that the method takes.
 
     Raises:
         UsageError: for another.
     """
     model = problem.model
-    if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-        raise UsageError(f"method '{method}' needs motor torques of a serial arm; otherwise take wls or tls")
+    if not isinstance(model, IdentificationModel) or not method.takes(model.torque_rows):
+        words = f"needs a serial arm with motor torques, not rows '{model.torque_rows.name}'"
+        raise UsageError(f"method '{method.name}' {words}; otherwise take wls or tls")
     return model
 
 
-def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot:
+def believed_robot(problem: IdentificationProblem, method: Method) -> BelievedRobot:
     """Return the robot model that simulates an identification problem.
 
+    Without motor torques (rows link) nothing in the problem tells how the motors move: inertia, friction and offset of
+    each are parameters more, the last ones (our choice).
+
     Raises:
-        UsageError: for a model that is no serial arm with motor torques.
+        UsageError: for a model that is no serial arm with torque rows that the method takes.
         CannotSimulate: for friction that the simulator does not know, or an exact sign.
     """
     model, columns = with_friction(problem, serial_arm(problem, method))
+    terms, size = model.columns, model.p
+    if not model.torque_rows.with_motors:
+        widths = {one.acts[0][0]: one.settings[-1] for one in terms if one.shape == "sign"}
+        width = [widths.get(joint, V0) for joint in range(model.n)]
+        motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic)
+        terms = (*terms, *(replace(one, name=f"motor {one.name}") for one in motors))
+        columns = np.append(columns, np.arange(size, size + len(motors)))
     with refused_as(CannotSimulate, CalibError, "{}"):
-        plant = Plant(model.bodies, model.terms, np.zeros(model.p))
+        plant = Plant(model.bodies, terms, np.zeros(model.inertial + len(terms)))
     return BelievedRobot(model, columns, plant)
 
 
@@ -198,7 +213,7 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
 
 def start_of(
     problem: IdentificationProblem,
-    method: str,
+    method: Method,
     plain: np.ndarray,
     inertia: np.ndarray,
     simulated: Callable[[np.ndarray], object],
@@ -206,14 +221,14 @@ def start_of(
     """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
 
     Args:
-        method: name of the one that simulates.
+        method: the one that simulates.
         plain: (p,) of weighted least squares.
         inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
         simulated: raises `CalibError` where values cannot be simulated.
 
     Raises:
         CannotSimulate: where none can be.
-        UsageError: for a model that is no serial arm with motor torques.
+        UsageError: for a model that is no serial arm with torque rows that the method takes.
     """
     if problem.start is not None:
         return np.array(problem.start, dtype=float)
