@@ -196,7 +196,7 @@ def believed_robot(problem: IdentificationProblem, method: Method) -> BelievedRo
     if not model.torque_rows.with_motors:
         widths = {one.acts[0][0]: one.settings[-1] for one in terms if one.shape == "sign"}
         width = [widths.get(joint, V0) for joint in range(model.n)]
-        motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic)
+        motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic.tolist())
         terms = (*terms, *(replace(one, name=f"motor {one.name}") for one in motors))
         columns = np.append(columns, np.arange(size, size + len(motors)))
     with refused_as(CannotSimulate, CalibError, "{}"):
