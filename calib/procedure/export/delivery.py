@@ -62,7 +62,7 @@ from calib.robot.description import impossible_bodies
 from calib.robot.formats import urdf_write
 from calib.robot.formats.urdf_tree import text, with_comment
 
-README, UR_KINEMATICS = "README.txt", "ur_kinematics.yaml"
+README, UR_KINEMATICS, MJCF, DRIVES = "README.txt", "ur_kinematics.yaml", "robot.xml", "drives.csv"
 GEOMETRY, DYNAMICS = "geometry", "dynamics"
 READ_BACK = "Pinocchio reads the same poses and torques to 1e-9"
 DRIVE_COLUMNS = (
@@ -224,7 +224,7 @@ class ExportFile:
 
 _TO_MASTER = "for the controller: joint offsets to add to its mastering; contains no other part of the geometry"
 _ONLY = f"only for programs that apply {TERMS}, otherwise {URDF} is better; masses are those of the source"
-_TO_SIMULATE = "for simulators: motor inertia, friction and offset of each joint, with sigmas"
+TO_SIMULATE = "for simulators: motor inertia, friction and offset of each joint, with sigmas"
 _UR = "for ur_description: kinematics_params_file"
 _MUJOCO = "for MuJoCo: geometry, masses, motor inertia and friction"
 _ROS = "for ROS, MoveIt and simulators; use this file if in doubt"
@@ -236,8 +236,8 @@ FILES = (
     ExportFile(ROBOT, _copy, "for this toolkit: geometry with covariance and corrections", deliverable="corrections"),
     ExportFile(OFFSETS, _offsets, _TO_MASTER),
     ExportFile(UR_KINEMATICS, _ur_kinematics, _UR, deliverable="urdf", marked=True),
-    ExportFile("robot.xml", _mjcf, _MUJOCO, (DYNAMICS,), "urdf", marked=True),
-    ExportFile("drives.csv", _drives, _TO_SIMULATE, (DYNAMICS,)),
+    ExportFile(MJCF, _mjcf, _MUJOCO, (DYNAMICS,), "urdf", marked=True),
+    ExportFile(DRIVES, _drives, TO_SIMULATE, (DYNAMICS,)),
     ExportFile("joint_origins.yaml", _joint_origins, "for tesseract", (DYNAMICS,)),
     ExportFile(PARAMETERS, _parameters, "all parameters of geometry and dynamics with covariances", (DYNAMICS,)),
 )

@@ -50,9 +50,10 @@ from calib.identification.possible.problem import find_prior_bodies
 from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import RADIUS
-from calib.procedure.export.delivery import README, write_drives
+from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, write_drives
 from calib.procedure.export.identified import Drives, drive_table
 from calib.procedure.findings import LEVELS
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.formats.simulators import mjcf_text, pinocchio_model, pose_attributes
@@ -69,10 +70,10 @@ from calib.transforms import invert
 
 PLATFORM, CLOSURES = "platform", "robot.yaml"
 USES = {
-    "robot.urdf": "for ROS, MoveIt, Pinocchio: the robot cut open at its platform",
+    URDF: "for ROS, MoveIt, Pinocchio: the robot cut open at its platform",
     CLOSURES: "for Pinocchio: the frames of robot.urdf that close the loops, the actuated joints, joint values at home",
-    "robot.xml": "for MuJoCo: loops closed, masses, motor inertia and friction; start at its keyframe home",
-    "drives.csv": "for simulators: motor inertia, friction and offset of each joint, with sigmas",
+    MJCF: "for MuJoCo: loops closed, masses, motor inertia and friction; start at its keyframe home",
+    DRIVES: TO_SIMULATE,
     ROBOT: "for this toolkit",
     PARAMETERS: "all parameters with their covariance",
     README: "",
@@ -176,7 +177,7 @@ class OpenedRobot:
             add_joint(root, f"{name}_fixed", "fixed", PLATFORM, name, np.asarray(leg.attachment))
         text = f'<?xml version="1.0"?>\n<!-- loops are open here: {CLOSURES} closes them -->\n' + xml_text(root)
         friction = {joint.name: (row[1], row[2]) for joint, row in zip(self.joints, self.drives.values.tolist())}
-        return put(text, "robot.urdf", {}, {name: pair for name, pair in friction.items() if any(pair)})
+        return put(text, URDF, {}, {name: pair for name, pair in friction.items() if any(pair)})
 
     def closures(self) -> str:
         """Return the text of ``robot.yaml``."""
@@ -343,7 +344,7 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     source = _identified(robot, folder, prior) if (folder / MODEL).is_file() else _calibrated(robot, folder)
     opened, (level, verdict) = source.opened, _verdict(folder)
     remark = verdict if level in ("marginal", "fail") else ""
-    texts = {"robot.urdf": opened.urdf(), "robot.xml": opened.mjcf()}
+    texts = {URDF: opened.urdf(), MJCF: opened.mjcf()}
     for name, text in texts.items():
         _check(opened, text, name)
 
@@ -351,16 +352,16 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
         robot.write(place)
         for name, text in texts.items():
             content = (
-                with_comment(text.encode(), "its loops are closed by robot.yaml") if "urdf" in name else text.encode()
+                with_comment(text.encode(), "its loops are closed by robot.yaml") if name == URDF else text.encode()
             )
             files.write(place / name, with_comment(content, remark) if remark else content)
         files.write(place / CLOSURES, opened.closures())
-        write_drives(opened.joints, opened.drives, place / "drives.csv")
+        write_drives(opened.joints, opened.drives, place / DRIVES)
         files.write_json(place / PARAMETERS, {"robot": robot.chain.name, **source.parameters})
         files.write(place / README, "\n".join([verdict or "verdict unknown", "", *_uses(), ""]))
 
     write_staged(into, tuple(USES), write)
-    made = f"robot.urdf ({len(opened.closing)} loops open, closed by {CLOSURES}), robot.xml (loops closed)"
+    made = f"{URDF} ({len(opened.closing)} loops open, closed by {CLOSURES}), {MJCF} (loops closed)"
     said = f"{made}; Pinocchio reads the same loops and forces to 1e-9"
     return (*([remark] if remark else []), said, *source.notes)
 

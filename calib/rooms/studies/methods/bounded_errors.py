@@ -32,7 +32,7 @@ class _GeneralisedTLS(Method):
         Raises:
             UsageError: for a model whose rows have no slopes by q, v and a.
         """
-        model = serial_arm(problem, self.name)
+        model = serial_arm(problem, self)
         return attempted(self.name, problem, lambda: self._estimate(problem, model))
 
     def _estimate(self, problem: IdentificationProblem, model: IdentificationModel) -> MethodEstimate:
