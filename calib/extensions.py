@@ -13,6 +13,7 @@ A room is a package of `calib.rooms` with a table ``OFFERS``: what it adds, and 
     return_masses          function: session → notes; hands identified masses to its fit
     track                  function: inputs, dynamics, predictions, controller → replays with the model fed forward
     robots                 functions: what a person names → `calib.procedure.robot_kinds.Mechanism`, or None
+    library                folder of the robots that go by a name
     stages                 their verbs: tables of kind → verb → `calib.procedure.robot_kinds.Stage`
     drive_gains            function: robot, cases of currents, settings, known parameters, reference joint → gains of
                            a robot that is not a serial arm (`calib.identification.gains.DriveGains`)

@@ -2,6 +2,7 @@
 but the verdict is fail, 2 input or usage, 3 not identifiable or not converged, 4 an internal error (what is
 needed to mend it stands in a file, see `calib.bug_reports`), 130 interrupted."""
 
+import codecs
 import gc
 import io
 import os
@@ -16,6 +17,7 @@ from typer.main import get_command
 
 import calib
 from calib.cli import dynamics, geometry, session
+from calib.cli.help import Group, spelt
 from calib.extensions import offered
 from calib.workers.threads import limit_process
 
@@ -27,22 +29,24 @@ EXIT_CODES = (
     "Exit codes: 0 done (the verdict is pass or marginal), 1 the verdict is fail, 2 input or usage, 3 not identifiable "
     "or not converged, 4 an internal error: details in calib-bug-….txt."
 )
+BEGIN = "Begin with calib demo; at a robot with calib new CELL, then calib next CELL. calib COMMAND --help: an example."
 INTERRUPTED = "interrupted; no incomplete files were left"
 RESUMED = ("next", "redo", "demo", "study")  # keep what they have done; every other command starts over
 
 app = typer.Typer(
-    add_completion=False,
+    cls=Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # a unit in brackets is a unit, not a style
     help="Calibrate a robot's geometry, then its dynamics: choose poses and motions, fit, validate, export.",
-    epilog=EXIT_CODES,
+    epilog=f"{BEGIN}\n\n{EXIT_CODES}",
 )
 
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
-for _group in (geometry.app, dynamics.app, session.app, *offered("commands")):
-    app.add_typer(_group)
+codecs.register_error("spelt", spelt)
+for _commands in (*offered("commands"), geometry.app, dynamics.app, session.app):  # in the order of the help
+    app.add_typer(_commands)
 
 
 def _show_version(wanted: bool) -> None:
@@ -67,8 +71,9 @@ def main(arguments: list[str] | None = None) -> None:
         limit_process()
     if not os.environ.get("CALIB_DEBUG"):  # what numpy and others say to programmers helps nobody at a cell
         warnings.filterwarnings("ignore")
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a console that lacks a letter gets its number
-        sys.stdout.reconfigure(errors="backslashreplace")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="spelt")
     try:
         code = run(arguments)
     except KeyboardInterrupt:  # one more, while the first was being seen to
@@ -92,7 +97,7 @@ def run(arguments: list[str] | None = None) -> int:
             what = "is not UTF-8; rename the file" if word else "is empty; leave the option out, or give it a value"
             return _complain(f"the argument after {before} {what}", 2)
     try:
-        code = int(command_tree()(args=_spread(given), standalone_mode=False) or 0)
+        code = int(command_tree()(args=_spread(given), prog_name="calib", standalone_mode=False) or 0)
         return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
     except typer.Exit as stop:
         return stop.exit_code
@@ -101,8 +106,8 @@ def run(arguments: list[str] | None = None) -> int:
         return 2
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(given)
-    except SystemExit:  # Typer's, where whoever read the output has gone
-        return 141  # as a shell says of SIGPIPE
+    except SystemExit as stop:  # Typer's: completion is done, or whoever read the output has gone
+        return 141 if stop.code else 0  # as a shell says of SIGPIPE
     except Exception as error:
         if os.environ.get("CALIB_DEBUG"):
             raise

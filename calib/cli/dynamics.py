@@ -5,15 +5,77 @@ from typing import Annotated, Any
 
 import typer
 
+from calib.cli.completion import Robot
 from calib.cli.shared import Out, Seed, check_destination, command, progress, say, say_written
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
 
 app = typer.Typer()
 
 
-@command(app, "identify")
+@command(app, "Dynamics")
+def excite(
+    robot: Robot,
+    out: Out,
+    settings: ExcitationSettings,
+    model: Path | None = None,
+    limits: Path | None = None,
+    options: Path | None = None,
+    after: Path | None = None,
+    workers: str = "1",
+    base: str | None = None,
+    tip: str | None = None,
+    plots: bool = True,
+) -> None:
+    """Design a motion that excites ROBOT's dynamics, within limits.
+
+    Example: calib excite fit --period 10 --out motion
+
+    Args:
+        out: folder for the motion, its figures and metrics.json
+        model: folder of an identification: predicts the torques
+        limits: TOML: speeds, torques, workspace, collision, friction
+        options: TOML: options of the identification that will follow (rows, drives, couplings, payloads)
+        after: folder of an identification, which the motion adds to: for its model, information and torque errors
+    """
+    from calib.api.motions import design_excitation
+    from calib.workers import finishing
+
+    check_destination("excite", robot, out, [robot, model, limits, options, after, *settings.existing])
+    with progress() as say:
+        designed = design_excitation(
+            robot, settings, model=model, limits=limits, options=options, after=after, base=base, tip=tip,
+            workers=workers, progress=say,
+        )  # fmt: skip
+        say("writing")
+        with finishing():
+            designed.save(out, plots=plots)
+    say_written(str(designed).splitlines(), out)
+
+
+@command(app, "Dynamics")
+def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = False) -> None:
+    """Find a designed motion in a log, and average its periods. The result is a recording for calib identify.
+
+    Example: calib recall motion log.csv --out period.npz
+
+    Args:
+        folder: folder written by calib excite
+        log: a recording of it; log.npz@0:90 takes seconds 0 to 90
+        out: the averaged period: .npz with its variance, or .csv
+        skip: whole periods to leave out at the beginning
+    """
+    from calib.files import results
+    from calib.procedure.excitation import coefficients
+
+    with results([(out, coefficients.SUFFIXES)], coefficients.inputs(folder, log), overwrite):
+        found = coefficients.find(folder, log, skip)
+        coefficients.write(found, out)
+    say_written(coefficients.lines(found), out)
+
+
+@command(app, "Dynamics", "identify")
 def identify_dynamics(
-    robot: str,
+    robot: Robot,
     recordings: list[str],
     out: Out,
     validate: list[str] | None = None,
@@ -27,6 +89,8 @@ def identify_dynamics(
     plots: bool = True,
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
+
+    Example: calib identify fit log.csv --out dynamics
 
     Args:
         recordings: recordings of q and torque or current; log.npz@0:9.4 takes seconds 0 to 9.4
@@ -68,66 +132,9 @@ def identify_dynamics(
     say_written([*found.renderables(), *compared], out, found.verdict.level)
 
 
-@command(app)
-def excite(
-    robot: str,
-    out: Out,
-    settings: ExcitationSettings,
-    model: Path | None = None,
-    limits: Path | None = None,
-    options: Path | None = None,
-    after: Path | None = None,
-    workers: str = "1",
-    base: str | None = None,
-    tip: str | None = None,
-    plots: bool = True,
-) -> None:
-    """Design a motion that excites ROBOT's dynamics, within limits.
-
-    Args:
-        out: folder for the motion, its figures and metrics.json
-        model: folder of an identification: predicts the torques
-        limits: TOML: speeds, torques, workspace, collision, friction
-        options: TOML: options of the identification that will follow (rows, drives, couplings, payloads)
-        after: folder of an identification, which the motion adds to: for its model, information and torque errors
-    """
-    from calib.api.motions import design_excitation
-    from calib.workers import finishing
-
-    check_destination("excite", robot, out, [robot, model, limits, options, after, *settings.existing])
-    with progress() as say:
-        designed = design_excitation(
-            robot, settings, model=model, limits=limits, options=options, after=after, base=base, tip=tip,
-            workers=workers, progress=say,
-        )  # fmt: skip
-        say("writing")
-        with finishing():
-            designed.save(out, plots=plots)
-    say_written(str(designed).splitlines(), out)
-
-
-@command(app)
-def recall(folder: Path, log: str, out: Out, skip: int = 0, overwrite: bool = False) -> None:
-    """Find a designed motion in a log, and average its periods. The result is a recording for calib identify.
-
-    Args:
-        folder: folder written by calib excite
-        log: a recording of it; log.npz@0:90 takes seconds 0 to 90
-        out: the averaged period: .npz with its variance, or .csv
-        skip: whole periods to leave out at the beginning
-    """
-    from calib.files import results
-    from calib.procedure.excitation import coefficients
-
-    with results([(out, coefficients.SUFFIXES)], coefficients.inputs(folder, log), overwrite):
-        found = coefficients.find(folder, log, skip)
-        coefficients.write(found, out)
-    say_written(coefficients.lines(found), out)
-
-
-@command(app)
+@command(app, "Motion")
 def plan(
-    robot: str,
+    robot: Robot,
     waypoints: Annotated[Path, typer.Option()],
     out: Out,
     settings: PlanSettings,
@@ -139,6 +146,8 @@ def plan(
     plots: bool = True,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits.
+
+    Example: calib plan fit --waypoints w.csv --out plan
 
     Args:
         waypoints: CSV of joint values, or x y z, qx qy qz qw of the tip

@@ -1,65 +1,20 @@
-"""Commands for geometry: fit, select, export, compensate."""
+"""Commands for geometry: select, fit; and export."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from calib.cli.completion import Robot
 from calib.cli.shared import Out, check_destination, command, exit_failed, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 
 app = typer.Typer()
 
 
-@command(app)
-def fit(
-    robot: str,
-    measured: list[Path],
-    out: Out,
-    settings: FitSettings,
-    validate: list[Path] | None = None,
-    options: Path | None = None,
-    selection: Path | None = None,
-    base: str | None = None,
-    tip: str | None = None,
-    plots: bool = True,
-) -> None:
-    """Fit the geometry of ROBOT to measured poses, and judge it.
-
-    Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged, 4 an
-    internal error.
-    Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
-    to gain; that it is good enough is said only with --tolerance.
-
-    Args:
-        measured: CSV files of measured poses (calib formats measurements), or folders of images (calib formats images)
-        out: folder for the calibrated robot and its report
-        validate: CSV file of unseen poses; may be repeated
-        options: TOML, see calib formats options
-        selection: CSV of calib select, or its folder: its prediction is compared with the result
-    """
-    from calib.api.kinematic import fit_geometry
-    from calib.procedure.report.geometry_section import read_lines
-
-    check_destination("fit", robot, out, [options, *measured, *(validate or [])])
-
-    def read(given: Any) -> None:
-        check_destination("fit", robot, out, [given.source])
-        say(*read_lines(given))
-
-    with progress() as show:
-        found = fit_geometry(
-            robot, measured, settings, validate=validate or (), options=options, poses=selection, base=base, tip=tip,
-            on_read=read, progress=show,
-        )  # fmt: skip
-        show("writing")
-        found.save(out, plots=plots)
-    say_written(found.renderables(), out, found.verdict.level)
-
-
-@command(app)
+@command(app, "Geometry")
 def select(
-    robot: str,
+    robot: Robot,
     out: Out,
     settings: SelectionSettings,
     m: Annotated[int, typer.Option("-m", "--poses", help="how many poses")] = 30,
@@ -77,6 +32,8 @@ def select(
     Beside OUT.csv, OUT_prediction.json holds what the poses are predicted to identify (calib fit --selection),
     OUT_predicted.png shows how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more
     poses would identify.
+
+    Example: calib select robot.urdf -m 40 --out poses.csv
 
     Args:
         out: CSV file of the chosen joint values, rad
@@ -115,7 +72,55 @@ def select(
     say(f"{m} poses written to {out}")
 
 
-@command(app)
+@command(app, "Geometry")
+def fit(
+    robot: Robot,
+    measured: list[Path],
+    out: Out,
+    settings: FitSettings,
+    validate: list[Path] | None = None,
+    options: Path | None = None,
+    selection: Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    plots: bool = True,
+) -> None:
+    """Fit the geometry of ROBOT to measured poses, and judge it.
+
+    Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged, 4 an
+    internal error.
+    Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
+    to gain; that it is good enough is said only with --tolerance.
+
+    Example: calib fit robot.urdf measured.csv --out fit
+
+    Args:
+        measured: CSV files of measured poses (calib formats measurements), or folders of images (calib formats images)
+        out: folder for the calibrated robot and its report
+        validate: CSV file of unseen poses; may be repeated
+        options: TOML, see calib formats options
+        selection: CSV of calib select, or its folder: its prediction is compared with the result
+    """
+    from calib.api.kinematic import fit_geometry
+    from calib.procedure.report.geometry_section import read_lines
+
+    check_destination("fit", robot, out, [options, *measured, *(validate or [])])
+
+    def read(given: Any) -> None:
+        check_destination("fit", robot, out, [given.source])
+        say(*read_lines(given))
+
+    with progress() as show:
+        found = fit_geometry(
+            robot, measured, settings, validate=validate or (), options=options, poses=selection, base=base, tip=tip,
+            on_read=read, progress=show,
+        )  # fmt: skip
+        show("writing")
+        found.save(out, plots=plots)
+    say_written(found.renderables(), out, found.verdict.level)
+
+
+@command(app, "Files and studies")
 def export(
     folder: Path,
     urdf: Path | None = None,
@@ -130,6 +135,8 @@ def export(
     """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included.
 
     A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
+
+    Example: calib export fit --into calibrated
 
     Args:
         folder: the folder of a fit, or of an identification

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.completion import codes, topics
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
 from calib.errors import CalibError, UsageError, command_line, require
 from calib.procedure.session.answers import Answers
@@ -15,7 +16,7 @@ app = typer.Typer()
 Folder = Annotated[Path, typer.Argument(help="the session's folder")]
 
 
-@command(app)
+@command(app, "Start")
 def new(
     folder: Folder,
     given: Answers,
@@ -32,6 +33,8 @@ def new(
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
     session). Without --robot or --instrument, at a terminal, it asks; what is not known of the cell is not checked, and
     stands on the certificate.
+
+    Example: calib new cell
 
     Args:
         dynamics_only: identify the dynamics only; the geometry is taken from the robot's file
@@ -73,9 +76,11 @@ def _asked(given: Answers) -> Answers:
     return given
 
 
-@command(app, listing=True)
-def formats(topic: Annotated[str | None, typer.Argument()] = None, schema: bool = False) -> None:
+@command(app, "Files and studies", listing=True)
+def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] = None, schema: bool = False) -> None:
     """Print the content of file formats: columns, keys, units.
+
+    Example: calib formats measurements
 
     Args:
         topic: measurements, images, targets, options, identify-options, identified, exports, constraints, mdh,
@@ -90,9 +95,11 @@ def formats(topic: Annotated[str | None, typer.Argument()] = None, schema: bool 
         print(documents.describe(topic) if topic else "\n".join(documents.overview()))
 
 
-@command(app, listing=True)
-def explain(code: Annotated[str | None, typer.Argument()] = None) -> None:
+@command(app, "Files and studies", listing=True)
+def explain(code: Annotated[str | None, typer.Argument(autocompletion=codes)] = None) -> None:
     """Print what a finding or a term means, and what to do.
+
+    Example: calib explain sigma-ratio
 
     Args:
         code: a finding's code in metrics.json, or a term such as 'held out'; default: list all
@@ -102,15 +109,20 @@ def explain(code: Annotated[str | None, typer.Argument()] = None) -> None:
     print(findings.explain(code) if code else "\n".join([*findings.catalogue(), *findings.glossary()]))
 
 
-@command(app, "next")
+@command(app, "Start", "next")
 def next_step(folder: Folder, plots: bool = True) -> None:
-    """Continue a session, then print what to do at the robot."""
+    """Continue a session, then print what to do at the robot.
+
+    Example: calib next cell
+    """
     _go_on(folder, "next", plots=plots)
 
 
-@command(app)
+@command(app, "Start")
 def redo(folder: Folder, step: str, plots: bool = True) -> None:
     """Repeat a step of a session and all steps that depend on it.
+
+    Example: calib redo cell fit
 
     Args:
         step: a step's name or number, see calib status
@@ -118,20 +130,25 @@ def redo(folder: Folder, step: str, plots: bool = True) -> None:
     _go_on(folder, "redo", step, plots)
 
 
-@command(app)
+@command(app, "Start")
 def status(folder: Folder) -> None:
-    """Show the progress of a session, and which steps are stale. With -v, the notes of its steps."""
+    """Show the progress of a session, and which steps are stale. With -v, the notes of its steps.
+
+    Example: calib status cell
+    """
     from calib.procedure.session import commands
 
     say(*commands.status_lines(folder), result=True)
     say(*commands.noted(folder))
 
 
-@command(app)
+@command(app, "Start")
 def run(sessions: list[Path], workers: str = "1", plots: bool = True) -> None:
     """Run many SESSIONS, one folder per robot, as far as possible. A table at the end shows their states.
 
     A robot that fails does not stop the others; see its folder's run.log. The exit code is the worst of all.
+
+    Example: calib run cell1 cell2 --workers 2
 
     Args:
         sessions: session.toml files, or the sessions' folders

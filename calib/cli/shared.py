@@ -17,8 +17,10 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
-from typer.models import OptionInfo, ParameterInfo
+from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 
+from calib.cli.completion import completion
+from calib.cli.help import Command, type_word
 from calib.config import described, parse
 from calib.config_types import OneOf, Typed
 from calib.errors import UsageError, require
@@ -204,13 +206,14 @@ class Common:
     """
 
 
-def command(app: typer.Typer, name: str | None = None, listing: bool = False) -> Callable[[F], F]:
-    """Return a decorator that adds a function to `app` as a command.
+def command(app: typer.Typer, group: str, name: str | None = None, listing: bool = False) -> Callable[[F], F]:
+    """Return a decorator that adds a function to `app` as a command of a `calib.cli.help.GROUPS` group.
 
-    What ``Args:`` of its docstring, or `Common`, says of a parameter is the option's help; a flag that is off by
-    default has no name to switch it off. A parameter that is annotated with a settings dataclass becomes an option per
-    field, described under ``Attributes:`` of that class; fields that the function takes itself are left to it. Every
-    command has ``-v``, without which it prints what `calib.cli.shared.printing` lets through; not so one that lists.
+    Its docstring ends with an example, which tests parse. What ``Args:`` of its docstring, or `Common`, says of a
+    parameter is the option's help; a flag that is off by default has no name to switch it off. A parameter that is
+    annotated with a settings dataclass becomes an option per field, described under ``Attributes:`` of that class;
+    fields that the function takes itself are left to it. Every command has ``-v``, without which it prints what
+    `calib.cli.shared.printing` lets through; not so one that lists.
     """
 
     def add(function: F) -> F:
@@ -222,13 +225,13 @@ def command(app: typer.Typer, name: str | None = None, listing: bool = False) ->
                 made += [option for option in _options(settings[key]) if option.name not in own]
             else:
                 names = (f"--{key.replace('_', '-')}",) if one.default is False else ()
-                annotation = _with_help(hints[key], about.get(key, ""), names, one.default is Parameter.empty)
+                annotation = _with_help(one, hints[key], about.get(key, ""), names)
                 made.append(one.replace(annotation=annotation, kind=Parameter.KEYWORD_ONLY))
 
         if not listing:
-            words = _with_help(bool, about["verbose"], ("-v", "--verbose"), False)
-            made = [one for one in made if one.name != "verbose"]
-            made.append(Parameter("verbose", Parameter.KEYWORD_ONLY, default=False, annotation=words))
+            verbose = Parameter("verbose", Parameter.KEYWORD_ONLY, default=False)
+            words = _with_help(verbose, bool, about["verbose"], ("-v", "--verbose"))
+            made = [*(one for one in made if one.name != "verbose"), verbose.replace(annotation=words)]
 
         @wraps(function)
         def call(**given: Any) -> Any:
@@ -242,18 +245,20 @@ def command(app: typer.Typer, name: str | None = None, listing: bool = False) ->
 
         call.__signature__ = signature(function).replace(parameters=made)  # type: ignore[attr-defined]
         call.__annotations__ = {}
-        app.command(name, help=cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0])(call)
+        words = cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0]
+        app.command(name, cls=Command, help=words, rich_help_panel=group)(call)
         return function
 
     return add
 
 
-def _with_help(hint: Any, words: str, names: Sequence[str], positional: bool) -> Any:
-    """Return an annotation with the help of its option or argument, and further metadata for Typer."""
+def _with_help(parameter: Parameter, hint: Any, words: str, names: Sequence[str]) -> Any:
+    """Return an annotation with help and type word of the parameter's option or argument, and metadata for Typer."""
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     option = next((copy(one) for one in metadata if isinstance(one, ParameterInfo)), None)
-    option = option or (typer.Argument() if positional else typer.Option(*names))
-    option.help = option.help or words
+    option = option or (typer.Argument() if parameter.default is Parameter.empty else typer.Option(*names))
+    option.help, named = option.help or words, isinstance(option, ArgumentInfo)
+    option.metavar = option.metavar or (parameter.name.upper() if named else type_word(_plain(kind)[0]))
     return Annotated[kind, option]
 
 
@@ -266,15 +271,18 @@ def _options(kind: Any) -> Iterator[Parameter]:
             continue
         plain, metadata = _plain(hints[field.name])
         typed = next((one for one in metadata if isinstance(one, Typed)), Typed())
-        words = [about.get(field.name, ""), *(one.words for one in metadata if isinstance(one, OneOf))]
-        names, metavar = [typed.name] if typed.name else [], typed.unit.upper() or None
+        allowed = next((one for one in metadata if isinstance(one, OneOf)), OneOf(()))
+        names = [typed.name] if typed.name else []
+        word = typed.unit.upper() or type_word(plain, allowed.allowed)
+        words = [about.get(field.name, ""), allowed.words if word == "NAME" else ""]
         if get_origin(plain) is tuple:
             names = names or [f"--{field.name.removesuffix('s')}"]
-            metavar = "NUMBERS" if _plain(get_args(plain)[0])[0] is not str else None
+            word = "NUMBERS" if _plain(get_args(plain)[0])[0] is not str else "TEXT"
             plain = list[str] if _is_repeated(plain) else str
         elif typed.unit:
             plain = str
-        option = typer.Option(*names, help="; ".join(filter(None, words)), metavar=metavar)
+        complete = completion(allowed) if allowed.allowed else None
+        option = typer.Option(*names, help="; ".join(filter(None, words)), metavar=word, autocompletion=complete)
         default = field.default if isinstance(field.default, int | float | str) else None
         annotation = Annotated[plain if default is not None else plain | None, option]
         yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

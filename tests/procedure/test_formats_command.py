@@ -1,9 +1,14 @@
 """The formats are documented where they are read, and the command prints that."""
 
+import os
+import subprocess
+import sys
 import tomllib
 
 import pytest
 
+from calib import cli
+from calib.cli.help import GROUPS
 from calib.procedure.formats import TOPICS
 from calib.procedure.session.settings import example
 
@@ -63,5 +68,58 @@ def test_help_keeps_units_in_brackets(calib, command):
 
 
 def test_no_commands_summary_is_cut_off(calib, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert "..." not in calib("--help")[1].partition("Commands:")[2]
+    monkeypatch.setenv("COLUMNS", "60")
+    shown = calib("--help")[1].partition("Start:")[2]
+    assert "..." not in shown and [group for group in GROUPS if f"{group}:" not in f"Start:{shown}"] == []
+
+
+@pytest.mark.parametrize("name", sorted(cli.command_tree().commands))
+def test_each_command_has_an_example_that_parses_and_no_type_of_python(calib, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "60")
+    shown, command = calib(name, "--help")[1], cli.command_tree().commands[name]
+    (example,) = (line.split() for line in shown.splitlines() if line.startswith("  Example: "))
+    assert example[1:3] == ["calib", name]
+    command.make_context(name, example[3:])
+    assert not set("<>{}") & set(shown) and max(map(len, shown.splitlines())) <= 60
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("calib ide", "identify"), ("calib fit ur10", "ur10 ur10e"), ("calib excite five", "fivebar"),
+        ("calib fit --stat", "--stations"), ("calib fit --stations o", "one"), ("calib excite --solver m", "mma"),
+        ("calib select --index O", "O1 O2 O3 O4 O5"), ("calib formats identi", "identified identify-options"),
+        ("calib explain sigma-r", "sigma-ratio"), ("calib explain dead", ""),
+    ],
+)  # fmt: skip
+def test_the_shell_completes_words(capsys, monkeypatch, tmp_path, line, expected):
+    monkeypatch.chdir(tmp_path)
+    for name, value in _asked(line).items():
+        monkeypatch.setenv(name, value)
+    assert cli.run([]) == 0 and sorted(capsys.readouterr().out.split()) == expected.split()
+
+
+def test_completion_loads_nothing_heavy():
+    code = "import sys; from calib import cli; cli.run([]); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | _asked("calib fit ur"), capture_output=True, text=True
+    )
+    assert "ur10e" in done.stdout and not {"numpy", "rich", "yaml", "calib.robot"} & set(done.stdout.split())
+
+
+def _asked(line: str) -> dict[str, str]:
+    """Return the environment in which bash asks what completes a line."""
+    return {"_CALIB_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}
+
+
+def test_a_console_without_unicode_gets_words(tmp_path):
+    """Letters that an encoding lacks are spelt: sigma, ^2, +-; others get their number."""
+    assert (
+        "1 σ, 2 ± 0.1 µm, kg m², 3 °…, 中".encode("ascii", "spelt").decode()
+        == "1 sigma, 2 +- 0.1 um, kg m^2, 3 deg..., \\u4e2d"
+    )
+    written = {"PYTHONIOENCODING": "ascii", "COLUMNS": "60"}
+    done = subprocess.run(
+        [sys.executable, "-m", "calib", "select", "--help"], env=os.environ | written, capture_output=True, text=True
+    )
+    assert "measurement sigma of" in done.stdout and done.stdout.isascii() and "\\" not in done.stdout

@@ -29,7 +29,7 @@ class FitSettings:
         folds: cross-validation folds of the ladder: transfer (stations, files, regions), regions, random or poses
         stations: one base placement for each file, or one for all
         tools: one tool (or set of reflectors) for all files, or one for each
-        holdout: share of each file's poses held out of the fit: the last of ``default_rng(seed).permutation(poses)``
+        holdout: share of each file's poses held out of the fit, drawn at random by the seed
         refit_frames: fit base and tool placement of the validation files separately
         tolerance: largest rms on unseen poses [m; on the command line mm]; above it the verdict is fail
         deliverable: subject of the verdict: urdf (robot.urdf alone), or corrections (with joint_corrections.csv)

@@ -11,7 +11,7 @@ app = typer.Typer()
 Millimetres = typer.Option(metavar="MM")
 
 
-@command(app)
+@command(app, "Geometry")
 def board(
     out: Out,
     kind: str = "charuco",
@@ -27,6 +27,8 @@ def board(
 
     Take ChArUco: it may be seen in part, and its corners are found to hundredths of a pixel; the
     corners of tags ten times worse. Print at 100 %, glue it onto something flat, measure a square, correct board.toml.
+
+    Example: calib board --paper a4 --square 20 --out board
 
     Args:
         out: folder for board.toml, board.pdf and board.svg
@@ -44,7 +46,7 @@ def board(
         say(line)
 
 
-@command(app)
+@command(app, "Geometry")
 def images(
     source: Path,
     board: Path | None = None,
@@ -56,6 +58,8 @@ def images(
 
     The folder then contains corners.csv, and goes where a CSV file of measured poses goes: calib fit ROBOT
     FOLDER. See calib formats images.
+
+    Example: calib images photos
 
     Args:
         source: a folder of images with board.toml, or a ROS bag / MCAP file

@@ -1,19 +1,21 @@
 """Command for a calibration of a simulated robot: demo."""
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
+from calib.cli.completion import robots
 from calib.cli.shared import Seed, command, exit_failed, reporting
 from calib.errors import command_line
 
 app = typer.Typer()
 
 
-@command(app)
+@command(app, "Start")
 def demo(
     out: Path = Path("calib-demo"),
-    robot: str = "lwr4plus",
+    robot: Annotated[str, typer.Option(autocompletion=robots)] = "lwr4plus",
     geometry_only: bool = False,
     instrument: str = "cmm",
     guided: bool = False,
@@ -22,6 +24,8 @@ def demo(
     plots: bool = True,
 ) -> None:
     """Calibrate a simulated robot; compare with the hidden truth.
+
+    Example: calib demo --out calib-demo
 
     Args:
         out: folder of the session

@@ -10,7 +10,7 @@ from calib.cli.shared import Out, Seed, command, numbers, progress, say
 app = typer.Typer()
 
 
-@command(app)
+@command(app, "Motion")
 def compensate(
     folder: Annotated[Path, typer.Argument(metavar="FIT")],
     targets: Path,
@@ -31,6 +31,8 @@ def compensate(
     Targets taught with the robot, or commands that are to change least: --frame nominal.
 
     Targets of an offline model of the cell, which stand in the robot's base: --frame base.
+
+    Example: calib compensate fit w.csv --out sent.csv
 
     Args:
         folder: the folder of a fit, or of a session with a fit

@@ -1,6 +1,9 @@
 """Parallel robots: the commands for serial arms, applied to closed loops (`calib.rooms.parallel.mechanism`)."""
 
-OFFERS = {"topics": ":TOPICS", "robots": "robots:find", "stages": "verbs:STAGES"}
+from pathlib import Path
+
+OFFERS = {"topics": ":TOPICS", "robots": "robots:find", "library": ":LIBRARY", "stages": "verbs:STAGES"}
+LIBRARY = Path(__file__).parent / "mechanism" / "library"
 TOPICS = {
     "parallel": (
         "a parallel robot as legs and a platform, and what commands write of one",

@@ -5,15 +5,16 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.completion import Robot
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
 from calib.errors import UsageError, one_of, require
 
 app = typer.Typer()
 
 
-@command(app)
+@command(app, "Files and studies")
 def study(
-    studies: Annotated[list[str] | None, typer.Argument(metavar="STUDY...")] = None,
+    studies: Annotated[list[str] | None, typer.Argument()] = None,
     out: Path | None = None,
     methods: str | None = None,
     runs: Annotated[int | None, typer.Option(min=0)] = None,
@@ -23,10 +24,12 @@ def study(
     list_studies: Annotated[bool, typer.Option("--list")] = False,
     plots: bool = True,
 ) -> None:
-    """Compare identification methods on simulated robots. Runs STUDY, or what of it is missing (Monte Carlo).
+    """Compare identification methods on simulated robots. Runs STUDIES, or what of them is missing (Monte Carlo).
 
     Rows go to the disk as they come: a study that was stopped, or lost workers, goes on from there when the same
     command is given again; asked for more runs, it adds them. What a study file holds: calib formats study.
+
+    Example: calib study MCS-TX40-1-1 --runs 5
 
     Args:
         studies: study files, or names of shipped ones: MCS-TX40-1-1, 'MCS-*'
@@ -65,9 +68,9 @@ def study(
     say(*found.described(), f"written to {folder}: {report.REPORT} shows it")
 
 
-@command(app)
+@command(app, "Files and studies")
 def compare(
-    robot: str,
+    robot: Robot,
     recordings: list[str],
     validate: list[str] | None = None,
     methods: str | None = None,
@@ -82,6 +85,8 @@ def compare(
     """Rank identification methods on recordings of your robot.
 
     The recommended method gets the verdict of calib identify; if it is fail, none is recommended: exit code 1.
+
+    Example: calib compare fit log.csv --validate other.csv
 
     Args:
         recordings: training recordings; log.npz@0:9.4 cuts

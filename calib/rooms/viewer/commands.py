@@ -11,15 +11,17 @@ from calib.errors import UsageError, command_line, require
 app = typer.Typer()
 
 
-@command(app)
+@command(app, "Files and studies")
 def view(
-    folder: Annotated[Path, typer.Argument(metavar="DIR")],
+    folder: Path,
     save: Path | None = None,
     spawn: Annotated[bool | None, typer.Option("--spawn/--no-spawn")] = None,
     robot: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Show robot, errors, poses, motions or torques in Rerun.
+
+    Example: calib view fit
 
     Args:
         folder: of a fit, a session, an identification, a motion; or a CSV

@@ -1,0 +1,76 @@
+"""Help of the commands as a user reads it: commands in groups, arguments in capitals, plain words for types."""
+
+import sys
+import unicodedata
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+from typer.core import TyperCommand, TyperGroup
+
+_ClickCommand: Any = TyperCommand.__mro__[1]  # of the click that this typer uses (or brings)
+GROUPS = ("Start", "Geometry", "Dynamics", "Motion", "Files and studies")  # in the order of the list of commands
+MAX_COLUMN = 30  # letters of the left column; a third of narrower terminals
+MAX_CHOICES = 25  # letters of choices that stand in place of a type word
+_SPELT = {"·": " ", "×": "x", "±": "+-", "→": "->", "–": "-", "≤": "<=", "≥": ">=", "½": "1/2", "µ": "u", "°": "deg"}
+_WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
+
+
+def type_word(kind: Any, choices: tuple[str, ...] | str = ()) -> str | None:
+    """Return what stands behind an option's name for its value: the choices where they are short; None for a flag.
+
+    Args:
+        choices: the allowed texts; or where they are to be found, for a module that is loaded late.
+    """
+    inner = get_args(kind)[0] if get_origin(kind) is list else kind
+    if isinstance(choices, tuple) and 0 < len(named := "|".join(choices)) <= MAX_CHOICES:
+        return named
+    return None if inner is bool else "NAME" if choices else _WORDS.get(inner, "TEXT")
+
+
+class _Spelt(_ClickCommand):
+    """Help in letters that the console has, which Typer would write as UTF-8 all the same."""
+
+    def get_help(self, ctx: Any) -> str:
+        console = sys.stdout.encoding or "utf-8"
+        return super().get_help(ctx).encode(console, "spelt").decode(console)
+
+
+class Command(_Spelt, TyperCommand):
+    """A command whose help names arguments as its text does (ROBOT, MEASURED...), without Python's types."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        for title, kind in (("Arguments", "argument"), ("Options", "option")):
+            found = [one.get_help_record(ctx) for one in self.get_params(ctx) if one.param_type_name == kind]
+            cells = [(name.partition(" <")[0], words) for name, words in filter(None, found)]
+            if rows := [(name, words.replace("x>=", "at least ")) for name, words in cells]:
+                with formatter.section(title):
+                    formatter.write_dl(rows, col_max=min(MAX_COLUMN, formatter.width // 3))
+
+
+class Group(_Spelt, TyperGroup):
+    """The list of commands in `GROUPS`, each stated where the command is (`calib.cli.shared.command`)."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
+        for name, one in self.commands.items():
+            words = one.get_short_help_str(limit=200)
+            groups[str(one.rich_help_panel)].append((name, words))  # type: ignore[attr-defined]
+        for title, rows in groups.items():
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
+def spelt(error: Any) -> tuple[str, int]:
+    """Return letters that an encoding lacks in ASCII (sigma, ^2, ...), or by their number; see `codecs`."""
+    return "".join(map(_in_ascii, error.object[error.start : error.end])), error.end
+
+
+def _in_ascii(letter: str) -> str:
+    name, plain = unicodedata.name(letter, ""), unicodedata.normalize("NFKD", letter)
+    if name.startswith("GREEK") and "LETTER" in name:
+        return name.partition("LETTER ")[2].partition(" ")[0].lower()
+    known = _SPELT.get(letter) or ("^" * name.startswith("SUPERSCRIPT") + plain).encode("ascii", "ignore").decode()
+    return known or letter.encode("ascii", "backslashreplace").decode()
