@@ -69,7 +69,7 @@ def select(
     say(str(chosen))
     if predictions := selection.beside_poses(out, plots, chosen):
         say(f"predictions: {', '.join(str(path) for path in predictions.values())}")
-    say(f"{m} poses written to {out}")
+    say(f"{m} poses, for an instrument that measures the {settings.kind} (--kind), written to {out}")
 
 
 @command(app, "Geometry")

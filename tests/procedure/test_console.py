@@ -19,7 +19,7 @@ def test_every_command_has_the_option():
 def test_without_it_details_go_and_warnings_stay(capsys):
     app = typer.Typer()
 
-    @command(app)
+    @command(app, "Start")
     def talk() -> None:
         """Print much."""
         table = Table("a")

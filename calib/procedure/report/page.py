@@ -216,7 +216,7 @@ def _rich_table(table: Table) -> RichTable:
 
 
 def section(shown: Section) -> Iterator[RenderableType]:
-    """Yield the blocks of a section as rich renderables, and its verdict with the reason."""
-    yield from rendered(shown.blocks)
+    """Yield the verdict of a section with its reason, then its blocks, as rich renderables."""
     if shown.verdict:
         yield RichText.assemble("verdict: ", (shown.verdict, f"bold {COLOURS[shown.verdict]}"), f": {shown.reason}")
+    yield from rendered(shown.blocks)

@@ -31,7 +31,6 @@ from calib.procedure.session import steps
 from calib.procedure.session.folder import (
     POSES,
     UNSEEN,
-    VERDICT,
     WAYS,
     Say,
     Session,
@@ -247,28 +246,26 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 
 def _ending(session: Session) -> tuple[str, ...]:
-    """Return the closing lines of a complete session; with verdict fail, the exported robot is for inspection only."""
+    """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
-    level, further = session.verdicts().level, [line for ending in offered("endings") for line in ending(session)]
-    if level == "fail":
-        said = (f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
-        return ("", *said, *further)
-    why = VERDICT if session.path(VERDICT).exists() else f"{robot.parent.name}/README.txt"
-    held = "" if level == "pass" else f" (verdict {level}: {why} says why)"
-    made = f"robot: {robot}{held}" if robot.exists() else "no robot was exported"
-    return ("", f"done; certificate: {page}", made, *further)
+    found, further = session.verdicts(), [line for ending in offered("endings") for line in ending(session)]
+    use = " (for inspection only, do not use)" if found.level == "fail" else ""
+    made = f"robot: {robot}{use}" if robot.exists() else "no robot was exported"
+    return ("", str(found), f"certificate: {page}", made, *further)
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
     """Yield the status of every step of a session, and the next command."""
     session = open_session(folder)
     settings, found = session.settings, steps.states(session)
+    ahead = next((state for state in found if state.kind not in (DONE, KEPT)), None)
+    if ahead is None:
+        yield str(session.verdicts())
     yield Text.assemble((settings.name, "bold"), f", {settings.instrument.name}, made {settings.created[:10]}")
     table = Table("", "step", "state", "", box=None, pad_edge=False)
     for number, state in enumerate(found, 1):
         table.add_row(str(number), state.step.name, Text(state.kind, COLOURS[state.kind]), Text(state.words))
     yield table
-    ahead = next((state for state in found if state.kind not in (DONE, KEPT)), None)
     if ahead is None:
         yield f"certificate: {session.path(CERTIFICATE)}"
     elif ahead.kind == WAITING:

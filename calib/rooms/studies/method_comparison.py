@@ -279,7 +279,7 @@ def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
 
 
 COLUMNS = (
-    Column("", "{0.rank}"),
+    Column("rank", "{0.rank}"),
     Column("method", "{0.name}", number=False),
     Column("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
     Column("behind the best", lambda one: "" if one.rank == 1 else f"{one.behind:.2g} ± {one.behind_sigma:.2g}"),
@@ -290,7 +290,7 @@ COLUMNS = (
     Column("rounds", "{0.iterations}"),
     Column("simulations", "{0.simulations}"),
     Column("seconds", "{0.seconds:.2g}"),
-    Column("", lambda one: "take" if one.chosen else "as good" if one.good else "", number=False),
+    Column("choice", lambda one: "take" if one.chosen else "as good" if one.good else "", number=False),
 )
 
 
