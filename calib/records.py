@@ -56,7 +56,8 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = csv.DictReader(file)
-        missing = vars(kind)["_field_defaults"].keys() - set(rows.fieldnames or ())
+        rows.fieldnames = [name.partition(" [")[0] for name in rows.fieldnames or ()]  # without units
+        missing = vars(kind)["_field_defaults"].keys() - set(rows.fieldnames)
         hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in missing}
         return tuple(kind(**{name: _cell(hint, row, name, str(path)) for name, hint in hints.items()}) for row in rows)
 

@@ -4,7 +4,8 @@ SI stands in every file that we write, unless a header or a key names another.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 DEG = math.pi / 180
 ANGLES = {"rad": 1.0, "deg": DEG, "mrad": 1e-3, "°": DEG, "degrees": DEG}
@@ -61,6 +62,13 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     first = "rad" if "prismatic" not in found else "m" if found == {"prismatic"} else "rad, m"
     torque = {"rad": TORQUE, "m": "N"}.get(first, f"{TORQUE}, N")
     return first, f"{first}/s", f"{first}/s²", torque
+
+
+def headings(what: str, joints: Sequence[Any]) -> list[str]:
+    """Return the headers of joints' columns in a table of motion: ``q_joint1 [rad]``, v_, a_, current_, torques."""
+    place = {"q": 0, "q_link": 0, "v": 1, "a": 2, "current": 4}.get(what, 3)
+    units = [(*motion_units([one.kind]), "A")[place].replace("²", "^2") for one in joints]
+    return [f"{what}_{one.name} [{unit}]" for one, unit in zip(joints, units)]
 
 
 def without_gains(unit: str) -> str:

@@ -116,7 +116,7 @@ def test_what_is_damaged_in_a_session_is_named(room: Path, capsys) -> None:
     assert run("new", "cell", "--robot", "arm.urdf", "--instrument", "tracker", "--geometry-only") == 0
     edited("cell/session.toml", "fit = 40", "fit = 8")(room)
     assert run("next", "cell") == 0
-    for name in ("poses.csv", "validation.csv", "selection.json", "poses_prediction.json"):
+    for name in ("poses.csv", "validation_poses.csv", "selection.json", "poses_prediction.json"):
         for damaged in ("", "[[1, 2], {", "\0\0", None):
             path, kept = room / "cell/2-poses" / name, (room / "cell/2-poses" / name).read_bytes()
             path.unlink()

@@ -48,7 +48,7 @@ class PoseSelection(selection.Chosen):
 
     @checked
     def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
-        """Write the poses as CSV under the joints' names [rad or m], and the predicted errors next to it.
+        """Write the poses as CSV under the joints' names [deg or mm], and the predicted errors next to it.
 
         That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`. Files that no
         earlier selection left, or that hold measurements since, are refused unless `overwrite`.
@@ -64,7 +64,7 @@ class PoseSelection(selection.Chosen):
 
     @checked
     def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the measuring run, poses in order, as CSV: t [s], pose (0 for a via-point), joints."""
+        """Write the measuring run, poses in order, as CSV: t [s], pose (0 for a via-point), joints [deg or mm]."""
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return write_run(Path(path), self.run, self.chain)
 

@@ -36,7 +36,7 @@ def select(
     Example: calib select robot.urdf -m 40 --out poses.csv
 
     Args:
-        out: CSV file of the chosen joint values, rad
+        out: CSV file of the chosen joint values
         constraints: TOML, see calib formats constraints
         run: CSV of the run: t, pose (0: via-point), joints; calib view rehearses it
         existing: CSV of poses measured before, included in the selection

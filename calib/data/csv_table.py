@@ -74,15 +74,15 @@ class Table:
         return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [plain_text(str(cell)) for cell in cells]
 
     def block(self, head: str) -> np.ndarray | None:
-        """Return the columns head1, head2, … as one array (m, n); None if the table has none of them."""
-        names = [name for name in self.header if name.startswith(head) and name[len(head) :].isdigit()]
-        return np.column_stack([self.numbers(name) for name in names]) if names else None
+        """Return the columns head_joint1 …, or head1 …, as one array (m, n), as they are; None if there are none."""
+        names = [name for name in self.header if re.fullmatch(rf"{head}(\d+|_.+)", name)]
+        return np.column_stack([self.numbers(name, None) for name in names]) if names else None
 
-    def numbers(self, name: str, dimension: str = "", unit: str = "", gaps: bool = False) -> np.ndarray:
+    def numbers(self, name: str, dimension: str | None = "", unit: str = "", gaps: bool = False) -> np.ndarray:
         """Return a column (m,) as floats in SI.
 
         Args:
-            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either) or "" (a plain number).
+            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), "" (a plain number) or None (as it is).
             unit: what the column is in where its header does not say; "" for SI.
             gaps: leave empty and NaN cells as NaN, where otherwise they are refused.
 
@@ -100,6 +100,8 @@ class Table:
             found = "an empty or NaN cell" if np.isnan(cells[row]) else f"{cells[row]}"
             message = f"found {found} where a number is needed; leave the row out, or measure it again"
             self.fail(message, name, row)
+        if dimension is None:
+            return cells
         known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
         return cells * self.factor(column, known, unit)
 

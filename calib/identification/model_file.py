@@ -12,10 +12,10 @@ sigma, told) and under ``drive_gains`` in both; state them as ``gains`` to use t
 ``reference`` that the others are relative to (1, without a sigma), or ``not told``: then gain and sigma are empty, and
 the joint's torque, friction and motor inertia are in amperes of its own motor, in every table.
 
-``torques_N.csv``: ``t [s]``, then measured_1 ... predicted_1 ... of each torque row [N m or N] and the joints q1 ...
-[rad or m], then sigma_1 ... of each torque row, the standard deviation expected of measured - predicted (1.96 of them
-hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, and, of recordings without a payload,
-v1 ... a1 ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify`` writes
+``torques_N.csv``: ``t [s]``, then ``measured_joint1 [N m]`` ... and predicted_ ... of each torque row and the joints
+``q_joint1 [rad]`` ..., then sigma_ ... of each torque row, the standard deviation expected of measured - predicted
+(1.96 of them hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, and, of recordings without a
+payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify`` writes
 ``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session writes
 one per validation recording.
 

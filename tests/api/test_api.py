@@ -228,7 +228,9 @@ def test_a_designed_motion_is_sampled_at_any_rate_without_interpolation(tmp_path
     t, q, v, a = design.sampled()
     written = (design.save(tmp_path / "m", plots=False) / "trajectory.csv").read_text().splitlines()
     rows = np.genfromtxt([line for line in written if line[0] != "#"], delimiter=",", names=True)
-    assert np.allclose(rows["q3"], q[:, 2], atol=1e-9) and np.allclose(rows["a6"], a[:, 5], atol=1e-8)
+    assert np.allclose(rows["q_joint3_rad"], q[:, 2], atol=1e-9) and np.allclose(
+        rows["a_joint6_rads2"], a[:, 5], atol=1e-8
+    )
     fine = design.sampled(1000.0)
     assert all(np.allclose(one[::10], other, atol=1e-9) for one, other in zip(fine, (t, q, v, a)))
     assert np.allclose(np.gradient(fine[1], fine[0], axis=0)[1:-1], fine[2][1:-1], atol=1e-3)

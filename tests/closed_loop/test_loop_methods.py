@@ -288,7 +288,9 @@ def design(folder) -> Periodic:
     series = tuple(np.concatenate([[0.1], a, b]) for a, b in zip(sines, cosines))
     names = tuple(f"joint{j + 1}" for j in range(planted.N))
     folder.mkdir()
-    (folder / NAME).write_text(dumps(table(Periodic(names, 8.0, RATE, 2, "fourier", series), "planted", [])))
+    (folder / NAME).write_text(
+        dumps(table(Periodic(names, ("revolute",) * len(names), 8.0, RATE, 2, "fourier", series), "planted", []))
+    )
     return read(folder)
 
 

@@ -110,7 +110,7 @@ def test_a_parameter_on_its_bound_has_no_sigma(robot: Path, tmp_path: Path):
     run("identify", robot, log, *more)
     rows = {row["name"]: row for row in csv.DictReader((out / "estimate.csv").open())}
     assert float(rows["Fv1"]["value"]) == pytest.approx(4.0, rel=1e-5)
-    assert rows["Fv1"]["sigma"] == rows["Fv1"]["rsd"] == rows["Fv1"]["sigma_torque"] == ""
+    assert rows["Fv1"]["sigma"] == rows["Fv1"]["rsd [%]"] == rows["Fv1"]["sigma_torque"] == ""
     assert "on its bound" in rows["Fv1"]["expression"]
     assert all(float(row["sigma"]) > 0.0 for name, row in rows.items() if name != "Fv1")
     stored = read_estimate(out)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import brentq
 
+from calib.data.csv_table import read_table
 from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
@@ -27,12 +28,9 @@ WAYPOINTS = np.array(
 
 def read_setpoints(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a motion's file: t (N,), and q, v, a, tau (N, n) as far as they are there."""
-    rows = np.genfromtxt([line for line in path.read_text().splitlines() if line[0] != "#"], delimiter=",", names=True)
-    found = {"t": rows["t"]}
-    for letter in ("q", "v", "a", "tau"):
-        names = [name for name in rows.dtype.names if name.rstrip("0123456789") == letter]
-        found |= {letter: np.column_stack([rows[name] for name in names])} if names else {}
-    return found
+    table = read_table(path)
+    found = {letter: table.block(letter) for letter in ("q", "v", "a", "tau")}
+    return {"t": table.numbers("t", None)} | {letter: one for letter, one in found.items() if one is not None}
 
 
 @cache

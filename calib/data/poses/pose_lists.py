@@ -56,27 +56,26 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.schema import BOUNDS, Joints
 from calib.errors import MeasurementError, listing
 from calib.records import frozen, shaped
-from calib.units import ANGLES, LENGTHS
+from calib.units import ANGLES, JOINT, LENGTHS
 
 MAX_JOINT_DIFFERENCE = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
 
 
-def write_poses(
-    path: str | Path, q: ArrayLike, joint_names: Sequence[str], *, unit: str = "rad", kinds: Sequence[str] | None = None
-) -> Path:
-    """Write joint values (m, n) [rad or m] to a CSV file with the joint names as header.
+def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kinds: Sequence[str] | None = None) -> Path:
+    """Write joint values (m, n) [rad or m] to a CSV file in deg or mm, under ``joint1 [deg]``.
 
     Args:
-        unit: ``rad`` or ``deg`` (headers then say ``[deg]``); prismatic joints stay in m.
         kinds: URDF's type of each joint; all revolute by default.
     """
-    values = shaped(q, (None, len(joint_names)), "q").copy()
-    header = list(joint_names)
-    for j, kind in enumerate(kinds or ["revolute"] * len(header)):
-        if unit == "deg" and kind != "prismatic":
-            values[:, j] = np.rad2deg(values[:, j])
-            header[j] = f"{header[j]} [deg]"
-    return files.write_numbers(path, header, values)
+    values = shaped(q, (None, len(joint_names)), "q")
+    header, factors = joint_columns(joint_names, kinds or ["revolute"] * len(joint_names))
+    return files.write_numbers(path, header, values * factors)
+
+
+def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str], np.ndarray]:
+    """Return headers of joints' columns for people, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI."""
+    units = [JOINT["prismatic" if kind == "prismatic" else "revolute"] for kind in kinds]
+    return [f"{name} [{unit}]" for name, (_, unit) in zip(names, units)], np.array([factor for factor, _ in units])
 
 
 def filled_in(path: Path, joints: int) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ from calib.procedure.dynamic_stage.verdict import Resting
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import plain, read_json
 from calib.robot import calibrated
-from calib.units import per_ampere
+from calib.units import TORQUE, headings, per_ampere
 
 INSTRUMENTAL = "instrumental.csv"
 OURS = (
@@ -39,7 +40,7 @@ OURS = (
 """Files of an earlier identification that a new one replaces."""
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
-HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
+HEADER = ("name", "expression", "unit", "value", "sigma", "rsd [%]", "essential", "sigma_torque", "sigma_geometry")
 
 
 class _Essential(NamedTuple):
@@ -108,7 +109,7 @@ class UnseenFolder:
         """Write a table of torques per unseen recording, and the report."""
         for number, case in enumerate(inputs.unseen, 1):
             predicted, expected = found.predictions[case.name], found.intervals.get(case.name)
-            _write_torques(case, predicted, expected, self.path / f"torques_{number}.csv")
+            _write_torques(inputs, case, predicted, expected, self.path / f"torques_{number}.csv")
         files.write_json(self.report, UnseenReport.of(inputs, found))
 
     def read(self) -> UnseenReport:
@@ -160,19 +161,21 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
     expected = outcome.intervals.get(first.name)
-    _write_torques(first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
+    _write_torques(inputs, first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
     made = inputs.robot.model_table if isinstance(inputs.robot, Mechanism) else to_table
     table = made(found.dynamics, found.base, inputs.unit) | {"drive_gains": gains}
     files.write_json(folder / MODEL, table)
     if gains is not None:
-        header = ("joint", f"gain [{gains.unit}]", "sigma", "told")
+        header = ("joint", f"gain [{gains.unit}]", f"sigma [{gains.unit}]", "told")
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
         files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / folders.METRICS, metrics(outcome))
 
 
-def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path) -> Path:
+def _write_torques(
+    inputs: IdentificationInputs, case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path
+) -> Path:
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
 
     Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates; without a
@@ -180,21 +183,26 @@ def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals 
     """
     motion = case.motion
     step = max(1, round(motion.rate / TORQUE_RATE))
-    columns = {"measured_": np.asarray(case.target), "predicted_": predicted, "q": np.asarray(motion.q)}
+    columns = {"measured": np.asarray(case.target), "predicted": predicted, "q": np.asarray(motion.q)}
     if expected is not None:
         near = np.searchsorted(expected.index, np.arange(len(motion)))
-        columns |= {"sigma_": expected.sigma[near], "extrapolated": expected.beyond[near]}
+        columns |= {"sigma": expected.sigma[near], "extrapolated": expected.beyond[near]}
     if not case.carried:
         columns |= {"v": np.asarray(motion.v), "a": np.asarray(motion.a)}
-    names = [f"{what}{j + 1}" if one.ndim > 1 else what for what, one in columns.items() for j in range(one[0].size)]
-    return files.write_numbers(path, ["t [s]", *names], np.column_stack([motion.t, *columns.values()])[::step])
+    joints, rows, names = inputs.chain.joints, inputs.options.settings.torque_rows, ["t [s]"]
+    units = rows.units([joint.kind == "prismatic" for joint in joints])
+    titled = list(zip(rows.titles(inputs.chain.joint_names), units if inputs.unit == TORQUE else repeat(inputs.unit)))
+    for what, one in columns.items():
+        named = headings(what, joints) if what in "qva" else [f"{what}_{title} [{unit}]" for title, unit in titled]
+        names += named if one.ndim > 1 else [what]
+    return files.write_numbers(path, names, np.column_stack([motion.t, *columns.values()])[::step])
 
 
 def read_torques(path: Path) -> dict[str, np.ndarray]:
     """Read the table of `_write_torques`: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
     table = read_table(path)
-    found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}
-    return {name.rstrip("_"): one for name, one in found.items() if one is not None} if found["v"] is not None else {}
+    found = {name: table.block(name) for name in ("measured", "predicted", "q", "v", "a")}
+    return {name: one for name, one in found.items() if one is not None} if found["v"] is not None else {}
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

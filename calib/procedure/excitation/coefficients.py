@@ -10,11 +10,16 @@
 limits = ["velocity limits: joint_1 1.92 rad/s (robot description)", ...]
     [[joint]]
     name = "joint_1"
+    kind = "revolute"                # or prismatic
     q0 = 0.1                         # [rad or m]
     a = [...]
     b = [...]
 
 With ``family = "bspline"`` a joint has ``points``, control points of a periodic spline of ``degree`` on uniform knots.
+
+``trajectory.csv`` is one period at that rate, ``run.csv`` the whole run with its approach: ``t [s]``, then of every
+joint ``q_joint1 [rad]``, ``v_joint1 [rad/s]``, ``a_joint1 [rad/s^2]`` (of sliding joints m) and, where the model
+predicts them, ``tau_joint1 [N m]``; ``motion.csv`` of `calib plan` likewise.
 
 ``calib recall`` finds the motion in a log, cuts it to whole periods and averages them. It writes a recording of one
 period that `calib identify` reads. A NumPy archive holds besides, per sample and joint, the variance of one sample over
@@ -33,13 +38,14 @@ from annotated_types import MinLen
 
 from calib import files
 from calib.config import parse, read_toml
-from calib.config_types import Expect, Name, OneOf, Positive, Real, Whole
+from calib.config_types import Expect, Name, OneOf, Positive, Real, Text, Whole
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, require
 from calib.folders import METRICS
+from calib.units import headings
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
 from trajectories.fourier import evaluate
@@ -58,6 +64,7 @@ class _JointTable:
     """Entry ``[[joint]]`` of ``trajectory.toml``: a joint's coefficients, see the module."""
 
     name: Name
+    kind: Text = "revolute"
     q0: Annotated[float, Real()] | None = None
     a: Numbers | None = None
     b: Numbers | None = None
@@ -81,12 +88,13 @@ class Periodic:
     """A periodic motion, defined by its coefficients: eq. 23 of Kolyubin et al. 2019, or control points.
 
     Attributes:
-        joint_names: n names.
+        joint_names, kinds: n names, and types (revolute, prismatic).
         period: [s]; rate: of the controller [Hz]; repeat: periods that were to be run.
         kind: of the family; coefficients: per joint; degree: of splines.
     """
 
     joint_names: tuple[str, ...]
+    kinds: tuple[str, ...]
     period: float
     rate: float
     repeat: int
@@ -114,10 +122,10 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, Any]
         else "periodic spline, uniform knots over the period; rad, m, s", "limits": list(limits),
     }  # fmt: skip
     joints = []
-    for name, c in zip(motion.joint_names, motion.coefficients):
+    for name, kind, c in zip(motion.joint_names, motion.kinds, motion.coefficients):
         half = len(c) // 2
         series = {"q0": c[0], "a": c[1 : 1 + half], "b": c[1 + half :]} if fourier else {"points": c}
-        joints.append({"name": name, **series})
+        joints.append({"name": name, "kind": kind, **series})
     return head | ({} if fourier else {"degree": motion.degree}) | {"joint": joints}
 
 
@@ -141,8 +149,8 @@ def read(folder: Path) -> Periodic:
             raise UsageError(f"{place}: a and b need {len(table.joint[0].a or ())} values each, as many as joint 1's a")
         coefficients.append(np.concatenate([np.array(part, dtype=float) for part in parts]))
     found = Periodic(
-        tuple(joint.name for joint in table.joint), table.period, table.rate, table.repeat, table.family,
-        tuple(coefficients), table.degree,
+        tuple(joint.name for joint in table.joint), tuple(joint.kind for joint in table.joint), table.period,
+        table.rate, table.repeat, table.family, tuple(coefficients), table.degree,
     )  # fmt: skip
     try:
         found.orders(np.zeros(1))
@@ -215,7 +223,8 @@ def write(averaged: AveragedMotion, out: Path) -> Path:
     called = HEADERS | {"q": "q", "v": "v", "effort": "tau" if averaged.kind == "torque" else "current"}
     t = np.arange(averaged.found.period) / averaged.rate
     if out.suffix == ".csv":
-        header = ["t", *(f"{called[name]}{j + 1}" for name in averages for j in range(len(names)))]
+        joints = [_JointTable(name, kind) for name, kind in zip(names, averaged.motion.kinds)]
+        header = ["t [s]", *(title for name in averages for title in headings(called[name], joints))]
         table = np.column_stack([t, *(one.mean for one in averages.values())])
         return files.write_numbers(out, header, table)
     arrays = {called[name]: one.mean for name, one in averages.items()}

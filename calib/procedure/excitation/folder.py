@@ -21,7 +21,7 @@ from calib.procedure.excitation.planning import Planned
 from calib.procedure.excitation.playback import Playback
 from calib.records import plain
 from calib.robot.tables import dumps
-from calib.units import motion_units
+from calib.units import headings, motion_units
 from trajectories.design.verify import dense_motion
 from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints
@@ -61,8 +61,9 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
         settings, family = designed.settings, designed.family
         motion = Periodic(
-            tuple(chain.joint_names), designed.period, settings.rate, settings.repeat, settings.family,
-            tuple(family.coefficients(designed.found.x)), getattr(family, "degree", 5),
+            chain.joint_names, tuple(joint.kind for joint in chain.joints), designed.period, settings.rate,
+            settings.repeat, settings.family, tuple(family.coefficients(designed.found.x)),
+            getattr(family, "degree", 5),
         )  # fmt: skip
         files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, chain.name, bounds.lines())))
         if played.approach is not None or played.repeat > 1:
@@ -101,10 +102,10 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
 
 def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:
-    """Write t, q, v, a and, if known, tau in SI units, one row per controller sample; comments state the limits."""
+    """Write t, q, v, a and, if known, tau, one row per controller sample; comments state the limits."""
     bounds.check(track)
     parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
-    header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
+    header = ["t [s]", *(name for letter in parts for name in headings(letter, bounds.joints))]
     return files.write_numbers(path, header, np.column_stack([track.times, *parts.values()]), notes=bounds.lines())
 
 

@@ -274,7 +274,8 @@ def _shortened(
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     """Write the parameters' predicted sigmas as CSV; value and rsd [%] are empty where the value is not known."""
-    return files.write_table(folder / NAME, PredictedSigma._fields, rows)
+    header = [f"{name} [%]" if name == "rsd" else name for name in PredictedSigma._fields]
+    return files.write_table(folder / NAME, header, rows)
 
 
 def lines(one: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:

@@ -30,7 +30,7 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert, to_xyz_rpy
 
-OFFSETS_HEADER = ("joint", "unit", "offset", "sigma")
+OFFSETS_HEADER = ("joint", "unit", "add_to_reading", "add_to_command", "sigma")
 MAX_DIFFERENCE = 1e-9  # of poses read back [m, and as a rotation matrix], and of torques over the largest
 
 
@@ -105,8 +105,9 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
 
 
 def export_offsets(robot: CalibratedChain, out: Path) -> Path:
-    """Write the offset (calibrated minus nominal) of each joint, to be added to the controller's joint value.
+    """Write the offset of each joint: to add to what the controller reads, and with the other sign to commands.
 
+    Calibrated minus nominal: a joint that reads q stands at q + offset in the nominal robot's terms.
     Where the fit has joint corrections, offsets and their sigmas are those of the best geometry without them: for
     whoever does not apply them.
     """
@@ -116,8 +117,8 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     rows = []
     for joint, k in zip(robot.chain.joints, robot.chain.moving):
         element, before = robot.chain.elements[k], nominal.elements[k]
-        known = float(sigma[k]) if sigma[k] > 0.0 else None
-        rows.append((joint.name, joint.unit, (element.value - before.value) / element.ratio, known))
+        offset = (element.value - before.value) / element.ratio
+        rows.append((joint.name, joint.unit, offset, 0.0 - offset, float(sigma[k]) if sigma[k] > 0.0 else None))
     return files.write_table(out, OFFSETS_HEADER, rows)
 
 

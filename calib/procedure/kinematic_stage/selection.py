@@ -241,7 +241,7 @@ def write(chosen: Chosen, path: Path) -> Path:
         forecast.write(chosen.prediction, path)
     else:
         forecast.beside(path).unlink(missing_ok=True)  # an earlier selection's
-    return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
+    return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, joint_kinds(chosen.chain))
 
 
 def bound_words(found: Selection) -> str:

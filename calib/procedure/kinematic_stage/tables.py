@@ -30,7 +30,7 @@ PLACES = tuple(
     for head, unit in (("", "m"), ("to_nominal_", "mm"), ("to_calibrated_", "mm"))
     for name in (f"{head}x", f"{head}y", f"{head}z")
 )
-HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd")
+HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd [%]")
 
 
 @dataclass(frozen=True, eq=False)

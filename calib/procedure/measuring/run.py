@@ -6,7 +6,7 @@ not keep clear, via-points lead around; the arm is taken to stop at each.
 
 The file of a run has a row per stop, in time order::
 
-    t, pose, q1 [deg], …             t [s]; pose: number of the pose in its list, counted from 1; 0 for a via-point
+    t [s], pose, joint1 [deg], …     pose: number of the pose in its list, counted from 1; 0 for a via-point
 
 Where no clear way leads to a pose, a candidate takes its place that one leads to. The same pose on another turn of its
 joints comes first. Of the candidates the one is taken that leaves most of the criterion among those that a straight
@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from calib import files
 from calib.data.csv_table import read_table
+from calib.data.poses.pose_lists import joint_columns
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
 from poses.by_index import merits
@@ -247,9 +248,7 @@ def lines(run: Run, settings: RunSettings) -> list[str]:
 
 def write_run(path: Path, run: Run, chain: Chain) -> Path:
     """Write the file of a run (format: see the module), its poses numbered in visiting order."""
-    factors = [180.0 / np.pi if joint.kind == "revolute" else 1.0 for joint in chain.joints]
-    units = ["deg" if joint.kind == "revolute" else "m" for joint in chain.joints]
-    header = ["t", "pose", *(f"{joint.name} [{unit}]" for joint, unit in zip(chain.joints, units))]
+    header, factors = joint_columns(chain.joint_names, [joint.kind for joint in chain.joints])
     velocity, acceleration = _speeds(chain, 1.0)
     rows, clock = [], 0.0
     for k in range(len(run.order)):
@@ -265,13 +264,13 @@ def write_run(path: Path, run: Run, chain: Chain) -> Path:
         rows.append([round(clock, 3), k + 1, *(place * factors)])
         clock += run.dwell
         rows.append([round(clock, 3), k + 1, *(place * factors)])
-    return files.write_table(path, header, rows)
+    return files.write_table(path, ["t [s]", "pose", *header], rows)
 
 
 def is_run(path: Path) -> bool:
     """Return whether a CSV file contains a run."""
     with path.open(encoding="utf-8", errors="replace") as file:
-        return file.readline().startswith("t,pose,")
+        return file.readline().startswith(("t [s],pose,", "t,pose,"))
 
 
 def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
@@ -283,7 +282,7 @@ def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.
     table = read_table(path)
     columns = {name.split(" [")[0]: name for name in reversed(table.header)}
     stops = np.column_stack([table.numbers(columns.get(name, name), "joint") for name in chain.joint_names])
-    times = table.numbers("t")
+    times = table.numbers("t", None)
     t = np.linspace(times[0], times[-1], max(int((times[-1] - times[0]) * rate), 2))
     return t, np.column_stack([np.interp(t, times, column) for column in stops.T])
 

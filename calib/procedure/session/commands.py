@@ -28,17 +28,7 @@ from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.folder import (
-    POSES,
-    UNSEEN,
-    WAYS,
-    Say,
-    Session,
-    create,
-    locked,
-    open_session,
-    read_state,
-)
+from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import NOTHING, SessionSettings
@@ -76,7 +66,8 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     if sets and lists[0] == POSES and not images and (ways := session.path(f"2-poses/{WAYS}")).exists():
         sets[0] += f" in their order (ways: {ways}; calib view {session.folder} rehearses them)"
     where = " and, into a separate file, ".join(sets) or "poses all over the workspace"
-    files = [str(session.path("3-measured") / ("measured.csv" if name == POSES else UNSEEN)) for name in lists]
+    names = {POSES: "measured.csv", UNSEEN: "validation_measured.csv"}
+    files = [str(session.path("3-measured") / names[name]) for name in lists]
     if images:
         spread = "" if sets else ", with the board near, far and tilted"
         return (
@@ -121,7 +112,7 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
         columns.append(f"tau_{first} [{force}] to tau_{last} [{to_force}]")
     if section.torques != "motor":
         columns.append(f"tau_link_{first} to tau_link_{last} (the sensors')")
-    files = " and ".join(str(session.path(f"7-recorded/{name}.csv")) for name in names)
+    files = " and ".join(str(session.path(f"7-recorded/{name}_log.csv")) for name in names)
     return task, (
         f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS bags "
         "work, too (calib formats recordings)"

@@ -3,14 +3,14 @@
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
 2-poses/         poses.csv to measure and fit, in the order of least time, poses_run.csv the ways between them, and
-                 validation.csv to measure and never fit; poses_prediction.json and predicted.png what they are
+                 validation_poses.csv to measure and never fit; poses_prediction.json and predicted.png what they are
                  predicted to identify
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
                  some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
 4-fit/  5-validation/
 6-excitation/    training and validation: two motions for the robot to play, at the controller's rate; round2 …: further
                  ones, where tolerance_percent or sigma_percent asks for more than these brought
-7-recorded/      what people bring: the logs of them, training.csv (any name; .npz or a ROS bag, too), and files whose
+7-recorded/      what people bring: the logs of them, training_log.csv (any name; .npz or a ROS bag, too), and files whose
                  name starts with validation or round2 …; a file whose name holds a payload's label was recorded with it
                  on board: `calib formats recordings`
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
@@ -62,7 +62,8 @@ CHECKED, VERDICT = "checked.txt", "verdict.json"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
 PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
-POSES, UNSEEN, WAYS = "poses.csv", "validation.csv", "poses_run.csv"  # as planned, in 2-poses
+POSES, UNSEEN, WAYS = "poses.csv", "validation_poses.csv", "poses_run.csv"  # as planned, in 2-poses
+OLDER = {f"2-poses/{UNSEEN}": "2-poses/validation.csv"}  # name today -> in sessions of earlier versions
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 ROUND = "round"  # of further motions: round2, round3 …
 LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3")
@@ -112,7 +113,8 @@ class Session:
 
     def path(self, name: str) -> Path:
         """Return the path of a file, given by its name relative to the session's folder."""
-        return self.folder / name
+        older = self.folder / OLDER.get(name, name)
+        return older if older.exists() else self.folder / name
 
     def named(self, name: str) -> Path | None:
         """Return the path of the file that a key of ``session.toml`` names; None if the key is empty."""

@@ -168,7 +168,7 @@ def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Genera
 def planned_poses(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
     """Yield the pose lists planned by the session in `folder` for an arm: number, name when measured, q (m, n)."""
     joints = Joints(arm.joint_names, joint_kinds(arm))
-    for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
+    for number, (plan, name) in enumerate((("poses", "measured"), ("validation_poses", "validation_measured"))):
         if (path := folder / f"2-poses/{plan}.csv").exists():
             yield number, name, read_poses(path, joints)
 
@@ -192,7 +192,7 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
         header += [f"sigma_{axis} [{unit[1]}]" for axis in "xyz"]
     if isinstance(measured, Poses) and measured.sigma_rotation is not None:
         columns.append(measured.sigma_rotation)
-        header += [f"sigma_r{axis}" for axis in "xyz"]
+        header += [f"sigma_r{axis} [rad]" for axis in "xyz"]
     return files.write_numbers(path, header, np.hstack(columns))
 
 

@@ -257,4 +257,4 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
         t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
         reference = play(t, *motions[name].orders(t), motions[name].repeat)
         recorded = record(arm, reference, np.random.default_rng([seed, number]), running)
-        write_log(recorded, session.path(f"7-recorded/{name}.csv"))
+        write_log(recorded, session.path(f"7-recorded/{name}_log.csv"))

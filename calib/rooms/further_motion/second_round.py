@@ -128,7 +128,7 @@ def promised(session: Session) -> tuple[str, ...]:
     if not session.needs or not notes or not folder.exists():
         return ()
     played = folder / (RUN if session.settings.dynamics.repeats > 1 else SAMPLES)
-    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}.csv')}; then: "
+    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 
 

@@ -28,6 +28,7 @@ from calib.rooms.parallel.mechanism.parallel_model import ParallelModel, Platfor
 from calib.rooms.parallel.mechanism.velocities import LoopMotion
 from calib.rooms.parallel.purpose import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
 from calib.rooms.parallel.robots import ParallelMechanism
+from calib.units import headings
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
 from trajectories.design.verify import dense_motion
@@ -149,8 +150,8 @@ class ParallelExcitation(ExcitationDesign):
         above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
         last = 1 + max(1, int((above[1:] > max_error).sum()))
         own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:last].imag, 2.0 * c[1:last].real]) for c in lines.T)
-        names, rate = self.robot.chain.joint_names, self.settings.rate
-        return coefficients.Periodic(names, self.period, rate, 1, "fourier", own)
+        names, kinds = zip(*((one.name, one.kind) for one in self.robot.chain.joints))
+        return coefficients.Periodic(names, kinds, self.period, self.settings.rate, 1, "fourier", own)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics of ``metrics.json``."""
@@ -291,13 +292,14 @@ def write_motion(
         bounds: which the motion keeps; they stand at the head of the file.
     """
     parts = {"q": track.q, "v": track.v, "tau": track.tau}
-    names = (f"{what}_{name}" for what in parts for name in robot.chain.joint_names)
+    names = [f"{name} [{'rad' if name[0] == 'r' else 'm'}]" for name in robot.chain.freedom]
+    names += [name for what in parts for name in headings(what, robot.chain.joints)]
     table = np.hstack([track.times[:, None], coordinates, *parts.values()])
 
     def write(folder: Path) -> None:
         robot.write(folder)
         bounds.check(track)
-        files.write_numbers(folder / PLANNED, ["t [s]", *robot.chain.freedom, *names], table, notes=bounds.lines())
+        files.write_numbers(folder / PLANNED, ["t [s]", *names], table, notes=bounds.lines())
         more(folder)
         files.write_json(folder / METRICS, metrics)
 

@@ -212,7 +212,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
                 for path in plans
                 if isinstance(chain, Chain) and is_run(path)
             ),
-            *(_played(path, folder, chain) for path in motions),
+            *(_played(path, folder) for path in motions),
         ),
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
@@ -320,12 +320,9 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
     return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
 
 
-def _played(path: Path, folder: Path, chain: Chain | Drawn | None) -> Played:
+def _played(path: Path, folder: Path) -> Played:
     table = read_table(path)
-    t, q, v = _seconds(table), table.block("q"), table.block("v")
-    if isinstance(chain, Drawn) and q is None:
-        q, v = (np.column_stack([table.numbers(f"{key}_{name}") for name in chain.joint_names]) for key in "qv")
-    return Played(_name(path, folder), t, _needed(table, "q", path) if q is None else q, v)
+    return Played(_name(path, folder), _seconds(table), _needed(table, "q", path), table.block("v"))
 
 
 def _seconds(table: Table) -> np.ndarray:
@@ -334,7 +331,7 @@ def _seconds(table: Table) -> np.ndarray:
 
 def _torques(path: Path, folder: Path, chain: Chain | Drawn | None) -> Torques:
     table = read_table(path)
-    measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
+    measured, predicted = (_needed(table, what, path) for what in ("measured", "predicted"))
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
     return Torques(_name(path, folder), rows, units, _seconds(table), measured, predicted, table.block("q"))
 
@@ -361,10 +358,10 @@ def _torque_rows(place: Path, chain: Chain | Drawn | None, count: int) -> tuple[
 
 
 def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
-    """Return the required columns letter1, letter2, … of a file as (N, n)."""
+    """Return the required columns letter_joint of a file as (N, n)."""
     found = table.block(letter)
     if found is None:
-        raise UsageError(f"{path} has no columns {letter}1, {letter}2, …; was it written by this toolkit?")
+        raise UsageError(f"{path} has no columns {letter}_joint …; was it written by this toolkit?")
     return found
 
 

@@ -20,12 +20,11 @@ def measured(q, rows=None):
     return Planes(q, ("q1", "q2", "q3", "q4"), file="m.csv", rows=rows)
 
 
-@pytest.mark.parametrize("unit", ["rad", "deg"])
-def test_round_trip(tmp_path, plan, unit):
+def test_round_trip(tmp_path, plan):
     kinds = ("prismatic", "revolute", "revolute", "continuous")
-    path = write_poses(tmp_path / "poses.csv", plan, NAMES, unit=unit, kinds=kinds)
+    path = write_poses(tmp_path / "poses.csv", plan, NAMES, kinds)
     np.testing.assert_allclose(read_poses(path, Joints(NAMES, kinds)), plan, rtol=1e-11)
-    assert path.read_text().splitlines()[0] == ("a,b,c,d" if unit == "rad" else "a,b [deg],c [deg],d [deg]")
+    assert path.read_text().splitlines()[0] == "a [mm],b [deg],c [deg],d [deg]"
 
 
 def test_nothing_is_written_of_a_bad_list(tmp_path, plan):

@@ -40,7 +40,7 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
         "unit",
         "value",
         "sigma",
-        "rsd",
+        "rsd [%]",
         "essential",
         "sigma_torque",
         "sigma_geometry",

@@ -72,7 +72,7 @@ def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
     assert np.abs(forward(again, q) - forward(load("done"), q)).max() < 1e-9
     assert np.isfinite(poses).all()
     estimate = read_rows(Path("done/estimate.csv"))
-    assert list(estimate[0]) == ["name", "unit", "nominal", "value", "sigma", "rsd"]
+    assert list(estimate[0]) == ["name", "unit", "nominal", "value", "sigma", "rsd [%]"]
     names = {row["name"] for row in estimate}
     assert {"day1.x", "day1.rz", "tool.x"} <= names
     chain, nominal = load("done"), load("ur5")

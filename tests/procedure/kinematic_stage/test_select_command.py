@@ -34,8 +34,8 @@ floor = -0.1
 def read_poses(path: str) -> np.ndarray:
     with Path(path).open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == list(load("ur5").joint_names)
-    return np.array([[float(value) for value in row.values()] for row in rows])
+    assert list(rows[0]) == [f"{name} [deg]" for name in load("ur5").joint_names]
+    return np.deg2rad([[float(value) for value in row.values()] for row in rows])
 
 
 def write_poses(path: str, count: int, seed: int) -> None:

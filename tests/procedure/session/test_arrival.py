@@ -74,14 +74,14 @@ def test_answers_are_checked_as_they_come() -> None:
 
 
 def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_too(measured: Session) -> None:
-    path = measured.path("3-measured/validation.csv")
+    path = measured.path("3-measured/validation_measured.csv")
     head, *lines = path.read_text().strip().split("\n")
     columns = [k for k, name in enumerate(head.split(",")) if name in ("x [mm]", "y [mm]", "z [mm]")]
     table = np.array([line.split(",") for line in lines], dtype=float)
     assert len(columns) == 3 and inputs.read_file(path, CELL.nominal, FitOptions())
     table[:, columns] *= 1e-3
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in table)]) + "\n")
-    with pytest.raises(MeasurementError, match=r"validation.csv: .*are they m, although the header states mm"):
+    with pytest.raises(MeasurementError, match=r"validation_measured.csv: .*are they m, although the header states mm"):
         read_measured(measured, chain_of(measured), [path])
 
 

@@ -59,7 +59,7 @@ def test_it_loads_nothing_from_anywhere(page: str) -> None:
 
 def test_it_says_what_a_professional_signs(text: str, finished_folder: Path) -> None:
     metrics = json.loads((finished_folder / "5-validation/metrics.json").read_text())
-    rms = metrics["validation"]["validation.csv"]["calibrated"]["position_mm"]["rms"]
+    rms = metrics["validation"]["validation_measured.csv"]["calibrated"]["position_mm"]["rms"]
     stated = {metrics["verdict"].upper(), metrics["reason"][1:], f"{rms:.3f}", "seed", "numpy", "Limitations"}
     robot = {"lwr4plus", "optical CMM", "60 µm", "3-measured/measured.csv", "theta2", "d4", "alpha7"}
     assert all(words in text for words in stated | robot | {"kept at their nominal values: alpha1"})
@@ -208,4 +208,4 @@ def test_what_was_not_checked_and_what_was_predicted_is_repeated(finished: Sessi
     assert "poses NOT checked for" in page and "obstacles (not known)" in page and "self-collision (capsules" in page
     notes = json.loads((finished.folder / "state.json").read_text())["steps"]["fit"]["notes"]
     assert any(note.startswith("estimated σ / predicted σ") for note in notes)
-    assert (finished.folder / "2-poses/poses_run.csv").read_text().startswith("t,pose,")
+    assert (finished.folder / "2-poses/poses_run.csv").read_text().startswith("t [s],pose,")

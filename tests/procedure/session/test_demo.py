@@ -27,7 +27,7 @@ def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     truth = json.loads((out / "truth.json").read_text())["position_mm"]
     nominal, calibrated = truth["nominal"], truth["calibrated"]
     assert calibrated < nominal / 8
-    found = json.loads((out / "5-validation/metrics.json").read_text())["validation"]["validation.csv"]
+    found = json.loads((out / "5-validation/metrics.json").read_text())["validation"]["validation_measured.csv"]
     assert found["calibrated"]["position_mm"]["rms"] < found["urdf_alone"]["position_mm"]["rms"] < nominal
     assert found["calibrated"]["position_mm"]["rms"] == pytest.approx(calibrated, rel=0.25)  # 20 poses against 2000
     chain, read = load(out / "6-export"), urdf.read(out / "6-export/robot_for_corrections.urdf")

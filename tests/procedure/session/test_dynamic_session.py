@@ -76,7 +76,7 @@ def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     first, second = commands.asks(waiting, state)
     assert "6-excitation/training/run.csv" in first and "validation/run.csv" in first
     assert "2 times" in first and "250 Hz" in first and "never used for training" in first
-    assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
+    assert "7-recorded/training_log.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
 def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> None:
@@ -95,7 +95,7 @@ def test_a_motion_that_was_recorded_stays_when_the_geometry_is_fitted_again(wait
     for brought, kept in ((False, False), (True, True)):
         if brought:
             waiting.path("7-recorded").mkdir(exist_ok=True)
-            waiting.path("7-recorded/training.csv").write_text("t\n0\n")
+            waiting.path("7-recorded/training_log.csv").write_text("t\n0\n")
         before = read_state(waiting)
         steps.forget(waiting, steps.find(waiting, "fit"))
         assert ("excite" in read_state(waiting).steps) is kept and "fit" not in read_state(waiting).steps
@@ -112,9 +112,9 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     assert joints[0] == joints[1] and "dynamics" not in given, "the calibrated geometry"
     page = whole.path("certificate.html").read_text()
     titles = {"Torque errors", "Excitation", "Identified parameters", "Geometry", "What was exported"}
-    assert all(words in page for words in titles | {"ZZ2R", "7-recorded/training.csv"})
+    assert all(words in page for words in titles | {"ZZ2R", "7-recorded/training_log.csv"})
     found = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
-    own = found["validation"]["validation.csv"]
+    own = found["validation"]["validation_measured.csv"]
     assert "<inertia " in whole.path("9-export/robot.urdf").read_text()
     assert own["evidence"] and whole.verdicts().level == "marginal"  # errors that no model holds remain
 
@@ -127,7 +127,7 @@ def test_the_unexplained_share_is_the_error_against_the_hidden_arm(whole: Sessio
     chain, dynamics = read_dynamics(whole.identification.path)
     found = torque_errors(cell, demo.arm_of(whole, cell), dynamics.model, dynamics.values, chain)
     report = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
-    stated = report["validation"]["validation.csv"]["filtered"]["relative_error_percent"]["total"]
+    stated = report["validation"]["validation_log.csv"]["filtered"]["relative_error_percent"]["total"]
     assert found.identified < found.nominal and found.identified / 1.5 < stated < 1.5 * found.identified
 
 
@@ -188,7 +188,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (reheaded(swapped), r"columns are swapped \(the column of joint3 contains joint2, .*joint2 contains joint3"),
         (scaled("t [", 2.0), "0.5 times its speed"),
         (scaled("tau_joint", -1.0), "reverse their sign"),
-        (scaled("tau_joint4", -1.0), "training.csv: torque of joint4 .* reverse the sign of the column of joint4"),
+        (scaled("tau_joint4", -1.0), "training_log.csv: torque of joint4 .* reverse the sign of the column of joint4"),
         (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
         (scaled("tau_joint", 1e-2), "times those of the nominal masses"),
         (scaled("tau_joint", 12.0), "are they in mNm"),
@@ -199,7 +199,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
     ids=["rad", "swapped", "rehearsal", "sign", "one", "horizontal", "unit", "mNm", "another", "stopped", "missing"],
 )
 def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
-    path = recorded.path("7-recorded/training.csv")
+    path = recorded.path("7-recorded/training_log.csv")
     path.write_text(change(path.read_text()))
     with pytest.raises(MeasurementError, match=message):
         go_on(recorded)
@@ -207,7 +207,7 @@ def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], st
 
 
 def test_a_motion_played_too_seldom_and_loosely_is_noted(recorded: Session) -> None:
-    path, motion = recorded.path("7-recorded/training.csv"), designed_motions(recorded)["training"]
+    path, motion = recorded.path("7-recorded/training_log.csv"), designed_motions(recorded)["training"]
     log = read_recording(str(path), joints_of(load_calibrated(recorded.fit.path).chain))
     loose = replace(log, q=log.q + 0.3 * log.q.std(axis=0) * np.sin(40.0 * log.t)[:, None])
     found, noted = check_motion(loose, motion, {}, 5)
@@ -215,7 +215,7 @@ def test_a_motion_played_too_seldom_and_loosely_is_noted(recorded: Session) -> N
 
 
 def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_proof(recorded: Session) -> None:
-    one, two = recorded.path("7-recorded/training.csv"), recorded.path("7-recorded/validation.csv")
+    one, two = recorded.path("7-recorded/training_log.csv"), recorded.path("7-recorded/validation_log.csv")
     shutil.copyfile(two, one)
     with pytest.raises(MeasurementError, match="contains the validation motion instead"):
         go_on(recorded)
@@ -235,7 +235,7 @@ def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, ca
     assert "Drive the 40 poses" in said and f"calib demo --bring {out}" in said
     assert not list((tmp_path / "cell/3-measured").iterdir())
     assert cli.run(["demo", "--bring", out]) == 0
-    assert (tmp_path / "cell/3-measured/validation.csv").exists()
+    assert (tmp_path / "cell/3-measured/validation_measured.csv").exists()
     assert cli.run(["demo", "--bring", out]) == 2 and "waits for no files" in capsys.readouterr().err
 
 

@@ -37,16 +37,20 @@ def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
     first, second = commands.asks(planned, waiting)
     assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
     assert "measured.csv" in second and "joint1 [deg]" in second and "qw" in second
-    assert "the 8 of" in first and "2-poses/validation.csv (never fitted)" in first and "validation.csv" in second
+    assert (
+        "the 8 of" in first
+        and "2-poses/validation_poses.csv (never fitted)" in first
+        and "validation_measured.csv" in second
+    )
 
 
 def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Session) -> None:
-    validation = measured.path("3-measured/validation.csv").rename(measured.folder / "later.csv")
+    validation = measured.path("3-measured/validation_measured.csv").rename(measured.folder / "later.csv")
     waiting = go_on(measured)
     assert waiting is not None and waiting.step.name == "validate"
     assert "8 poses" in commands.asks(measured, waiting)[0]
     before = measured.path("4-fit/robot.toml").stat().st_mtime_ns
-    validation.rename(measured.path("3-measured/validation.csv"))
+    validation.rename(measured.path("3-measured/validation_measured.csv"))
     assert go_on(measured) is None
     assert measured.path("4-fit/robot.toml").stat().st_mtime_ns == before
 
@@ -206,7 +210,7 @@ def _verdicts(content: Any) -> list[tuple[str, str]]:
 
 
 def test_without_a_validation_file_a_share_of_the_poses_is_held_out(measured: Session) -> None:
-    measured.path("3-measured/validation.csv").unlink()
+    measured.path("3-measured/validation_measured.csv").unlink()
     assert go_on(measured) is not None, "waits for the planned validation poses"
     edit(measured.path("session.toml"), "holdout = 0.0", "holdout = 0.25")
     assert go_on(measured) is None

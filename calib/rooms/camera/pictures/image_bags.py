@@ -146,7 +146,7 @@ def write_image_folder(found: ImageBag, board: Board, folder: Path) -> Path:
     """Write a bag's images as a folder for `calib.rooms.camera.pictures.image_folders`."""
     write_board(board, folder / BOARD)
     rows = [[name, *map(float, joints)] for name, joints in zip(found.names, found.q)]
-    files.write_table(folder / JOINTS, ["image", *found.joint_names], rows)
+    files.write_table(folder / JOINTS, ["image", *(f"{name} [rad]" for name in found.joint_names)], rows)
     write_corners(folder / CORNERS, found.corners)
     return folder
 
