@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from calib.api.rendering import Judged, Progress, data_frame, listed, optional, progress_shown
+from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional, progress_shown
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -25,15 +25,32 @@ from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
 Recorded = str | Path | Recording
 
 
-class DynamicsModel(Judged, identify.IdentificationOutcome):
+class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
+
+    tab = (
+        "robot verdict warnings validation estimate residuals torques torque_sigma predictions plot save to_dict "
+        "to_dataframe"
+    )
+
+    @property
+    def residuals(self) -> Any:
+        """Measured minus predicted torques of every recording, fitted or unseen, as a pandas DataFrame."""
+        inputs, titles = self.inputs, self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
+        rows = (
+            (case.name, t, *row)
+            for case in (*inputs.cases, *inputs.unseen)
+            for t, row in zip(case.motion.t, case.target - self.predictions[case.name])
+        )
+        return data_frame(
+            rows, ["file", "t [s]", *(f"{each} [{unit}]" for each, unit in zip(titles, inputs.row_units))]
+        )
 
     @property
     def robot(self) -> CalibratedChain:
@@ -74,12 +91,11 @@ class DynamicsModel(Judged, identify.IdentificationOutcome):
 
         return folder.write_folder(self, Path(out), dynamics_figures.write if plots else None)
 
-    @one_blas_thread()
-    def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: measured and predicted torques, autocorrelations, friction."""
-        from calib.procedure.report import charts, dynamics_figures
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures show: measured and predicted torques, autocorrelations, friction."""
+        from calib.procedure.report import dynamics_figures
 
-        return charts.figures(dynamics_figures.figures(self))
+        return dynamics_figures.figures(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as in ``metrics.json``."""

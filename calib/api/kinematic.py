@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Judged, Progress, data_frame, listed, optional, progress_shown
+from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional, progress_shown
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -30,16 +30,17 @@ from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Page, Section
 
 Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-class PoseSelection(selection.Chosen):
+class PoseSelection(Drawn, selection.Chosen):
     """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
+
+    tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
 
     @property
     def q(self) -> np.ndarray:
@@ -68,13 +69,11 @@ class PoseSelection(selection.Chosen):
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return write_run(Path(path), self.run, self.chain)
 
-    @one_blas_thread()
-    def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: σ of the tool position over the workspace, and over the number of poses.
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures show: σ of the tool position over the workspace, and over the number of poses.
 
         There are none where a parameter is not identifiable.
         """
-        from calib.procedure.report.charts import figure
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
         look = self.outlook
@@ -84,7 +83,7 @@ class PoseSelection(selection.Chosen):
             "predicted": lambda: predicted_map(look.poses.points, look.poses.spread),
             "outlook": lambda: outlook_figure(curve, own, "poses", "σ of the tool's position [mm]"),
         }
-        return {name: figure(charts[name]()) for name in self.figures}
+        return {name: charts[name]() for name in self.figures}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results of the selection: index, its value, that of random sets, efficiency, seconds, notes."""
@@ -109,8 +108,20 @@ class PredictedPoses(NamedTuple):
     sigma: np.ndarray
 
 
-class GeometryFit(Judged, fit.Outcome):
+class GeometryFit(Drawn, Judged, fit.Outcome):
     """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
+
+    tab = (
+        "robot verdict warnings validation estimate residuals outliers predict position_sigma plot save to_dict "
+        "to_dataframe"
+    )
+
+    @property
+    def residuals(self) -> Any:
+        """Residuals of every row, fitted or unseen, with weight and expected error, as a pandas DataFrame."""
+        from calib.procedure.kinematic_stage.tables import residuals
+
+        return data_frame(*residuals(self))
 
     @property
     def estimate(self) -> Estimate:
@@ -165,14 +176,12 @@ class GeometryFit(Judged, fit.Outcome):
 
         return folder.write_folder(self, Path(out), partial(certificate.write_fit, plots=plots))
 
-    @one_blas_thread()
-    def plot(self) -> dict[str, Figure]:
-        """Return the figures of the certificate by name."""
-        from calib.procedure.report import charts, geometry_figures
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures of the certificate show, by name."""
+        from calib.procedure.report import geometry_figures
         from calib.procedure.report.fit_report import collect
 
-        captioned = geometry_figures.captioned(collect(self))
-        return {name: charts.figure(chart) for name, (chart, _) in captioned.items()}
+        return {name: chart for name, (chart, _) in geometry_figures.captioned(collect(self)).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as in ``metrics.json``."""
@@ -182,7 +191,7 @@ class GeometryFit(Judged, fit.Outcome):
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
         from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
 
-        return data_frame(estimate_table(self.selection.fit, self.selection.nominal.cell).rows(), list(HEADER))
+        return data_frame(estimate_table(self.selection.fit, self.selection.nominal.cell).rows(), HEADER)
 
     def section(self) -> Section:
         """Return a report section with the errors on unseen poses, the compared models, and the verdict."""

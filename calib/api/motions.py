@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import Progress, optional, progress_shown, saved
+from calib.api.rendering import Drawn, Progress, optional, progress_shown, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -20,11 +20,10 @@ from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.robot.calibrated import CalibratedChain
-from calib.workers.threads import one_blas_thread
 from trajectories.setpoints import Setpoints
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from calib.procedure.report.charts import Chart
 
 Sampled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -33,8 +32,10 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-class ExcitationDesign(design.Designed):
+class ExcitationDesign(Drawn, design.Designed):
     """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
+
+    tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
 
     def sampled(self, rate: float | None = None) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], ends included.
@@ -51,12 +52,11 @@ class ExcitationDesign(design.Designed):
 
         return folder.write_design(self, Path(out), motion_figures.write_design if plots else None)
 
-    @one_blas_thread()
-    def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: motion, tool path, search, front."""
-        from calib.procedure.report import charts, motion_figures
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures show: motion, tool path, search, front."""
+        from calib.procedure.report import motion_figures
 
-        return charts.figures(motion_figures.design_figures(self))
+        return motion_figures.design_figures(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
@@ -69,8 +69,10 @@ class ExcitationDesign(design.Designed):
         return "\n".join(folder.design_lines(self))
 
 
-class MotionPlan(planning.Planned):
+class MotionPlan(Drawn, planning.Planned):
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
+
+    tab = "duration track margins deviation sigma notes sampled plot save to_dict"
 
     @property
     def duration(self) -> float:
@@ -88,12 +90,11 @@ class MotionPlan(planning.Planned):
 
         return folder.write_plan(self, Path(out), motion_figures.write_plan if plots else None)
 
-    @one_blas_thread()
-    def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: motion and speed profile."""
-        from calib.procedure.report import charts, motion_figures
+    def charts(self) -> dict[str, Chart]:
+        """Return what the figures show: motion and speed profile."""
+        from calib.procedure.report import motion_figures
 
-        return charts.figures(motion_figures.plan_figures(self))
+        return motion_figures.plan_figures(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

@@ -6,20 +6,23 @@ What the verbs take in several forms: one or many, a file that may be missing, a
 from __future__ import annotations
 
 import io
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Self
-
-if TYPE_CHECKING:
-    from calib.procedure.report.page import Page, Section
-
 import sys
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
-from calib.errors import refused_as
+from calib.errors import UsageError, one_of, refused_as
+from calib.workers.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calib.procedure.report.charts import Chart
+    from calib.procedure.report.page import Page, Section
 
 Progress = Callable[[str], None]
 
@@ -68,7 +71,39 @@ def as_text(renderables: Iterable[Any]) -> str:
     return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
 
 
-class Judged(ABC):
+class Shown:
+    """A result that shows itself as by ``print`` where it is typed, and offers on Tab the members in `tab`."""
+
+    tab: ClassVar[str] = ""
+
+    def __dir__(self) -> list[str]:
+        return self.tab.split()
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        printer.text(str(self))
+
+
+class Drawn(Shown, ABC):
+    """A result with figures."""
+
+    @abstractmethod
+    def charts(self) -> Mapping[str, Chart]:
+        """Return what the figures show, by name."""
+
+    @overload
+    def plot(self) -> dict[str, Figure]: ...
+    @overload
+    def plot(self, name: str) -> Figure: ...
+    @one_blas_thread()
+    def plot(self, name: str | None = None) -> Any:
+        """Return one of the figures, or all of them by name."""
+        from calib.procedure.report import charts
+
+        found = self.charts()
+        return charts.figures(found) if name is None else charts.figure(found[one_of(name, found, "plot", UsageError)])
+
+
+class Judged(Shown, ABC):
     """A result shown as a section of a report: on a console, by ``print``, and as a page in a notebook."""
 
     @abstractmethod
@@ -100,15 +135,19 @@ class Judged(ABC):
 
         return certificate.render(self.page())
 
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+        """Return the page in a frame of its own, so that its style does not become the notebook's."""
+        frame = '<iframe srcdoc="{}" style="width: 100%; height: 60em; border: 1px solid #ccc"></iframe>'
+        return {"text/plain": str(self), "text/html": frame.format(escape(self._repr_html_()))}
 
-def data_frame(rows: Iterable[Any], columns: list[str]) -> Any:
+
+def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:
     """Return rows as a pandas DataFrame.
 
     Raises:
         UsageError: where pandas is not installed.
     """
-    from calib.errors import UsageError
-
-    with refused_as(UsageError, ImportError, "to_dataframe needs pandas: pip install pandas, or use to_dict"):
+    words = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
+    with refused_as(UsageError, ImportError, words):
         from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-    return DataFrame(list(rows), columns=columns)
+    return DataFrame(list(rows), columns=list(columns))

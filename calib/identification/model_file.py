@@ -15,9 +15,9 @@ the joint's torque, friction and motor inertia are in amperes of its own motor, 
 ``torques_N.csv``: ``t [s]``, then ``measured_joint1 [N m]`` ... and predicted_ ... of each torque row and the joints
 ``q_joint1 [rad]`` ..., then sigma_ ... of each torque row, the standard deviation expected of measured - predicted
 (1.96 of them hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, and, of recordings without a
-payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify`` writes
-``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session writes
-one per validation recording.
+payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify``
+writes ``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session
+writes one per validation recording.
 
 ``metrics.json``: errors by file under ``identification`` (training) and ``validation`` (``evidence`` false: it
 repeats the training). Each has ``raw`` (torque as recorded, full rate), ``filtered`` (both sides low-passed to the

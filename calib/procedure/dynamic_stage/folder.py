@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +26,7 @@ from calib.procedure.dynamic_stage.verdict import Resting
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import plain, read_json
 from calib.robot import calibrated
-from calib.units import TORQUE, headings, per_ampere
+from calib.units import headings, per_ampere
 
 INSTRUMENTAL = "instrumental.csv"
 OURS = (
@@ -189,12 +188,10 @@ def _write_torques(
         columns |= {"sigma": expected.sigma[near], "extrapolated": expected.beyond[near]}
     if not case.carried:
         columns |= {"v": np.asarray(motion.v), "a": np.asarray(motion.a)}
-    joints, rows, names = inputs.chain.joints, inputs.options.settings.torque_rows, ["t [s]"]
-    units = rows.units([joint.kind == "prismatic" for joint in joints])
-    titled = list(zip(rows.titles(inputs.chain.joint_names), units if inputs.unit == TORQUE else repeat(inputs.unit)))
+    names, titles = ["t [s]"], inputs.options.settings.torque_rows.titles(inputs.chain.joint_names)
     for what, one in columns.items():
-        named = headings(what, joints) if what in "qva" else [f"{what}_{title} [{unit}]" for title, unit in titled]
-        names += named if one.ndim > 1 else [what]
+        rows = [f"{what}_{title} [{unit}]" for title, unit in zip(titles, inputs.row_units)]
+        names += [what] if one.ndim == 1 else headings(what, inputs.chain.joints) if what in "qva" else rows
     return files.write_numbers(path, names, np.column_stack([motion.t, *columns.values()])[::step])
 
 

@@ -11,9 +11,9 @@ robot.xml             MJCF for MuJoCo: bodies, armature (Ia), damping (Fv), fric
 drives.csv            joint, armature, damping, friction, offset, and the sigma of each: for simulators that take them;
                       by hand. A sigma is empty where the model has no such term. Then a row per coupling, as
                       "joint5 + joint6", of a motor that turns with both.
-joint_offsets.csv     of a fit: joint, unit, ``add_to_reading`` (a joint whose controller reads q stands at q plus this),
-                      ``add_to_command`` (the same with the other sign, to send), sigma. Instead of the geometry, not
-                      beside it.
+joint_offsets.csv     of a fit: joint, unit, ``add_to_reading`` (a joint that the controller reads q of stands at q
+                      plus this), ``add_to_command`` (the same with the other sign, to send), sigma. They stand for
+                      the rest of the geometry, not beside it.
 joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
                       calibration / joints / name / position x y z [m], orientation x y z w.
 parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, what

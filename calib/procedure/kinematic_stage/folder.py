@@ -178,7 +178,8 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     table = tables.estimate_table(fit, outcome.selection.nominal.cell)
     files.write_table(folder / ESTIMATE, tables.HEADER, table.rows())
     folders.write_covariance(folder / COVARIANCE, table.names, table.covariance)
-    tables.write_residuals(outcome, folder / RESIDUALS)
+    rows, header = tables.residuals(outcome)
+    files.write_table(folder / RESIDUALS, header, rows)
     files.write_json(folder / METRICS, metrics(outcome))
 
 

@@ -119,8 +119,8 @@ COMPONENTS = {
 }
 
 
-def write_residuals(outcome: Outcome, path: Path) -> Path:
-    """Write the residual (measured minus predicted) of every row: fitted, held out or validation.
+def residuals(outcome: Outcome) -> tuple[list[list[object]], list[str]]:
+    """Return the residual (measured minus predicted) of every row: fitted, held out or validation; and the header.
 
     Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
     deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
@@ -136,7 +136,7 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
     joints = outcome.inputs.chain.joints
     header = ["set", "file", "row", "station", "tool", *(f"{joint.name} [{joint.unit}]" for joint in joints)]
     header += [name for names in COMPONENTS.values() for name in names]
-    return files.write_table(path, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier", *INTERVAL], rows)
+    return rows, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier", *INTERVAL]
 
 
 def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:

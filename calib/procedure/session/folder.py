@@ -10,9 +10,9 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
 4-fit/  5-validation/
 6-excitation/    training and validation: two motions for the robot to play, at the controller's rate; round2 …: further
                  ones, where tolerance_percent or sigma_percent asks for more than these brought
-7-recorded/      what people bring: the logs of them, training_log.csv (any name; .npz or a ROS bag, too), and files whose
-                 name starts with validation or round2 …; a file whose name holds a payload's label was recorded with it
-                 on board: `calib formats recordings`
+7-recorded/      what people bring: the logs of them, training_log.csv (any name; .npz or a ROS bag, too), and files
+                 whose name starts with validation or round2 …; a file whose name holds a payload's label was recorded
+                 with it on board: `calib formats recordings`
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
 8-masses/        the identification whose masses the fit's gravity torques are made of, where it has compliance
 9-export/        the calibrated robot in the forms other programs read; README.txt says which file is for whom

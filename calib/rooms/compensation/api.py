@@ -9,7 +9,7 @@ import numpy as np
 
 from calib import files
 from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Progress, progress_shown, saved
+from calib.api.rendering import Progress, Shown, progress_shown, saved
 from calib.arguments import checked
 from calib.data.poses.pose_lists import Targets, read_targets
 from calib.errors import CalibError
@@ -17,8 +17,10 @@ from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.rooms.compensation import joint_commands
 
 
-class JointCommands(joint_commands.Commands):
+class JointCommands(Shown, joint_commands.Commands):
     """Joint commands that move the real tool to nominal targets. ``print`` says what is reached and how well."""
+
+    tab = "q reached reason left before sigma expected beyond notes save"
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:

@@ -170,7 +170,7 @@ class ParallelFit(Judged):
 
     def to_dataframe(self) -> Any:
         """Return the estimate as a pandas DataFrame: name, unit, value, sigma."""
-        return data_frame(self._table(), list(HEADER))
+        return data_frame(self._table(), HEADER)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``metrics.json``."""

@@ -12,6 +12,7 @@ import pytest
 from sessions import begin, go_on
 from without_figures import run
 
+from calib.data.csv_table import read_table
 from calib.errors import NotConverged
 from calib.procedure.export import identified
 from calib.procedure.findings import PREDICTION_ONLY
