@@ -91,7 +91,7 @@ class PoseSelection(Drawn, selection.Chosen):
 
     def to_dataframe(self) -> Any:
         """Return the joint values as a pandas DataFrame, a row per pose."""
-        return data_frame(self.q.tolist(), list(self.chain.joint_names))
+        return data_frame(self.q.tolist(), [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints])
 
     def __repr__(self) -> str:
         return f"<PoseSelection: {len(self.q)} poses of {self.chain.name}>"

@@ -65,22 +65,22 @@ def as_text(renderables: Iterable[Any]) -> str:
     """Return rich renderables as plain text."""
     from rich.console import Console
 
-    console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None)
+    console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
     for each in renderables:
         console.print(each, soft_wrap=True)
     return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
 
 
 class Shown:
-    """A result that shows itself as by ``print`` where it is typed, and offers on Tab the members in `tab`."""
+    """A result that a notebook shows as ``print`` does, with the members in `tab` on Tab."""
 
     tab: ClassVar[str] = ""
 
     def __dir__(self) -> list[str]:
         return self.tab.split()
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        printer.text(str(self))
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+        return {"text/plain": str(self)}
 
 
 class Drawn(Shown, ABC):
@@ -137,8 +137,8 @@ class Judged(Shown, ABC):
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""
-        frame = '<iframe srcdoc="{}" style="width: 100%; height: 60em; border: 1px solid #ccc"></iframe>'
-        return {"text/plain": str(self), "text/html": frame.format(escape(self._repr_html_()))}
+        frame = '<iframe srcdoc="{}" style="width: 100%; height: 60em; border: 0"></iframe>'
+        return super()._repr_mimebundle_() | {"text/html": frame.format(escape(self._repr_html_()))}
 
 
 def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:

@@ -1,11 +1,14 @@
 """The Python API: few names, each documented; what it returns is what the commands write."""
 
+import csv
 import inspect
 import json
+import sys
 import tomllib
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import planted_motion as planted
@@ -220,6 +223,45 @@ def test_a_notebook_shows_the_page_and_a_verdict_equals_its_name(fitted, model):
     for result in (fitted, model):
         assert result.verdict == result.verdict.level and result.verdict != "other"
         assert result.verdict.reason[1:40] in unescape(result._repr_html_())
+        shown = result._repr_mimebundle_()
+        assert shown["text/plain"] == str(result) and shown["text/html"].startswith("<iframe")
+        assert unescape(shown["text/html"]).count("<html") == 1 and "<html" not in shown["text/html"]
+
+
+def test_in_a_notebook_results_print_as_text(fitted, model, monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    assert str(fitted).startswith(f"verdict: {fitted.verdict.level}") and "torque errors" in str(model)
+
+
+def test_one_figure_by_its_name(fitted, model):
+    assert fitted.plot("position")._repr_png_().startswith(b"\x89PNG")
+    with pytest.raises(UsageError, match=r"plot 'frictoin' is not one of torque_1.*did you mean 'friction'"):
+        model.plot("frictoin")
+
+
+def test_tab_offers_what_there_is_and_no_more(fitted, model):
+    assert "annotations" not in dir(calib) and "TYPE_CHECKING" not in dir(calib)
+    for result in (fitted, model):
+        wanted = [name for name in dir(result) if name != "residuals"]
+        assert {"verdict", "plot", "save", "robot"} <= set(wanted) and not [name for name in wanted if name[0] == "_"]
+        assert all(hasattr(result, name) for name in wanted)
+    assert all(hasattr(calib.ExcitationDesign, name) for name in ("sampled", "plot", "save", "to_dict"))
+
+
+def test_residuals_are_a_frame_where_pandas_is_there(fitted, model, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(UsageError, match=r"need pandas: pip install 'armature-calib\[pandas\]'"):
+        _ = fitted.residuals
+    frame = SimpleNamespace(DataFrame=lambda rows, columns: [columns, *rows])
+    monkeypatch.setitem(sys.modules, "pandas", frame)
+    with (fitted.save(tmp_path / "fit", plots=False) / "residuals.csv").open(newline="") as file:
+        head, first, *rows = csv.reader(file)
+    assert fitted.residuals[0] == head and len(fitted.residuals) == len(rows) + 2
+    assert [float(first[5]), float(first[11])] == pytest.approx([fitted.residuals[1][5], fitted.residuals[1][11]])
+    head, *rows = model.residuals
+    assert head[:3] == ["file", "t [s]", "joint1 [N m]"] and {row[0] for row in rows} == {"train.npz", "other.npz"}
+    last = model.inputs.unseen[0].target[-1] - model.predictions["other.npz"][-1]
+    np.testing.assert_array_equal(rows[-1][2:], last)
 
 
 def test_a_designed_motion_is_sampled_at_any_rate_without_interpolation(tmp_path):
@@ -227,10 +269,10 @@ def test_a_designed_motion_is_sampled_at_any_rate_without_interpolation(tmp_path
     design = calib.design_excitation("tx40", settings)
     t, q, v, a = design.sampled()
     written = (design.save(tmp_path / "m", plots=False) / "trajectory.csv").read_text().splitlines()
-    rows = np.genfromtxt([line for line in written if line[0] != "#"], delimiter=",", names=True)
-    assert np.allclose(rows["q_joint3_rad"], q[:, 2], atol=1e-9) and np.allclose(
-        rows["a_joint6_rads2"], a[:, 5], atol=1e-8
-    )
+    head, *rows = csv.reader(line for line in written if line[0] != "#")
+    assert (head[3], head[18]) == ("q_joint_3 [rad]", "a_joint_6 [rad/s^2]")
+    table = np.array(rows, dtype=float)
+    assert np.allclose(table[:, 3], q[:, 2], atol=1e-9) and np.allclose(table[:, 18], a[:, 5], atol=1e-8)
     fine = design.sampled(1000.0)
     assert all(np.allclose(one[::10], other, atol=1e-9) for one, other in zip(fine, (t, q, v, a)))
     assert np.allclose(np.gradient(fine[1], fine[0], axis=0)[1:-1], fine[2][1:-1], atol=1e-3)

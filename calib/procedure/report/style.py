@@ -63,6 +63,13 @@ def styled(quiet_titles: bool = False) -> Iterator[None]:
         yield
 
 
+class ShownFigure(Figure):
+    """A figure that a notebook shows without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        return png(self)
+
+
 def sheet(
     rows: int = 1, columns: int = 1, width: float = HALF_WIDTH, height: float = 2.5, head: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
@@ -73,7 +80,7 @@ def sheet(
         width, height: of the figure [in].
         head: what is kept free at the top for `legend` [in].
     """
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = ShownFigure(figsize=(width, height), layout="constrained")
     engine: Any = figure.get_layout_engine()
     engine.set(rect=(0.0, 0.0, 1.0, 1.0 - head / height), w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
