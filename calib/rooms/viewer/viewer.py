@@ -115,13 +115,14 @@ def about(scene: Scene) -> str:
     lines = [f"# {scene.title}"]
     for measured in scene.measured:
         sizes = [1e3 * np.linalg.norm(measured.seen - p, axis=1) for p in (measured.nominal, measured.calibrated)]
-        rms = [float(np.sqrt(np.mean(size**2))) for size in sizes]
+        for label, some in (("fitted", ~measured.unseen), ("unseen", measured.unseen)):
+            if some.any():
+                rms = [float(np.sqrt(np.mean(size[some] ** 2))) for size in sizes]
+                words = f"{rms[0]:.3f} mm rms nominal (orange), {rms[1]:.3f} mm calibrated (green)"
+                lines.append(f"{int(some.sum())} {label} poses: {words}")
         scale = measured.arrow_scale(scene.chain) if scene.chain else 1.0
-        lines.append(
-            f"{len(measured.q)} measured poses ({int(measured.unseen.sum())} of them unseen): {rms[0]:.3f} mm rms "
-            f"nominal (orange), {rms[1]:.3f} mm calibrated (green). **Arrows are {scale:g} times as long as the "
-            "errors**; from the target's position by the arm's model to the measured one."
-        )
+        words = "from the target's position by the arm's model to the measured one."
+        lines.append(f"**Arrows are {scale:g} times as long as the errors**; {words}")
     lines += [f"pose plan *{name}*: {len(q)} poses" for name, q in scene.chosen]
     lines += [f"motion *{one.name}*: {one.t[-1]:.1f} s" for one in scene.played]
     lines += [
@@ -308,7 +309,7 @@ def _blueprint(scene: Scene) -> Any:
     text = rrb.TextDocumentView(origin="about", name="what is shown")
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(picture, text, row_shares=[4, 1]), right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.TimePanel(timeline="time" if scene.chosen or scene.played or scene.torques else "pose", state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,

@@ -89,6 +89,7 @@ def test_a_fit_shows_every_pose_as_both_arms_see_it(fitted, tmp_path):
     scale = measured.arrow_scale(scene.chain)
     assert {f"/world/errors_times_{scale:g}/{arm}" for arm in ("nominal", "calibrated")} <= still
     assert f"{scale:g} times as long as the errors" in viewer.about(scene)
+    assert "45 fitted poses: " in viewer.about(scene) and "15 unseen poses: " in viewer.about(scene)
 
 
 def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
