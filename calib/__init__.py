@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
     from calib.procedure.session.commands import new_session
-    from calib.procedure.session.fleet import run_sessions
     from calib.robot.calibrated import CalibratedChain
     from calib.rooms.compensation.api import JointCommands, compensate
+    from calib.rooms.fleet.fleet import run_sessions
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
 _HOMES = {
@@ -43,7 +43,7 @@ _HOMES = {
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
     "api.exporting": ("validate", "export"),
     "procedure.session.commands": ("new_session",),
-    "procedure.session.fleet": ("run_sessions",),
+    "rooms.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
     "rooms.compensation.api": ("compensate", "JointCommands"),
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),

@@ -13,7 +13,8 @@ from sessions import edit
 from without_figures import run
 
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
-from calib.procedure.session import fleet, steps
+from calib.procedure.session import steps
+from calib.rooms.fleet import fleet
 from calib.workers import Workers
 
 

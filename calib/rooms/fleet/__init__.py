@@ -1,0 +1,3 @@
+"""Fleets: many sessions side by side, one folder per robot."""
+
+OFFERS = {"commands": "commands:app"}
