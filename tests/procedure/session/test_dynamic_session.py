@@ -12,6 +12,7 @@ import pytest
 from sessions import begin, copy_of, edit, go_on, kinds
 
 from calib import cli
+from calib.data.csv_table import read_header
 from calib.data.recordings.recording_files import read_recording
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
@@ -61,6 +62,25 @@ def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory
 
 
 waiting, recorded, whole = (copy_of(f"{name}_folder") for name in ("waiting", "recorded", "whole"))
+
+
+PLAIN = re.compile(  # columns that have no unit, or have it in a column of their own
+    r"name|set|file|row|station|tool|expression|unit|essential|rank|element|matters|parameter|parameters_moved|pose|"
+    r"corrected|basis|joint|order|q[xyzw]|weight|outlier|extrapolated|shift_sigma(_per_milli)?|relative_percent"
+)
+
+
+def test_no_column_of_a_session_lacks_its_unit(whole: Session) -> None:
+    """Joints above all: those of what is to be driven, of what was, of motions and of torques."""
+    seen = 0
+    for path in sorted(whole.folder.rglob("*.csv")):
+        names, units = read_header(path)
+        matrix = path.stem.endswith("covariance") or path.stem == "information"  # units of products
+        of_rows = {"unit", "armature_unit"} & set(names)  # a unit in each row
+        bare = [name for name, unit in zip(names, units) if not unit and not PLAIN.fullmatch(name)]
+        assert not bare or matrix or of_rows, f"{path}: {bare}"
+        seen += sum(unit in ("deg", "rad") for unit in units)
+    assert seen > 100 and not list(whole.folder.glob("*/validation.csv"))
 
 
 def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> None:
