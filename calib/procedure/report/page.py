@@ -205,7 +205,7 @@ def _rich_table(table: Table) -> RichTable:
     )  # fmt: skip
     numbers = set(table.numbers)
     for k, name in enumerate(table.header):
-        result.add_column(RichText(name), justify="right" if k in numbers else "left")
+        result.add_column(RichText(name), justify="right" if k in numbers else "left", overflow="fold")
     for number, row in enumerate(table.rows):
         if len(row) == 1 and len(table.header) > 1:
             result.add_section()
