@@ -137,8 +137,8 @@ class Judged(Shown, ABC):
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         """Return the page in a frame of its own, so that its style does not become the notebook's."""
-        frame = '<iframe srcdoc="{}" style="width: 100%; height: 60em; border: 0"></iframe>'
-        return super()._repr_mimebundle_() | {"text/html": frame.format(escape(self._repr_html_()))}
+        page, frame = self._repr_html_(), '<iframe srcdoc="{}" style="width: 100%; height: 60em; border: 0"></iframe>'
+        return super()._repr_mimebundle_() | ({"text/html": frame.format(escape(page))} if page else {})
 
 
 def data_frame(rows: Iterable[Any], columns: Sequence[str]) -> Any:

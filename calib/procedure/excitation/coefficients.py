@@ -45,7 +45,7 @@ from calib.data.schema import Joints
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, require
 from calib.folders import METRICS
-from calib.units import headings
+from calib.units import headings, motion_units
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
 from trajectories.fourier import evaluate
@@ -239,11 +239,11 @@ def lines(averaged: AveragedMotion) -> list[str]:
     """Return the lines that `calib recall` prints: periods, their agreement, noise of each joint."""
     found, averages = averaged.found, averaged.averages
     start = found.start / averaged.rate
-    unit = "N m" if averaged.kind == "torque" else "A"
+    place, unit = motion_units(averaged.motion.kinds)[0], "N m" if averaged.kind == "torque" else "A"
     result = [
         f"{found.periods} whole periods of {averaged.motion.period:g} s in {averaged.file}, from {start:.3f} s "
         f"on; each matches at least {min(found.likeness):.2%} of the motion",
-        f"{'joint':14} {'off command':>14} {'noise of q':>12} {f'noise of {unit}':>14} {'of the mean':>12}",
+        f"{'joint':14} {f'off by [{place}]':>14} {f'noise [{place}]':>12} {f'noise [{unit}]':>14} {'of the mean':>12}",
     ]
     noise, effort = np.sqrt(averages["q"].pooled), np.sqrt(averages["effort"].pooled)
     rows = zip(averaged.motion.joint_names, averaged.following, noise, effort)
