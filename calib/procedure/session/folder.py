@@ -112,7 +112,7 @@ class Session:
     plots: bool = True
 
     def path(self, name: str) -> Path:
-        """Return the path of a file, given by its name relative to the session's folder."""
+        """Return the path of a file, given by its name relative to the session's folder (`OLDER` in older ones)."""
         older = self.folder / OLDER.get(name, name)
         return older if older.exists() else self.folder / name
 
