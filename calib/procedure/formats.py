@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from calib.config import schema
-from calib.errors import UsageError
+from calib.errors import UsageError, one_of
 from calib.extensions import merged
 
 TOPICS: Mapping[str, tuple[str, str]] = {
@@ -73,8 +73,7 @@ def describe(topic: str) -> str:
     Raises:
         UsageError: for an unknown topic, with the known ones.
     """
-    if topic not in TOPICS:
-        raise UsageError(f"unknown format '{topic}'; the known formats are {', '.join(TOPICS)}")
+    one_of(topic, TOPICS, "format", UsageError)
     parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1].split()]
     if topic == "session":
         from calib.procedure.session.settings import example
