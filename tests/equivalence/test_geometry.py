@@ -165,7 +165,7 @@ def test_what_the_poses_promised_is_held_against_the_same_figures(fitted: Path, 
     session = open_session(shutil.copytree(fitted, tmp_path / "cell"))
     edit(session.path("session.toml"), "plan = false", "plan = true")
     cell, names = perturbed_cell(planted.arm(), seed=1, hidden=0.0), planted.arm().joint_names
-    for plan, name in (("poses", "measured"), ("validation", "validation")):
+    for plan, name in (("poses", "measured"), ("validation_poses", "validation")):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), names)
         write_measured(measure(cell, q, seed=2), session.path(f"3-measured/{name}.csv"))
     assert not go_on(session)

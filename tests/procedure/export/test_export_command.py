@@ -82,8 +82,9 @@ def test_offsets_are_what_a_controller_adds(cell, calib, fitted):
     chain, nominal = load(fitted), load("source.urdf")
     assert [row["joint"] for row in rows] == list(chain.joint_names)
     for row, k in zip(rows, chain.moving):
-        assert float(row["offset"]) == pytest.approx(chain.values[k] - nominal.values[k], abs=1e-12)
-    assert float(rows[0]["offset"]) == 0.0  # the first joint's offset cannot be told from the station
+        assert float(row["add_to_reading"]) == pytest.approx(chain.values[k] - nominal.values[k], abs=1e-12)
+        assert float(row["add_to_command"]) == -float(row["add_to_reading"])
+    assert float(rows[0]["add_to_reading"]) == 0.0  # the first joint's offset cannot be told from the station
 
 
 def test_offsets_beside_corrections_have_the_sigmas_of_the_geometry_without_them(tmp_path):

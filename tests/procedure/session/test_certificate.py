@@ -81,7 +81,7 @@ def test_what_was_noticed_on_arrival_stands_on_it(text: str, finished_folder: Pa
     assert all(line in text for line in lines) and any(re.match("drift.csv: .* measured again", line) for line in lines)
     noted = json.loads((finished_folder / "5-validation/metrics.json").read_text())["warnings"]
     assert noted and all(text.count(line) == 1 for line in noted), "nothing is noted twice"
-    assert all(f"{name}.csv: measured joint positions differ" in text for name in ("validation", "measured"))
+    assert all(f"{name}.csv: measured joint positions differ" in text for name in ("validation_measured", "measured"))
 
 
 def test_every_figure_is_in_the_page_and_says_what_it_shows(page: str) -> None:
