@@ -134,7 +134,7 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     titles = {"Torque errors", "Excitation", "Identified parameters", "Geometry", "What was exported"}
     assert all(words in page for words in titles | {"ZZ2R", "7-recorded/training_log.csv"})
     found = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
-    own = found["validation"]["validation_measured.csv"]
+    own = found["validation"]["validation_log.csv"]
     assert "<inertia " in whole.path("9-export/robot.urdf").read_text()
     assert own["evidence"] and whole.verdicts().level == "marginal"  # errors that no model holds remain
 
