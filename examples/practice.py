@@ -1,7 +1,8 @@
 """A robot cell to practise on: it writes the files that your instrument and your robot's controller would bring.
 
 Each function stands for an afternoon in the cell. The UR5's true geometry is a little off its nominal one, the TX40's
-true masses are; the examples never see that truth, only the files.
+true masses are; the examples never see that truth, only the files. From a shell, in place of an instrument or a
+controller: ``python examples/practice.py FUNCTION ARGUMENTS``, as the tutorials do.
 """
 
 import os
@@ -12,7 +13,14 @@ from pathlib import Path
 import numpy as np
 
 import calib
-from calib.rooms.cells import cell, demo, virtual_arm, virtual_cells
+from calib.data.poses.pose_lists import read_poses
+from calib.data.schema import Joints
+from calib.dynamics.bodies import bodies_of
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.pseudo_inertia import ball, from_standard, to_standard
+from calib.identification.prior import rods
+from calib.procedure.excitation import coefficients
+from calib.rooms.cells import camera_cell, cell, demo, virtual_arm, virtual_cells
 from calib.rooms.cells.cell import write_log, write_measured
 from calib.rooms.cells.known_robots import random_fourier
 
@@ -60,6 +68,70 @@ def record(path: str, motion: int) -> None:
     write_log(virtual_arm.record(arm, reference, motion), path)
 
 
+def tracker(plan: str, path: str, robot: str = "tx40") -> None:
+    """Measure planned poses with a laser tracker: joints [deg] and the reflector's position [mm], a row per pose."""
+    instrument = cell.SimulatedInstrument("laser tracker", position_sigma=15e-6, orientation_sigma=None)
+    arm = virtual_cells.virtual_cell(robot, 1, instrument)
+    q = read_poses(Path(plan), Joints.of(arm.nominal.joint_names))
+    write_measured(cell.measure(arm, q, seed=1), path)
+
+
+def photos(folder: str, count: str = "30") -> None:
+    """Take images of a board on the table with a camera in the hand of a UR5, and write its joints beside them."""
+    eye = camera_cell.seen_by_camera(ur5())
+    camera_cell.take_pictures(eye, camera_cell.views(eye, int(count), 1), Path(folder), seed=1)
+
+
+GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # of a UR10e [N m/A] (De Luca, in Mamedov & Mikhel 2020)
+TOOL = ball(2.8, 0.06, np.array([0.01, 0.02, 0.07]))  # the true tool: 2.8 kg, 7 cm before the flange
+
+
+def moving(robot: str, load: bool = False) -> virtual_arm.MovingArm:
+    """Return the moving arm of a robot, with or without the tool; the library's masses, or rods between the joints."""
+    place = virtual_cells.virtual_cell(robot, 0)
+    if place.nominal.inertias is None:
+        masses = rods(place.nominal, IdentificationModel(bodies_of(place.nominal), ()), total=30.0)
+        place = replace(place, nominal=replace(place.nominal, inertias=masses))
+    arm = virtual_arm.moving_arm(place, robot, 0)
+    if not load:
+        return arm
+    tail, values, last = np.asarray(arm.chain.tail), arm.plant.parameters.copy(), 10 * (arm.chain.n - 1)
+    values[last : last + 10] += to_standard(tail @ from_standard(TOOL) @ tail.T)
+    return replace(arm, plant=arm.plant.with_parameters(values))
+
+
+def log(path: str, robot: str, motion: str, what: str = "torque", load: str = "") -> None:
+    """Log a motion of a robot: a design's folder, played twice, or the number of a random one of 10 s at 500 Hz.
+
+    Args:
+        path: CSV to write: time [s], positions [deg], and
+        what: motor torques, torques of joint sensors (link) or motor currents.
+        load: "load": with the tool.
+    """
+    arm, seed = moving(robot, load == "load"), sum(map(ord, path))
+    if Path(motion).is_dir():
+        design = coefficients.read(Path(motion))
+        t = np.arange(round(design.period * design.rate) + 1) / design.rate
+        reference = virtual_arm.play(t, *design.orders(t), 2)
+    else:
+        speeds = 0.5 * np.array([joint.velocity for joint in arm.chain.joints])
+        limits = np.maximum(arm.chain.lower, -2.5), np.minimum(arm.chain.upper, 2.5)
+        reference = random_fourier(*limits, speeds, 10.0, 500.0, acceleration=15.0, seed=int(motion))
+    seen = virtual_arm.record(arm, reference, seed)
+    if what == "link":
+        seen = replace(seen, effort=seen.tau_link)
+    elif what == "current":
+        seen = replace(seen, effort=seen.effort / GAINS)
+    file = write_log(replace(seen, tau_link=None), path)
+    if what == "current":
+        head, rows = file.read_text().split("\n", 1)
+        file.write_text(head.replace("tau_", "current_").replace("[Nm]", "[A]") + "\n" + rows)
+
+
 def bring(session: str) -> None:
     """Simulate the files that a session waits for: measured poses, or logs of its motions."""
     demo.simulate_next(Path(session), print)
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](*sys.argv[2:])
