@@ -28,7 +28,8 @@ TOLERANCE = 0.05  # relative, of numbers that a page shows: other machines round
 COLUMNS = "100"
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _FENCE = re.compile(
-    r"(?:^<!-- data: (?P<data>\S+) -->\n)?^```(?P<kind>sh|python)\n(?P<code>.*?)^```\n(?:\n*```text\n(?P<shown>.*?)^```\n)?",
+    r"(?:^<!-- data: (?P<data>\S+) -->\n)?^```(?P<kind>sh|python)\n(?P<code>.*?)^```\n"
+    r"(?:\n*```text\n(?P<shown>.*?)^```\n)?",
     re.M | re.S,
 )
 

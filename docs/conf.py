@@ -3,6 +3,7 @@
 import sys
 from importlib.metadata import version as _version
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
@@ -21,3 +22,20 @@ html_math_renderer = "drawings"
 html_copy_source = html_show_sourcelink = False
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
+
+autodoc_default_options = {"member-order": "bysource"}
+autodoc_typehints = "signature"
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+suppress_warnings = ["ref.python"]  # errors that both poses and trajectories have
+
+
+def setup(app: Any) -> None:
+    """Write the reference before the pages are read, and lay docstrings out as they are in the source."""
+    import reference
+
+    def laid_out(app: Any, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+        lines[:] = reference.readable("\n".join(lines)).splitlines()
+
+    reference.write()
+    app.connect("autodoc-process-docstring", laid_out, priority=100)

@@ -8,8 +8,8 @@
     rigid = [0.0, 0.1627, ...]       # those of the best geometry without joint corrections, where there are any
     [deflection]                     # the joint corrections; formula in `calib.robot.calibrated`
     reference = [0.0, 0.1, ...]      # element values of the chain that levers are taken from (the nominal one)
-masses = [[0.1, ...], ...]       # XX .. M of its bodies, where these were identified: gravity torques are right, single
-                                 # parameters are not
+    masses = [[0.1, ...], ...]       # XX .. M of its bodies, where these were identified: gravity torques are right,
+                                     # single parameters are not
     [[deflection.term]]
     element = "q3.offset"            # the element it moves
     basis = "sin"                    # torque, lever, joint, cos, sin

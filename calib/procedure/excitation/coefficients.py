@@ -7,7 +7,7 @@
     period = 20.0                    # [s]
     rate = 1000.0                    # of the controller [Hz]
     repeat = 5                       # periods that were written to run
-limits = ["velocity limits: joint_1 1.92 rad/s (robot description)", ...]
+    limits = ["velocity limits: joint_1 1.92 rad/s (robot description)", ...]
     [[joint]]
     name = "joint_1"
     kind = "revolute"                # or prismatic
