@@ -55,16 +55,13 @@ def paragraphs(text: str) -> str:
 
 def commands() -> str:
     """Return the page of all commands, by their groups."""
-    tree = cli.command_tree()
     groups: dict[str, list[Any]] = {}
-    for one in tree.commands.values():
+    for one in cli.command_tree().commands.values():
         if not one.hidden:
-            groups.setdefault(str(getattr(one, "rich_help_panel", None) or "Commands"), []).append(one)
-    parts = ["# Commands", "`calib COMMAND --help` prints the same.", "", exit_codes()]
+            groups.setdefault(str(getattr(one, "rich_help_panel", None) or "All commands"), []).append(one)
+    parts = ["# Commands\n\n`calib COMMAND --help` prints the same.", exit_codes()]
     for group, members in groups.items():
-        if len(groups) > 1:
-            parts.append(f"## {group}")
-        parts += [_command(one) for one in members]
+        parts += [f"## {group}", *map(_command, members)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -143,8 +140,7 @@ def _names(part: str) -> str:
 def topic(name: str) -> str:
     """Return the page of a kind of file (reStructuredText, as the docstrings that document it are)."""
     words, modules = formats.TOPICS[name]
-    title = f"{name}: {words}"
-    parts = [f".. _format-{name}:", f"{title}\n{'=' * len(title)}", f"Printed by ``calib formats {name}``."]
+    parts = [f".. _format-{name}:", f"{name}\n{'=' * len(name)}", f"{_plain(words)} (``calib formats {name}``)"]
     parts += [readable(cleandoc(import_module(module).__doc__ or "")) for module in modules.split()]
     if name in COLUMNS:
         parts += ["Columns", "-------", COLUMNS[name]()]
@@ -153,6 +149,13 @@ def topic(name: str) -> str:
     if name in formats.SCHEMAS:
         parts += ["Keys", "----", f"``calib formats {name} --schema`` prints the JSON schema.", _keys(name)]
     return "\n\n".join(parts) + "\n"
+
+
+def file_list() -> str:
+    """Return the page that lists the kinds of files."""
+    rows = [(f"[{name}](format-{name}.rst)", cell(words)) for name, (words, _) in formats.TOPICS.items()]
+    tree = "\n".join(f"format-{name}" for name in formats.TOPICS)
+    return f"# Files\n\n{table(('Topic', 'What it is'), rows)}\n```{{toctree}}\n:hidden:\n\n{tree}\n```\n"
 
 
 def _indented(text: str) -> str:
@@ -219,10 +222,13 @@ def finding_list() -> str:
         "`calib explain CODE` prints one. A verdict is the worst level among the findings; `accept` in the options "
         "file makes a finding a note. Values in braces are filled in; a part in `<…>` is left out if it has no value."
     )
-    return (
-        "\n\n".join(["# Findings", intro, *(_finding(code_, one) for code_, one in findings.catalogue().items())])
-        + "\n"
-    )
+    parts = ["# Findings", intro]
+    for line in Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8").splitlines():
+        if found := re.match(r"# -+ \d+ (.+?) -+$", line):
+            parts.append(f"## {found[1]}")
+        elif found := re.match(r"\[([\w-]+)\]$", line):
+            parts.append(_finding(found[1], findings.catalogue()[found[1]]))
+    return "\n\n".join(parts) + "\n"
 
 
 def _finding(name: str, one: findings.Entry) -> str:
@@ -234,7 +240,7 @@ def _finding(name: str, one: findings.Entry) -> str:
         ("Do", cell(one.advice)),
         ("Accept", code(f'accept = ["{one.accept}"]') if one.accept else ""),
     ]
-    return f"(finding-{name})=\n## {name}\n\n" + table(("", ""), [row for row in rows if row[1]])
+    return f"(finding-{name})=\n### {name}\n\n" + table(("", ""), [row for row in rows if row[1]])
 
 
 def terms() -> str:
@@ -312,6 +318,7 @@ def write() -> None:
         "glossary.md": terms(),
         "methods.md": method_list(),
     }
+    pages["files.md"] = file_list()
     pages |= {f"format-{name}.rst": topic(name) for name in formats.TOPICS} | api()
     MADE.mkdir(parents=True, exist_ok=True)
     for old in set(MADE.iterdir()) - {MADE / name for name in pages}:
