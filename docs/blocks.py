@@ -9,7 +9,8 @@ project's folder (`examples` is there):
 
 A line of a ``text`` block holds if a printed line is the same word by word, and number by number within `TOLERANCE`.
 ``<!-- data: NAME -->`` before a block says that it reads the open recordings ``$D/NAME``, D being ``CALIB_DATA``
-(default ``../shared/data``): where they are absent the block is left out, and the page says so.
+(default ``../shared/data``): where they are absent the block is left out. ``<!-- slow -->`` says that it takes more
+than a few seconds: it is left out but with ``slow``.
 """
 
 import io
@@ -28,7 +29,7 @@ TOLERANCE = 0.05  # relative, of numbers that a page shows: other machines round
 COLUMNS = "100"
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _FENCE = re.compile(
-    r"(?:^<!-- data: (?P<data>\S+) -->\n)?^```(?P<kind>sh|python)\n(?P<code>.*?)^```\n"
+    r"(?:^<!-- (?P<mark>slow|data: \S+) -->\n)?^```(?P<kind>sh|python)\n(?P<code>.*?)^```\n"
     r"(?:\n*```text\n(?P<shown>.*?)^```\n)?",
     re.M | re.S,
 )
@@ -43,14 +44,21 @@ class Block:
         code: its text.
         line: of the page, from 1, where it begins.
         shown: what the page says that it prints, line by line.
-        data: folder of the open recordings that it reads, or "".
+        mark: ``slow``, ``data: NAME`` or "".
     """
 
     kind: str
     code: str
     line: int
     shown: list[str] = field(default_factory=list)
-    data: str = ""
+    mark: str = ""
+
+    def left_out(self, slow: bool) -> str:
+        """Return why the block does not run; "" where it does."""
+        place = DATA / self.mark.removeprefix("data: ")
+        if self.mark.startswith("data: ") and not place.is_dir():
+            return f"{place} is absent"
+        return "slow" if self.mark == "slow" and not slow else ""
 
 
 @dataclass
@@ -69,14 +77,14 @@ def read(text: str) -> list[Block]:
     return [
         Block(
             found["kind"], found["code"], text.count("\n", 0, found.start()) + 1,
-            (found["shown"] or "").splitlines(), found["data"] or "",
+            (found["shown"] or "").splitlines(), found["mark"] or "",
         )
         for found in _FENCE.finditer(text)
     ]  # fmt: skip
 
 
-def run(page: Path, folder: Path) -> Report:
-    """Run the blocks of a page in a new folder; a block that fails ends it."""
+def run(page: Path, folder: Path, slow: bool = False) -> Report:
+    """Run the blocks of a page in a new folder, slow ones if wanted; a block that fails ends it."""
     text, started = page.read_text(encoding="utf-8"), time.perf_counter()
     folder.mkdir(parents=True)
     (folder / "examples").symlink_to(ROOT / "examples")
@@ -84,8 +92,8 @@ def run(page: Path, folder: Path) -> Report:
     report = Report(page.stem, [], [], text, 0.0)
     for block in read(text):
         place = f"{page.name}, line {block.line}"
-        if block.data and not (DATA / block.data).is_dir():
-            report.remarks.append(f"{place}: left out, {DATA / block.data} is absent")
+        if why := block.left_out(slow):
+            report.remarks.append(f"{place}: left out, {why}")
             continue
         printed, error = _run(block, folder, names)
         if error:

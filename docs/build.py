@@ -1,9 +1,10 @@
 """Build the documentation: run the code of its pages, generate the reference, write the HTML.
 
-python docs/build.py [--html] [--record] [PAGE ...]
+python docs/build.py [--html] [--record] [--slow] [PAGE ...]
 
     PAGE       run these pages only, by their names; default: all
     --html     run no page: pictures are those of the last run
+    --slow     run slow blocks, too
     --record   write fresh numbers into pages whose commands print others than they show
 """
 
@@ -22,7 +23,7 @@ RUNS, HTML = HERE / "_build/runs", HERE / "_build/html"
 WORKERS = 2
 
 
-def run_pages(names: list[str], record: bool) -> bool:
+def run_pages(names: list[str], record: bool, slow: bool) -> bool:
     """Run pages, all by default; return whether all that they show holds."""
     pages = [page for page in sorted(HERE.glob("*/*.md")) if blocks.read(page.read_text(encoding="utf-8"))]
     known = {page.stem: page for page in pages}
@@ -33,7 +34,7 @@ def run_pages(names: list[str], record: bool) -> bool:
         shutil.rmtree(RUNS / name, ignore_errors=True)
     good = True
     with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
-        for report in pool.map(blocks.run, wanted.values(), [RUNS / name for name in wanted]):
+        for report in pool.map(blocks.run, wanted.values(), [RUNS / name for name in wanted], [slow] * len(wanted)):
             print(f"{report.page}: {report.seconds:.0f} s", *report.remarks, *report.complaints, sep="\n  ", flush=True)
             if record and report.fresh:
                 wanted[report.page].write_text(report.fresh, encoding="utf-8")
@@ -47,8 +48,9 @@ def main() -> None:
     read.add_argument("pages", nargs="*", metavar="PAGE")
     read.add_argument("--html", action="store_true")
     read.add_argument("--record", action="store_true")
+    read.add_argument("--slow", action="store_true")
     given = read.parse_args()
-    good = given.html or run_pages(given.pages, given.record)
+    good = given.html or run_pages(given.pages, given.record, given.slow)
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", HERE, HTML]
     good = subprocess.run(command).returncode == 0 and good
     print(f"{HTML / 'index.html'}" if good else "the documentation has errors")

@@ -18,11 +18,16 @@ from calib.data.schema import Joints
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball, from_standard, to_standard
+from calib.files import write_numbers
 from calib.identification.prior import rods
 from calib.procedure.excitation import coefficients
 from calib.rooms.cells import camera_cell, cell, demo, virtual_arm, virtual_cells
 from calib.rooms.cells.cell import write_log, write_measured
 from calib.rooms.cells.known_robots import random_fourier
+from calib.rooms.parallel.mechanism.closure import closed
+from calib.rooms.parallel.mechanism.geometric_fit import changed, loop_parameters
+from calib.rooms.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
+from calib.rooms.parallel.robots import find
 
 NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
 TAUGHT = NEAR + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))
@@ -126,6 +131,37 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
     if what == "current":
         head, rows = file.read_text().split("\n", 1)
         file.write_text(head.replace("tau_", "current_").replace("[Nm]", "[A]") + "\n" + rows)
+
+
+def platform(folder: str) -> None:
+    """Write a DualV's files: encoder readings with platform poses, logs without and with a payload of 5.37 kg.
+
+    The true legs are 1 mm and 1 mrad (1 sigma) off their nominal in the poses; the torques are the model's, with noise.
+    """
+    known, place, rng = find("dualv").known, Path(folder), np.random.default_rng(0)
+    motors = known.robot.joint_names
+    parameters = loop_parameters(known)
+    true = closed(changed(known.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
+    x = 0.9 * rng.uniform(known.robot.lower, known.robot.upper, (60, 3))
+    q = true.place(x).q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(60, 4))
+    head = [*(f"{name} [deg]" for name in motors), "x [mm]", "y [mm]", "rz [deg]"]
+    write_numbers(place / "measured.csv", head, np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])]))
+
+    model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["plate"])
+    values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
+    values[model.names.index("Mplate")] = 5.37
+    t, order = np.arange(1000) / 1000.0, 2 * np.pi * np.array([1.5, 2.5, 4.0, 5.5])[:, None, None]
+    for name, carried in (("empty", ()), ("load", ("plate",)), ("other", ("plate",))):
+        angle = order * t[:, None] + rng.uniform(0, 6, (4, 1, 3))
+        size = np.array([0.02, 0.02, 0.12])
+        plan = PlatformRegressor(model, np.arange(model.p), values, 10.0, carried)
+        motion = plan.motion(*((size * part).sum(axis=0) for part in (
+            np.sin(angle), order * np.cos(angle), -(order**2) * np.sin(angle)
+        )))  # fmt: skip
+        q = motion.posture.q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
+        tau = plan.torques(motion) + 0.5 * rng.normal(size=q.shape)
+        head = ["t [s]", *(f"{name}_q [deg]" for name in motors), *(f"{name}_tau [Nm]" for name in motors)]
+        write_numbers(place / f"{name}.csv", head, np.column_stack([t, np.degrees(q), tau]))
 
 
 def bring(session: str) -> None:
