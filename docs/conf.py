@@ -1,5 +1,6 @@
 """Sphinx's settings; `python docs/build.py` builds the pages."""
 
+import os
 import sys
 from importlib.metadata import version as _version
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
+os.environ["PYTHONPATH"] = os.pathsep.join(map(str, (HERE.parent, HERE.parent / "examples")))  # for the notebooks
 
 project = "armature-calib"
 author = "the calibration toolkit's founders"
@@ -29,6 +31,10 @@ autodoc_default_options = {"member-order": "bysource"}
 autodoc_typehints = "signature"
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_execution_timeout = 600
+nb_merge_streams = True
 suppress_warnings = ["ref.python"]  # errors that both poses and trajectories have
 
 

@@ -76,7 +76,7 @@ def record(path: str, motion: int) -> None:
 def tracker(plan: str, path: str, robot: str = "tx40") -> None:
     """Measure planned poses with a laser tracker: joints [deg] and the reflector's position [mm], a row per pose."""
     instrument = cell.SimulatedInstrument("laser tracker", position_sigma=15e-6, orientation_sigma=None)
-    arm = virtual_cells.virtual_cell(robot, 1, instrument)
+    arm = virtual_cells.virtual_cell(robot, 0, instrument)
     q = read_poses(Path(plan), Joints.of(arm.nominal.joint_names))
     write_measured(cell.measure(arm, q, seed=1), path)
 
