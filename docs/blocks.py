@@ -7,7 +7,8 @@ project's folder (`examples` is there):
     ```python              code; the blocks of a page share their names
     ```text                directly after one of these: lines that it printed, in their order; others may be left out
 
-A line of a ``text`` block holds if a printed line is the same word by word, and number by number within `TOLERANCE`.
+A line of a ``text`` block holds if a printed line is the same word by word, and number by number within `TOLERANCE`, or
+within what ``text within 30 %`` says: a search may end elsewhere where a processor rounds otherwise.
 ``<!-- data: NAME -->`` before a block says that it reads the open recordings ``$D/NAME``, D being ``CALIB_DATA``
 (default ``../shared/data``): where they are absent the block is left out. ``<!-- slow -->`` says that it takes more
 than a few seconds: it is left out but with ``slow``.
@@ -25,12 +26,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("CALIB_DATA", ROOT.parent / "shared/data")).resolve()
-TOLERANCE = 0.05  # relative, of numbers that a page shows: other machines round otherwise
+TOLERANCE = 0.05  # relative, of numbers that a page shows
 COLUMNS = "100"
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _FENCE = re.compile(
     r"(?:^<!-- (?P<mark>slow|data: \S+) -->\n)?^```(?P<kind>sh|python)\n(?P<code>.*?)^```\n"
-    r"(?:\n*```text\n(?P<shown>.*?)^```\n)?",
+    r"(?:\n*```text(?: within (?P<within>\d+) %)?\n(?P<shown>.*?)^```\n)?",
     re.M | re.S,
 )
 
@@ -45,6 +46,7 @@ class Block:
         line: of the page, from 1, where it begins.
         shown: what the page says that it prints, line by line.
         mark: ``slow``, ``data: NAME`` or "".
+        tolerance: relative, of its numbers.
     """
 
     kind: str
@@ -52,6 +54,7 @@ class Block:
     line: int
     shown: list[str] = field(default_factory=list)
     mark: str = ""
+    tolerance: float = TOLERANCE
 
     def left_out(self, slow: bool) -> str:
         """Return why the block does not run; "" where it does."""
@@ -78,6 +81,7 @@ def read(text: str) -> list[Block]:
         Block(
             found["kind"], found["code"], text.count("\n", 0, found.start()) + 1,
             (found["shown"] or "").splitlines(), found["mark"] or "",
+            float(found["within"]) / 100.0 if found["within"] else TOLERANCE,
         )
         for found in _FENCE.finditer(text)
     ]  # fmt: skip
@@ -99,7 +103,7 @@ def run(page: Path, folder: Path, slow: bool = False) -> Report:
         if error:
             report.complaints.append(f"{place}: {error}\n{printed}")
             break
-        fresh, wrong = compare(block.shown, printed.splitlines())
+        fresh, wrong = compare(block.shown, printed.splitlines(), block.tolerance)
         report.fresh = report.fresh.replace("\n".join(block.shown), "\n".join(fresh)) if block.shown else report.fresh
         if wrong:
             report.complaints.append(f"{place}: the page shows\n{wrong}\nbut it printed\n{printed}")
@@ -126,7 +130,7 @@ def _run(block: Block, folder: Path, names: dict[str, object]) -> tuple[str, str
     return done.stdout + done.stderr, f"exit code {done.returncode}" if done.returncode else ""
 
 
-def compare(shown: list[str], printed: list[str]) -> tuple[list[str], str]:
+def compare(shown: list[str], printed: list[str], tolerance: float = TOLERANCE) -> tuple[list[str], str]:
     """Return the lines that a page shows with fresh numbers, and those that no longer hold."""
     fresh, wrong, left = [], [], list(printed)
     for line in shown:
@@ -136,7 +140,7 @@ def compare(shown: list[str], printed: list[str]) -> tuple[list[str], str]:
             wrong += [line] if line.strip() not in ("", "…") else []
             continue
         left = left[left.index(match) + 1 :]
-        alike = all(_close(a, b) for a, b in zip(_NUMBER.findall(line), _NUMBER.findall(match)))
+        alike = all(_close(a, b, tolerance) for a, b in zip(_NUMBER.findall(line), _NUMBER.findall(match)))
         fresh.append(line if alike else match.rstrip())
         wrong += [] if alike else [line]
     return fresh, "\n".join(wrong)
@@ -146,6 +150,6 @@ def _words(line: str) -> list[str]:
     return _NUMBER.sub("#", line).split()
 
 
-def _close(a: str, b: str) -> bool:
+def _close(a: str, b: str, tolerance: float) -> bool:
     digit = 10.0 ** -len(a.partition("e")[0].partition(".")[2])
-    return abs(float(a) - float(b)) <= max(1.01 * digit, TOLERANCE * abs(float(b)))
+    return abs(float(a) - float(b)) <= max(1.01 * digit, tolerance * abs(float(b)))

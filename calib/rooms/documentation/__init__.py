@@ -1,0 +1,3 @@
+"""Command that opens the documentation built in a clone of the project."""
+
+OFFERS = {"commands": "commands:app"}
