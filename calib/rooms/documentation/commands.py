@@ -6,12 +6,12 @@ from pathlib import Path
 
 import typer
 
-import calib
 from calib.cli.shared import command, say
 from calib.errors import UsageError, require
 
 app = typer.Typer()
 
+CLONE = Path(__file__).parents[3]  # where the package is used from a clone
 PAGE = Path("docs/_build/html/index.html")
 ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.py --html; then calib docs again there"
 
@@ -20,9 +20,9 @@ ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.
 def docs() -> None:
     """Open the documentation, if it has been built here; otherwise say how to build it.
 
-    It is looked for in this folder, and beside the installed package.
+    It is looked for in this folder and, if calib runs from a clone of the project, in the clone.
     """
-    found = [place / PAGE for place in (Path.cwd(), Path(calib.__file__).parents[1]) if (place / PAGE).is_file()]
+    found = [place / PAGE for place in (Path.cwd(), CLONE) if (place / PAGE).is_file()]
     require(bool(found), f"the documentation has not been built here; {ADVICE}", UsageError)
     if sys.stdout.isatty():
         webbrowser.open(found[0].as_uri())
