@@ -22,7 +22,7 @@ writes one per validation recording.
 ``metrics.json``: errors by file under ``identification`` (training) and ``validation`` (``evidence`` false: it
 repeats the training). Each has ``raw`` (torque as recorded, full rate), ``filtered`` (both sides low-passed to the
 identification band f_p), ``moving`` and ``standing`` (raw, samples at which the joint is above or below ``slow``), with
-``relative_error_percent`` ``100 |tau - predicted| / |tau|`` in ``total`` and by ``joints`` (in the order of ``rows``) and
+``relative_error_percent`` 100 |tau - predicted| / |tau| in ``total`` and by ``joints`` (in the order of ``rows``) and
 ``rms`` [N m or N]; ``above_band_percent``: share of the torque above f_p (noise, ripple, elasticity), which no model in
 the band explains; ``whiteness`` of the residuals; ``motion_share``: part of the samples at which joints move; unseen
 ones have ``interval95``: share of the errors within the 95 % interval that the model states, of all rows and by joint,

@@ -13,7 +13,7 @@ app = typer.Typer()
 
 CLONE = Path(__file__).parents[3]  # where the package is used from a clone
 PAGE = Path("docs/_build/html/index.html")
-ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.py --html; then calib docs again there"
+ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.py"
 
 
 @command(app)
