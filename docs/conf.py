@@ -23,7 +23,7 @@ html_css_files = ["style.css"]
 html_math_renderer = "drawings"
 smartquotes = False  # two dashes are an option
 default_role = "literal"
-html_copy_source = html_show_sourcelink = False
+html_show_copyright = html_copy_source = html_show_sourcelink = False
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
 

@@ -143,11 +143,11 @@ def topic(name: str) -> str:
     parts = [f".. _format-{name}:", f"{name}\n{'=' * len(name)}", f"{_plain(words)} (``calib formats {name}``)"]
     parts += [readable(cleandoc(import_module(module).__doc__ or "")) for module in modules.split()]
     if name in COLUMNS:
-        parts += ["Columns", "-------", COLUMNS[name]()]
+        parts += ["Columns\n-------", COLUMNS[name]()]
     if name == "session":
         parts += ["session.toml, as ``calib new`` writes it::", _indented(example())]
     if name in formats.SCHEMAS:
-        parts += ["Keys", "----", f"``calib formats {name} --schema`` prints the JSON schema.", _keys(name)]
+        parts += ["Keys\n----", f"``calib formats {name} --schema`` prints the JSON schema.", _keys(name)]
     return "\n\n".join(parts) + "\n"
 
 
