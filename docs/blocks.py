@@ -19,7 +19,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -66,7 +65,7 @@ class Block:
 
 @dataclass
 class Report:
-    """What came of a page: complaints, remarks, its text with fresh numbers, and the seconds that it took."""
+    """What came of a page: complaints, remarks, its text with fresh numbers, and the processor seconds that it took."""
 
     page: str
     complaints: list[str]
@@ -89,7 +88,7 @@ def read(text: str) -> list[Block]:
 
 def run(page: Path, folder: Path, slow: bool = False) -> Report:
     """Run the blocks of a page in a new folder, slow ones if wanted; a block that fails ends it."""
-    text, started = page.read_text(encoding="utf-8"), time.perf_counter()
+    text, started = page.read_text(encoding="utf-8"), sum(os.times()[:4])
     folder.mkdir(parents=True)
     (folder / "examples").symlink_to(ROOT / "examples")
     names: dict[str, object] = {"__name__": "page"}
@@ -107,7 +106,7 @@ def run(page: Path, folder: Path, slow: bool = False) -> Report:
         report.fresh = report.fresh.replace("\n".join(block.shown), "\n".join(fresh)) if block.shown else report.fresh
         if wrong:
             report.complaints.append(f"{place}: the page shows\n{wrong}\nbut it printed\n{printed}")
-    report.seconds = time.perf_counter() - started
+    report.seconds = sum(os.times()[:4]) - started
     return report
 
 
@@ -122,7 +121,7 @@ def _run(block: Block, folder: Path, names: dict[str, object]) -> tuple[str, str
             return printed.getvalue(), f"{type(error).__name__}: {error}"
         return printed.getvalue(), ""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    places = {"PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": COLUMNS, "D": str(DATA)}
+    places = {"PATH": path, "COLUMNS": COLUMNS, "D": str(DATA)}
     command = ["bash", "-euo", "pipefail", "-c", block.code]
     done = subprocess.run(
         command, cwd=folder, env=os.environ | places, capture_output=True, text=True, stdin=subprocess.DEVNULL

@@ -35,7 +35,13 @@ def run_pages(names: list[str], record: bool, slow: bool) -> bool:
     good = True
     with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
         for report in pool.map(blocks.run, wanted.values(), [RUNS / name for name in wanted], [slow] * len(wanted)):
-            print(f"{report.page}: {report.seconds:.0f} s", *report.remarks, *report.complaints, sep="\n  ", flush=True)
+            print(
+                f"{report.page}: {report.seconds:.0f} s of processor time",
+                *report.remarks,
+                *report.complaints,
+                sep="\n  ",
+                flush=True,
+            )
             if record and report.fresh:
                 wanted[report.page].write_text(report.fresh, encoding="utf-8")
             good = good and not report.complaints
@@ -51,7 +57,7 @@ def main() -> None:
     read.add_argument("--slow", action="store_true")
     given = read.parse_args()
     good = given.html or run_pages(given.pages, given.record, given.slow)
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", HERE, HTML]
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", str(WORKERS), "-b", "html", HERE, HTML]
     good = subprocess.run(command).returncode == 0 and good
     print(f"{HTML / 'index.html'}" if good else "the documentation has errors")
     sys.exit(0 if good else 1)

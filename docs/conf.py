@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
-os.environ["PYTHONPATH"] = os.pathsep.join(map(str, (HERE.parent, HERE.parent / "examples")))  # for the notebooks
+sys.path.insert(0, str(HERE))
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(HERE.parent / "examples"), os.environ.get("PYTHONPATH", "")]
+)  # notebooks'
 
 project = "armature-calib"
 author = "the calibration toolkit's founders"
@@ -38,7 +40,7 @@ nb_merge_streams = True
 suppress_warnings = ["ref.python"]  # errors that both poses and trajectories have
 
 
-def setup(app: Any) -> None:
+def setup(app: Any) -> dict[str, bool]:
     """Write the reference before the pages are read, and lay docstrings out as they are in the source."""
     import reference
 
@@ -47,3 +49,4 @@ def setup(app: Any) -> None:
 
     reference.write()
     app.connect("autodoc-process-docstring", laid_out, priority=100)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
