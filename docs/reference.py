@@ -89,7 +89,7 @@ def exit_codes() -> str:
         [
             "(exit-codes)=\n## Exit codes",
             table(("Code", "Meaning"), [(number, cell(words)) for number, words in rows]),
-            "130: interrupted; no incomplete files are left.",
+            f"130: {cli.INTERRUPTED}.",
         ]
     )
 
@@ -178,14 +178,10 @@ def _plain(text: str) -> str:
 
 
 def _keys(name: str) -> str:
-    found = formats._schema(name)
-    rows = []
-    for line in formats._keys(found, found.get("$defs", {})):
-        key, _, rest = line.strip().partition(" ")
-        held, _, words = rest.strip().partition("; ")
-        default = re.match(r"default (.*?)(?:; |$)", words)
-        words = words[default.end() :] if default else words
-        rows.append((_literal(key), _plain(held), _literal(default[1] if default else ""), _plain(words)))
+    rows = [
+        (_literal(key), _plain(held), _literal(default), _plain(words))
+        for key, held, default, words in formats.keys(name)
+    ]
     return _rst_table(("Key", "Allowed", "Default", "Meaning"), rows)
 
 

@@ -80,10 +80,8 @@ def describe(topic: str) -> str:
 
         parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
     elif topic in SCHEMAS:
-        found = _schema(topic)
-        parts.append(
-            "\n".join(["Every key, its allowed values, and its default:\n", *_keys(found, found.get("$defs", {}))])
-        )
+        lines = ("; ".join(filter(None, (f"    {a:28} {b}", c and f"default {c}", d))) for a, b, c, d in keys(topic))
+        parts.append("\n".join(["Every key, its allowed values, and its default:\n", *lines]))
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
@@ -103,8 +101,13 @@ def _schema(topic: str) -> dict[str, Any]:
     return schema(getattr(import_module(module), name), f"{TOPICS[topic][0]} (armature-calib)")
 
 
-def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") -> Iterator[str]:
-    """Yield one line for each key of a JSON schema's table, nested tables included."""
+def keys(topic: str) -> Iterator[tuple[str, str, str, str]]:
+    """Yield place (``sigma.position``), allowed values, default and meaning of each key of a kind of TOML file."""
+    found = _schema(topic)
+    return _keys(found, found.get("$defs", {}))
+
+
+def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, str, str, str]]:
     for key, value in table.get("properties", {}).items():
         if key == "files":  # the same keys, for one file
             continue
@@ -113,9 +116,8 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], place: str = "") 
         if named:
             yield from _keys(named, tables, f"{place}{key}.")
             continue
-        default = f"; default {json.dumps(value['default'])}" if "default" in value else ""
-        words = f"; {value['description']}" if "description" in value else ""
-        yield f"    {place + key:28} {_held(value)}{default}{words}"
+        default = json.dumps(value["default"]) if "default" in value else ""
+        yield place + key, _held(value), default, value.get("description", "")
 
 
 def _held(value: Mapping[str, Any]) -> str:
@@ -129,9 +131,8 @@ def _held(value: Mapping[str, Any]) -> str:
     bounds = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
     said = [f"{word} {value[key]:g}" for key, word in bounds.items() if key in value]
     kinds = value.get("type", "value")
-    return " ".join(
-        [" or ".join(_KINDS.get(one, one) for one in ([kinds] if isinstance(kinds, str) else kinds)), *said]
-    )
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    return " ".join([" or ".join(_KINDS.get(one, one) for one in kinds), *said])
 
 
 def _plain(text: str) -> str:
