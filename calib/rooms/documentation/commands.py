@@ -18,7 +18,7 @@ ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.
 
 @command(app)
 def docs() -> None:
-    """Open the documentation, if it has been built here; otherwise say how to build it.
+    """Open the documentation, or say how to build it.
 
     It is looked for in this folder and, if calib runs from a clone of the project, in the clone.
     """
