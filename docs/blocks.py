@@ -23,7 +23,8 @@ from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
 DATA = Path(os.environ.get("CALIB_DATA", ROOT.parent / "shared/data")).resolve()
 TOLERANCE = 0.05  # relative, of numbers that a page shows
 COLUMNS = "100"
@@ -72,6 +73,11 @@ class Report:
     remarks: list[str]
     fresh: str
     seconds: float
+
+
+def pages() -> list[Path]:
+    """Return the documentation's own pages, without those that are generated."""
+    return sorted({*DOCS.glob("*.md"), *DOCS.glob("*/*.md")} - set(DOCS.glob("_build/*.md")))
 
 
 def read(text: str) -> list[Block]:

@@ -25,8 +25,7 @@ WORKERS = 2
 
 def run_pages(names: list[str], record: bool, slow: bool) -> bool:
     """Run pages, all by default; return whether all that they show holds."""
-    pages = [page for page in sorted(HERE.glob("*/*.md")) if blocks.read(page.read_text(encoding="utf-8"))]
-    known = {page.stem: page for page in pages}
+    known = {page.stem: page for page in blocks.pages() if blocks.read(page.read_text(encoding="utf-8"))}
     if unknown := set(names) - set(known):
         sys.exit(f"no page with code is called {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     wanted = {name: known[name] for name in names or known}

@@ -14,8 +14,7 @@ import pytest
 from calib import cli
 from calib.rooms.documentation import commands
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.parts and "made" not in path.parts]
+DOCS, PAGES = blocks.DOCS, blocks.pages()
 PAGE = """# A page
 
 ```sh
