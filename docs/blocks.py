@@ -5,7 +5,7 @@ project's folder (`examples` is there):
 
     ```sh                  commands of bash; the first one that fails ends the page
     ```python              code; the blocks of a page share their names
-    ```text                directly after one of these: lines that it printed, in their order; others may be left out
+    ```text                directly after one of these: lines that it printed; others may be left out
 
 A line of a ``text`` block holds if a printed line is the same word by word, and number by number within `TOLERANCE`, or
 within what ``text within 30 %`` says: a search may end elsewhere where a processor rounds otherwise.
@@ -144,7 +144,7 @@ def compare(shown: list[str], printed: list[str], tolerance: float = TOLERANCE) 
             fresh.append(line)
             wrong += [line] if line.strip() not in ("", "…") else []
             continue
-        left = left[left.index(match) + 1 :]
+        left.remove(match)
         alike = all(_close(a, b, tolerance) for a, b in zip(_NUMBER.findall(line), _NUMBER.findall(match)))
         fresh.append(line if alike else match.rstrip())
         wrong += [] if alike else [line]

@@ -114,9 +114,14 @@ def readable(docstring: str) -> str:
         if indented and not literal and k:
             parts[k - 1] = parts[k - 1].rstrip() + ("\n\n::" if not parts[k - 1].endswith(":") else ":")
         elif not indented:
-            parts[k] = _names(part).replace("|", "∣")  # a bar would begin a substitution
+            parts[k] = _names("``".join(_unmarked(text, n % 2) for n, text in enumerate(part.split("``"))))
         literal = indented or part.rstrip().endswith("::")
     return "\n\n".join(parts)
+
+
+def _unmarked(text: str, code: int) -> str:
+    """Return text whose bars and last underscores are no marks of reStructuredText; code as it is."""
+    return text if code else re.sub(r"(?<=\w)_(?!\w)", r"\\_", text.replace("|", "∣"))
 
 
 def _names(part: str) -> str:
