@@ -1,6 +1,6 @@
 """Equations as drawings (SVG), made by ziamath while the pages are built: no script, no font, no network.
 
-An equation with a command that ziamath does not know is a warning, with which the build fails.
+An equation with a command that ziamath does not know, or cannot draw, is a warning, with which the build fails.
 """
 
 from typing import Any
@@ -10,6 +10,7 @@ from docutils import nodes
 from sphinx.util import logging
 
 EM = 20.0  # units of a drawing per letter height of the text around it
+MAX_HEIGHT = 8.0  # letter heights; fences around some formulas come out many times as tall
 ziamath.config.svg2 = False  # every drawing with its own paths
 LOG = logging.getLogger(__name__)
 
@@ -20,6 +21,8 @@ def _drawing(node: Any, inline: bool) -> str:
     if "\\" in "".join(formula.mathml.itertext()):
         LOG.warning("equation with an unknown command: %s", node.astext(), location=node)
     svg = formula.svgxml()
+    if float(svg.get("height")) > MAX_HEIGHT * EM:
+        LOG.warning("equation came out too tall: %s", node.astext(), location=node)
     width, height = (float(svg.attrib.pop(side)) / EM for side in ("width", "height"))
     svg.set("style", f"width:{width:.3f}em;height:{height:.3f}em;vertical-align:{formula.getyofst() / EM:.3f}em")
     svg.set("role", "img")

@@ -55,10 +55,11 @@ def paragraphs(text: str) -> str:
 
 def commands() -> str:
     """Return the page of all commands, by their groups."""
-    groups: dict[str, list[Any]] = {}
-    for one in cli.command_tree().commands.values():
-        if not one.hidden:
-            groups.setdefault(str(getattr(one, "rich_help_panel", None) or "All commands"), []).append(one)
+    tree, groups = cli.command_tree(), dict[str, list[Any]]()
+    printed = tree.get_help(tree.context_class(tree, info_name="calib"))  # in the order of calib --help
+    for name in re.findall(r"^  (\w+)  ", printed, flags=re.M):
+        one = tree.commands[name]
+        groups.setdefault(str(one.rich_help_panel or "All commands"), []).append(one)
     parts = ["# Commands\n\n`calib COMMAND --help` prints the same.", exit_codes()]
     for group, members in groups.items():
         parts += [f"## {group}", *map(_command, members)]
