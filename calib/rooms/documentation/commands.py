@@ -16,11 +16,13 @@ PAGE = Path("docs/_build/html/index.html")
 ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.py"
 
 
-@command(app)
+@command(app, "Start")
 def docs() -> None:
     """Open the documentation, or say how to build it.
 
     It is looked for in this folder and, if calib runs from a clone of the project, in the clone.
+
+    Example: calib docs
     """
     found = [place / PAGE for place in (Path.cwd(), CLONE) if (place / PAGE).is_file()]
     require(bool(found), f"the documentation has not been built here; {ADVICE}", UsageError)
