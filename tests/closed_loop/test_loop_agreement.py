@@ -70,3 +70,10 @@ def test_estimates_that_bear_another_loop_come_with_a_note(name: str):
     assert found is None and "loop-gains-off" in [one.code for one in test.findings(taken=True)]
     assert test.found is not None
     np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
+
+
+def test_a_loop_that_explains_less_torque_than_the_model_is_named():
+    """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
+    _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")
+    (said,) = test.findings(taken=True)
+    assert said.code == "loop-unexplained" and [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]

@@ -146,11 +146,16 @@ class Instrumental:
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure[-len(away) :])  # rows of the motors
 
     @property
-    def explains(self) -> bool:
-        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
+    def unexplained(self) -> np.ndarray:
+        """Torque rows (from 0) that the simulated motion fits much worse than the measured motion does."""
         # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
         max_loop_error = 2.0
-        return not len(self.off) and bool(np.all(self.direct < max_loop_error * self.own))
+        return np.flatnonzero(self.direct >= max_loop_error * self.own)
+
+    @property
+    def explains(self) -> bool:
+        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
+        return not len(self.off) and not len(self.unexplained)
 
     @property
     def shift(self) -> np.ndarray:

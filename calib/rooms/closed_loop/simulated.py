@@ -142,7 +142,7 @@ class LoopTest:
         """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
-        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
+        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found) or _torques(self.found))]
         return noticed + (_blurred(self.found, self.loops) if taken else _biased(self.found))
 
 
@@ -179,6 +179,14 @@ def _gains(found: Instrumental) -> list[Finding]:
     """Return the finding on joints whose given gains differ from the gains in the recording."""
     joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
     return [finding("loop-gains-off", joints=joints)] if joints else []
+
+
+def _torques(found: Instrumental) -> list[Finding]:
+    """Return the finding on torque rows that the simulated motion does not explain, though the measured one does."""
+    case, direct, own = found.rows[0][0], found.direct, found.own
+    labels = case.torque_rows.numbered(case.motion.n)
+    rows = [f"{direct[k]:.3g} % for {own[k]:.3g} % at joint {labels[k]}" for k in found.unexplained]
+    return [finding("loop-unexplained", rows=rows)] if rows else []
 
 
 def _biased(found: Instrumental) -> list[Finding]:
