@@ -76,4 +76,5 @@ def test_a_loop_that_explains_less_torque_than_the_model_is_named():
     """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
     _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")
     (said,) = test.findings(taken=True)
-    assert said.code == "loop-unexplained" and [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]
+    assert said.code == "loop-unexplained"
+    assert [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]

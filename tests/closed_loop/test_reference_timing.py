@@ -49,8 +49,9 @@ def test_a_reference_is_moved_to_where_the_torques_say_it_was_played(shift):
 
 @pytest.mark.parametrize(
     ("how", "says"),
-    [({"shift": 2}, "late by 10"), ({"shift": -1}, "early by 4.9"), ({"copied": np.array}, "is the measured positions: "),
-     ({"copied": smoothed}, "is the measured positions: "), ({"copied": rounded}, "is the measured positions: "),
+    [({"shift": 2}, "late by 10"), ({"shift": -1}, "early by 4.9"),
+     ({"copied": np.array}, "is the measured positions: "), ({"copied": smoothed}, "is the measured positions: "),
+     ({"copied": rounded}, "is the measured positions: "),
      ({"copied": np.array, "shift": 2}, "measured positions, 10 ms later")],
 )  # fmt: skip
 def test_a_late_or_copied_reference_is_refused(how, says):

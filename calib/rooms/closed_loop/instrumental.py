@@ -167,6 +167,18 @@ class Instrumental:
         return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
 
     @property
+    def apart(self) -> np.ndarray:
+        """Distance of the constrained IV estimate from that by free instruments alone (p,), in σ of the free estimate.
+
+        Zero where nothing binds, and for didim; see `instrumental_variables.by_free_instruments`.
+        """
+        held, values = self.constrained, self.fit.estimate.values
+        if held is None or not len(held.normals) or not self.estimator.measured:
+            return np.zeros(len(values))
+        other = instrumental_variables.by_free_instruments(self.problem, self.std, values, held.normals)
+        return np.abs(other - values) / np.maximum(held.free.estimate.sigma, 1e-300)
+
+    @property
     def valid(self) -> bool:
         """Whether the instruments are valid: full rank, not weak, and the simulated robot follows the recorded one."""
         return not self.strength.weak and bool(np.all(self.distance < 10.0))

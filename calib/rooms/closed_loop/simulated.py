@@ -267,7 +267,12 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     notes = () if loops is None else loops.notes
     if found is None or loops is None:
         return LoopMetrics(test.failure, notes)
-    identified, strength = loops.identified, found.strength
+    identified, strength, apart = loops.identified, found.strength, found.apart
+    if apart.any():
+        notes += (
+            f"constrained: the slides' form, with the instruments of unbound parameters alone, is at most "
+            f"{apart.max():.2g} σ away, at {found.names[int(np.argmax(apart))]}",
+        )
     return LoopMetrics(
         "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
         strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
