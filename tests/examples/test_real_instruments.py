@@ -11,11 +11,10 @@ NEAR = 0.05  # relative: what another processor's rounding may change, beside th
 
 
 @pytest.fixture
-def script(monkeypatch, data):
+def script(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     import real_instruments
 
-    monkeypatch.setattr(real_instruments, "DATA", data)
     return real_instruments
 
 
@@ -34,7 +33,8 @@ def test_every_row_stands_in_the_document(script):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(7))
-def test_the_document_states_what_a_fresh_run_gives(script, number):
+def test_the_document_states_what_a_fresh_run_gives(script, number, data, monkeypatch):
+    monkeypatch.setattr(script, "DATA", data)
     told, fresh = cells(TABLE.strip().splitlines()[2 + number]), cells(script.study(script.ROWS[number]))
     assert told[0] == fresh[0]
     for one, other in zip(told, fresh, strict=True):

@@ -159,7 +159,11 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     refuse_data(
         motion.file,
         f"{name} deviates from its reference by {away:.2g} times its travel (rms); the reference "
-        + (f"is {size / spread:.3g} times as large" if alike else "is not correlated with it")
+        + (
+            f"is {size / spread:.3g} times as large, {np.mean(asked - q):.2g} rad (or m) above it on average"
+            if alike
+            else "is not correlated with it"
+        )
         + "; check that the reference belongs to this recording, has the same joints and starts at the same time",
     )
 
