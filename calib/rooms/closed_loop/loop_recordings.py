@@ -182,7 +182,8 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
         if estimated:
             raise UsageError(
                 f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
-                "use rows = 'both', or log the reference (q_ref)"
+                "use rows = 'both', or log the reference (q_ref); for iv alone [loop] timing = 'stated' will do, which "
+                "leaves it at the measured positions"
             )
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)
