@@ -255,7 +255,7 @@ def identify_instrumental(
     kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
     raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
-        f"iterations; estimate fewer (essential ones), or check the controller's gains{_weakness(task, found, std)}",
+        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, found, std)}",
         before,
     )
 
@@ -438,11 +438,11 @@ def _simulate_new(
                 task, found = further, replace(found, fit=fit, bound=held)
                 continue
         retreats += 1
-    words = f"neither the estimate nor smaller steps can be simulated: {problem}{_weakness(task, found, std)}"
+    words = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, found, std)}"
     raise CannotSimulate(words, task.plant(old, found))
 
 
-def _weakness(task: _Fixed, found: _Found, std: np.ndarray) -> str:
+def _if_weak(task: _Fixed, found: _Found, std: np.ndarray) -> str:
     """Return what weak instruments add to the message of a failure; "" for strong ones."""
     if not task.estimator.measured:
         return ""

@@ -270,7 +270,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     identified, strength, apart = loops.identified, found.strength, found.apart
     if apart.any():
         notes += (
-            f"constrained: the slides' form, with the instruments of unbound parameters alone, is at most "
+            f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
             f"{apart.max():.2g} σ away, at {found.names[int(np.argmax(apart))]}",
         )
     return LoopMetrics(

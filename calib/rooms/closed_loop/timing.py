@@ -147,16 +147,18 @@ def check_no_copy(motion: Motion, asked: np.ndarray) -> None:
     measured, reference = (CubicSpline(t, x[:, moves]) for x in (motion.q, asked))
     shift = _by_positions(reference, measured, rows)
     rest = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
-    exact = np.sqrt(np.mean(rest**2, axis=0)) < 1e-7 * measured(rows).std(axis=0)
+    share = 0.01  # of the positions' noise in the band; no commanded motion has that of the encoders
+    noise = (motion.cutoffs.noise * np.sqrt(2.0 * motion.cutoff / motion.rate))[moves]
+    exact = np.sqrt(np.mean(rest**2, axis=0)) < np.maximum(share * noise, 1e-7 * measured(rows).std(axis=0))
     shares = _noise_shares(motion, measured(rows), rest, np.flatnonzero(moves))
-    max_share = 0.1  # of the noise's power in the distance from a copy; from a commanded motion all of it (our choice)
+    max_share = 0.1  # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
     if exact.all() or (len(shares) and np.median(shares) < max_share):
         late = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
         refuse_data(
             motion.file,
-            f"its reference (q_ref) is the measured positions{late}: instruments from it hold the "
-            "noise that they are to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of "
-            "the designed motion (--excitation)",
+            f"its reference (q_ref) is the measured positions{late}: instruments from it hold the noise that they are "
+            "to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed motion "
+            "(--excitation)",
         )
 
 
