@@ -122,6 +122,7 @@ class Held:
         binding: constraints that are binding.
         tight: indices of the random postures in which M(q) is on its bound.
         free: the unconstrained estimate.
+        normals: (k, p) slopes of the binding constraints.
         findings: on binding constraints.
     """
 
@@ -129,6 +130,7 @@ class Held:
     binding: tuple[Binding, ...]
     tight: np.ndarray
     free: LinearFit
+    normals: np.ndarray
     findings: tuple[Finding, ...] = ()
 
     @property

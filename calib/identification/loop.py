@@ -26,7 +26,8 @@ Gains are what the joints feel, torque per position error on the joint side::
     reference = "recording"          # the column q_ref (q_des, q_cmd, …), or the session's designed motion (of the
                                      # command: --excitation FOLDER); or a file, see below
     timing = "checked"               # of the reference, by the motors' torques: checked: refused where it is late or
-                                     # early; estimated: moved; stated: as it is. A designed motion is always moved
+                                     # early; estimated: moved; stated: as it is. A designed motion is moved, too, or
+                                     # where stated left at the measured positions: late by the lag, which iv bears
     design = [1.2, 1.5]              # inertias for which the gains are stated [kg m²], if they follow the estimate
     inertia = [0.4, 0.5]             # of the robot the simulation starts from [kg m²]; default kd² / (2 kp)
     instruments = "iv"               # iv, or didim: the simulated motion alone

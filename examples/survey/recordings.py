@@ -3,7 +3,8 @@
     CALIB_DATA=… python examples/survey/recordings.py --out examples/survey/recordings
 
 A table that is there already is left as it is, so that a run that was stopped goes on. The recordings hold no
-reference, so that methods that simulate the closed loop do not run. What each one is: `examples/real_recordings.md`.
+reference, so that methods that simulate the closed loop do not run (with a fitted one: `examples/real_instruments.py`).
+What each one is: `examples/real_recordings.md`.
 """
 
 from __future__ import annotations

@@ -187,6 +187,7 @@ def judge(
         "estimated": len(first.names),
         "rounds": {name: [vars(one) for one in finite(result)] for name, result in results.items()},
         "verdict": verdict(first),
+        "constrained_forms_apart": float(results["PC-IV"].apart.max()),
     }
 
 

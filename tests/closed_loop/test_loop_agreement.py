@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from small_arm import LOOP, problem
 
+from calib.errors import UsageError
+from calib.identification.constraint_settings import ConstraintSettings, CurvedConstraint
 from calib.identification.methods.registry import METHODS
 from calib.procedure.dynamic_stage.plausibility import another_loop
 from calib.procedure.findings import level_of
@@ -70,3 +72,26 @@ def test_estimates_that_bear_another_loop_come_with_a_note(name: str):
     assert found is None and "loop-gains-off" in [one.code for one in test.findings(taken=True)]
     assert test.found is not None
     np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
+
+
+def test_a_loop_that_explains_less_torque_than_the_model_is_named():
+    """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
+    _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")
+    (said,) = test.findings(taken=True)
+    assert said.code == "loop-unexplained"
+    assert [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]
+
+
+def test_weak_instruments_are_named_beside_an_estimate_and_in_its_failure():
+    """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate cannot be simulated: 4.9."""
+    _, test = judged("iv", 1.5e-3, 0.05)
+    (said,) = test.findings(taken=True)
+    assert said.code == "weak-instruments" and 5.0 < said.values["donald"] < 10.0
+    failed = METHODS["iv"].estimate(problem(0, 2e-3, 0.05)).failure
+    assert "The instruments are weak (Cragg-Donald 4.9" in str(failed)
+
+
+def test_a_wrong_derivative_of_a_curved_constraint_is_refused_in_a_simulated_loop_too():
+    curved = CurvedConstraint(lambda Fv1, Fv2: 1.0 - Fv1 * Fv2, lambda Fv1, Fv2: (-Fv2, Fv1), "product")
+    with pytest.raises(UsageError, match=r"'product': its derivative by Fv2 is stated as .* differences of h give -"):
+        METHODS["pc-iv"].estimate(replace(problem(0, 1e-3, 0.05), constraints=ConstraintSettings(curved=(curved,))))

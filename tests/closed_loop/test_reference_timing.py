@@ -7,6 +7,7 @@ import pytest
 import small_arm
 
 from calib.data.recordings.recording import Recording
+from calib.data.signals.filtering import low_pass
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import MeasurementError
 from calib.identification.rows import make_case
@@ -14,11 +15,11 @@ from calib.rooms.closed_loop.loop_recordings import ClosedLoops, close_loops
 from calib.rooms.closed_loop.simulation import Sensing, simulate
 
 
-def closed(shift: int = 0, timing: str = "checked", copied: bool = False, **gains) -> ClosedLoops:
-    """Return the loops of a log whose reference comes `shift` samples of 5 ms late, or is a copy of the positions."""
+def closed(shift: int = 0, timing: str = "checked", copied=None, **gains) -> ClosedLoops:
+    """Return the loops of a log whose reference comes `shift` samples of 5 ms late, or is `copied` of the positions."""
     plant, model, _ = small_arm.robot()
     run = simulate(plant, small_arm.PD, small_arm.motion(), Sensing(2e-5, sigma_tau=0.05, every=3.5), 1)
-    asked = run.measured if copied else small_arm.motion().at(np.arange(len(run.t)) * 3.5)[0]
+    asked = copied(run.measured) if copied else small_arm.motion().at(np.arange(len(run.t)) * 3.5)[0]
     rows = slice(10, -10)
     late = Recording(
         run.t[rows], run.measured[rows], run.tau[rows], "torque", ("joint1", "joint2"),
@@ -26,6 +27,14 @@ def closed(shift: int = 0, timing: str = "checked", copied: bool = False, **gain
     )  # fmt: skip
     case = make_case("log", make_motion(late, FilterOptions(cutoff=40.0, band=20.0, clock="stamps")))
     return close_loops(model.bodies, [case], case.motion.decimator, replace(small_arm.LOOP, timing=timing, **gains))
+
+
+def smoothed(q: np.ndarray) -> np.ndarray:
+    return low_pass(q, 200.0, 25.0)
+
+
+def rounded(q: np.ndarray) -> np.ndarray:
+    return np.round(q, 5)
 
 
 @pytest.mark.parametrize("shift", [3, -2])
@@ -40,8 +49,10 @@ def test_a_reference_is_moved_to_where_the_torques_say_it_was_played(shift):
 
 @pytest.mark.parametrize(
     ("how", "says"),
-    [({"shift": 2}, "late by 10"), ({"shift": -1}, "early by 4.9"), ({"copied": True}, "is the measured positions, to"),
-     ({"copied": True, "shift": 2}, "measured positions, 10 ms later")],
+    [({"shift": 2}, "late by 10"), ({"shift": -1}, "early by 4.9"),
+     ({"copied": np.array}, "is the measured positions: "), ({"copied": smoothed}, "is the measured positions: "),
+     ({"copied": rounded}, "is the measured positions: "),
+     ({"copied": np.array, "shift": 2}, "measured positions, 10 ms later")],
 )  # fmt: skip
 def test_a_late_or_copied_reference_is_refused(how, says):
     with pytest.raises(MeasurementError, match=says):

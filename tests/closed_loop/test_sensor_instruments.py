@@ -66,13 +66,20 @@ def log(rows, seed: int = 0):
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [BOTH, LINK])
 def test_instruments_are_right_with_sensors_where_least_squares_is_biased(rows):
-    """Measured, seed 0: least squares is up to 17 of its sigmas off (19 of 92 parameters beyond 5), IV 2.7."""
+    """Measured over seeds 0 to 7: where least squares is beyond 5 of its σ, IV is within 1.4 of its own.
+
+    These are 15 to 20 of 92 parameters (up to 17 σ off), of link rows alone 7 to 12 of 64; IV errs there by 1 to 3 %
+    (median) of what least squares does. Its σ are cautious, some 15 times the scatter over these seeds: they take the
+    residuals for white, which hold accelerations' noise, least where the motion's power is. Against that scatter some
+    bias is left with both rows (up to 18 times it, 0.4 σ), with link rows none (1.7 times).
+    """
     (model, base, truth), case, (_, controller, reference) = model_of(rows), log(rows), arm()
     found = identify_instrumental(model, base, [(case, Loop(controller, reference))], case.motion.decimator)
-    ordinary, instrumental = (
-        np.abs(one.values - truth) / one.sigma for one in (found.ordinary.estimate, found.fit.estimate)
-    )
-    assert (ordinary > 5.0).sum() >= 8 and ordinary.max() > 10.0
+    errors = [np.abs(one.values - truth) for one in (found.ordinary.estimate, found.fit.estimate)]
+    ordinary, instrumental = errors[0] / found.ordinary.estimate.sigma, errors[1] / found.fit.estimate.sigma
+    biased = ordinary > 5.0
+    assert biased.sum() >= 8 and ordinary.max() > 10.0
+    assert instrumental[biased].max() < 2.0 and np.median(errors[1][biased] / errors[0][biased]) < 0.05
     assert (instrumental < 2.0).mean() > 0.95 and instrumental.max() < 4.0
     assert found.valid and found.explains and found.verdict.biased() and not len(found.off)
 

@@ -88,7 +88,7 @@ def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) 
         return covariance
     p = len(covariance)
     norms = np.linalg.norm(factor[:p, :p], axis=0)
-    free = _null_space(normals / norms)
+    free = null_space(normals / norms)
     if not free.shape[1]:
         return np.zeros((p, p))
     upper = factor[:p, :p] / norms
@@ -96,7 +96,7 @@ def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) 
     return np.asarray(shrink @ covariance @ shrink.T)
 
 
-def _null_space(rows: np.ndarray) -> np.ndarray:
+def null_space(rows: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis (p, p - rank) of the null space of rows; exact zeros for fixed parameters."""
     size = np.linalg.norm(rows, axis=1)
     rows = rows[size > 0.0] / size[size > 0.0, None]

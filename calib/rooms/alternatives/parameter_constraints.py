@@ -249,7 +249,7 @@ def _binding(constraints: Constraints, found: Constrained, free: LinearFit) -> H
         ))  # fmt: skip
     tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
-    return Held(constraints.names, tuple(binding), tight, free, findings)
+    return Held(constraints.names, tuple(binding), tight, free, found.normals[found.binding], findings)
 
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:

@@ -146,11 +146,16 @@ class Instrumental:
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure[-len(away) :])  # rows of the motors
 
     @property
-    def explains(self) -> bool:
-        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
+    def unexplained(self) -> np.ndarray:
+        """Torque rows (from 0) that the simulated motion fits much worse than the measured motion does."""
         # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
         max_loop_error = 2.0
-        return not len(self.off) and bool(np.all(self.direct < max_loop_error * self.own))
+        return np.flatnonzero(self.direct >= max_loop_error * self.own)
+
+    @property
+    def explains(self) -> bool:
+        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
+        return not len(self.off) and not len(self.unexplained)
 
     @property
     def shift(self) -> np.ndarray:
@@ -160,6 +165,18 @@ class Instrumental:
         """
         estimate = self.fit.estimate
         return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
+
+    @property
+    def apart(self) -> np.ndarray:
+        """Distance of the constrained IV estimate from that by free instruments alone (p,), in σ of the free estimate.
+
+        Zero where nothing binds, and for didim; see `instrumental_variables.by_free_instruments`.
+        """
+        held, values = self.constrained, self.fit.estimate.values
+        if held is None or not len(held.normals) or not self.estimator.measured:
+            return np.zeros(len(values))
+        other = instrumental_variables.by_free_instruments(self.problem, self.std, values, held.normals)
+        return np.abs(other - values) / np.maximum(held.free.estimate.sigma, 1e-300)
 
     @property
     def valid(self) -> bool:
@@ -238,7 +255,7 @@ def identify_instrumental(
     kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
     raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
-        "iterations; estimate fewer (essential ones), or check the controller's gains",
+        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, found, std)}",
         before,
     )
 
@@ -421,7 +438,17 @@ def _simulate_new(
                 task, found = further, replace(found, fit=fit, bound=held)
                 continue
         retreats += 1
-    raise CannotSimulate(f"neither the estimate nor smaller steps can be simulated: {problem}", task.plant(old, found))
+    words = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, found, std)}"
+    raise CannotSimulate(words, task.plant(old, found))
+
+
+def _if_weak(task: _Fixed, found: _Found, std: np.ndarray) -> str:
+    """Return what weak instruments add to the message of a failure; "" for strong ones."""
+    if not task.estimator.measured:
+        return ""
+    strength = instrumental_variables.strength(found.problem, std)
+    words = f". The instruments are weak (Cragg-Donald {strength.cragg_donald:.2g}, sound above 10)"
+    return f"{words}: record faster motion, or positions with less noise" if strength.weak else ""
 
 
 def _stack(

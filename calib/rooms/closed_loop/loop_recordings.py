@@ -159,7 +159,11 @@ def _compare(motion: Motion, asked: np.ndarray, joint: int, max_difference: floa
     refuse_data(
         motion.file,
         f"{name} deviates from its reference by {away:.2g} times its travel (rms); the reference "
-        + (f"is {size / spread:.3g} times as large" if alike else "is not correlated with it")
+        + (
+            f"is {size / spread:.3g} times as large, {np.mean(asked - q):.2g} rad (or m) above it on average"
+            if alike
+            else "is not correlated with it"
+        )
         + "; check that the reference belongs to this recording, has the same joints and starts at the same time",
     )
 
@@ -178,7 +182,8 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller
         if estimated:
             raise UsageError(
                 f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
-                "use rows = 'both', or log the reference (q_ref)"
+                "use rows = 'both', or log the reference (q_ref); for iv alone [loop] timing = 'stated' will do, which "
+                "leaves it at the measured positions"
             )
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)

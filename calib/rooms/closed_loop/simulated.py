@@ -142,7 +142,7 @@ class LoopTest:
         """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
-        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
+        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found) or _torques(self.found))]
         return noticed + (_blurred(self.found, self.loops) if taken else _biased(self.found))
 
 
@@ -179,6 +179,14 @@ def _gains(found: Instrumental) -> list[Finding]:
     """Return the finding on joints whose given gains differ from the gains in the recording."""
     joints = [f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off]
     return [finding("loop-gains-off", joints=joints)] if joints else []
+
+
+def _torques(found: Instrumental) -> list[Finding]:
+    """Return the finding on torque rows that the simulated motion does not explain, though the measured one does."""
+    case, direct, own = found.rows[0][0], found.direct, found.own
+    labels = case.torque_rows.numbered(case.motion.n)
+    rows = [f"{direct[k]:.3g} % for {own[k]:.3g} % at joint {labels[k]}" for k in found.unexplained]
+    return [finding("loop-unexplained", rows=rows)] if rows else []
 
 
 def _biased(found: Instrumental) -> list[Finding]:
@@ -259,7 +267,12 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     notes = () if loops is None else loops.notes
     if found is None or loops is None:
         return LoopMetrics(test.failure, notes)
-    identified, strength = loops.identified, found.strength
+    identified, strength, apart = loops.identified, found.strength, found.apart
+    if apart.any():
+        notes += (
+            f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
+            f"{apart.max():.2g} σ away, at {found.names[int(np.argmax(apart))]}",
+        )
     return LoopMetrics(
         "", notes, found.estimator.name, beside, len(found.rounds), found.verdict, float(found.shift.max()),
         strength.cragg_donald, strength.weak, float(strength.partial_r2.min()), found.distance, found.direct,
