@@ -93,9 +93,7 @@ def identify_parallel(
     inputs = gather(robot, recordings, validate, options=options, seed=seed, progress=progress)
     if on_read is not None:
         on_read(inputs)
-    model = make_parallel_model(
-        known, settings.sets, per_joint(settings.v0, 1, "v0")[0], rows, tuple(settings.payloads), settings.passive
-    )
+    model = model_of(known, settings)
     found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
     noticed = [*_payloads(model, found, inputs.cases)]
     if known.robot.redundant:
@@ -111,6 +109,13 @@ def identify_parallel(
     return ParallelDynamics(
         **vars(judged), inputs=inputs, found=found, findings=findings, carried=carried, seed=settings.seed
     )
+
+
+def model_of(known: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
+    """Return the model of a robot that the settings ask for, with their torque rows."""
+    v0 = per_joint(settings.v0, 1, "v0")[0]
+    payloads = tuple(settings.payloads)
+    return make_parallel_model(known, settings.sets, v0, settings.torque_rows, payloads, settings.passive)
 
 
 def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
@@ -166,7 +171,7 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     """Raise an error for settings and options that apply to serial arms only."""
     read = {each.name for each in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
-    read = {each.name for each in fields(options)} - {"gain_pair", "cut_slow"}
+    read = {each.name for each in fields(options)} - {"cut_slow"}
     refuse_unread(options, IdentifyOptions(), read, options.source)
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
