@@ -90,7 +90,7 @@ def drive_gains(
     squares, folds = noise * np.mean(squares, axis=0), max(settings.folds, 2 * len(cases))
     data = triangulate(with_blocks(rows, folds))
     found, again = _total_least_squares(data, squares, rows), []
-    blocks = [k for k, used in enumerate(data.rows.reshape(-1, len(squares)).any(axis=1)) if used]
+    blocks = np.flatnonzero(data.rows.reshape(-1, len(squares)).any(axis=1)).tolist()
     for left in blocks:
         with suppress(NotConverged, Unidentifiable):  # without the only run that carries the payload
             again.append(_total_least_squares(data, squares, rows, [k for k in blocks if k != left]).gains)
