@@ -16,6 +16,7 @@ import json
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,8 @@ def designed(seed: int) -> ParallelExcitation:
     robot = Robot()
     settings = ExcitationSettings(period=0.5, harmonics=5, starts=1, evaluations=MOST, seed=seed, rate=RATE)
     limits = np.array([ACCELERATION, ACCELERATION, np.inf])
-    return design_parallel(find("dualv"), robot.model, robot.values, settings, acceleration=limits, preload=PRELOAD)
+    loaded = replace(robot.model, preload=(PRELOAD,))
+    return design_parallel(find("dualv"), loaded, robot.values, settings, acceleration=limits)
 
 
 class Robot:

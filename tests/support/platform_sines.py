@@ -1,6 +1,7 @@
 """Motions of a platform for the tests of parallel robots, and what encoders and motors show of them."""
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,7 +41,8 @@ def recorded(
     model, own = truth(known)
     rng, t = np.random.default_rng(seed), np.arange(samples) / 1000.0
     x, v, a = sines(t, (1.5, 2.5, 4.0, 5.5), 0.04 * (known.robot.upper - known.robot.lower), rng)
-    plan = PlatformRegressor(model, np.arange(model.p), own if values is None else values, preload, carried)
+    model = replace(model, preload=(preload,) * (known.robot.n - known.robot.r))
+    plan = PlatformRegressor(model, np.arange(model.p), own if values is None else values, carried)
     motion = plan.motion(x, v, a)
     q = motion.posture.q[:, known.robot.actuated] + encoder * rng.normal(size=(samples, known.robot.n))
     effort = (plan.torques(motion) + noise * rng.normal(size=q.shape)) / gains

@@ -11,6 +11,7 @@ from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, UsageError, finding
+from calib.estimation.whiteness import inflation
 from calib.identification.friction.passivity import MIN_ENERGY_SHARE
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
@@ -36,6 +37,7 @@ from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.geometry_share import propagate
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
+from calib.rooms.parallel.mechanism.velocities import loop_jacobians, overconstraint
 from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
@@ -98,6 +100,10 @@ def identify_parallel(
     noticed = [*_payloads(model, found, inputs.cases)]
     if known.robot.redundant:
         noticed.append(finding("torques-projected", actuators=known.robot.n, freedoms=known.robot.r))
+        preloads = [_preload(known, inputs, case) for case in inputs.cases]
+        noticed += [one for own in preloads for one in own]
+        mean = np.mean([[one.values["mean"] for one in own] for own in preloads], axis=0)
+        found = replace(found, dynamics=replace(found.dynamics, model=replace(model, preload=tuple(mean.tolist()))))
     noticed = (*parameter_findings(found), *settle(noticed))
     findings = ModelFindings(resting_parameters(found), noticed=noticed)
     judged = assess(inputs, found, findings)
@@ -122,6 +128,21 @@ def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
     """Return the torques (N, n) of the actuators in a recording [N m or N; A where no gain is known]."""
     gains = inputs.currents.for_motion(case.motion, inputs.options.file_settings(case.motion.file))
     return np.asarray(case.motion.effort if gains is None else case.motion.effort * gains)
+
+
+def _preload(known: ClosedRobot, inputs: IdentificationInputs, case: Case) -> list[Finding]:
+    """Return findings on the overconstraint of redundant actuators in a recording: mean with sigma, and spread."""
+    jacobians = loop_jacobians(known, known.locate(case.motion.q))
+    own = overconstraint(known, jacobians, actuator_torques(inputs, case))
+    own = case.motion.in_band(own)[:: case.motion.decimator.factor]
+    unit = "N" if known.robot.joints[0].kind == "prismatic" else "N m"
+    return [
+        finding(
+            "preload", file=case.name, number=k, mean=x.mean(), spread=x.std(), unit=unit,
+            sigma=x.std() * np.sqrt(inflation(x) / len(x)),
+        )
+        for k, x in enumerate(own.T, 1)
+    ]  # fmt: skip
 
 
 def assess(inputs: IdentificationInputs, found: Identification[RegressorModel], findings: ModelFindings) -> Assessment:

@@ -118,6 +118,7 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
             robot.known, [texts[j] for j in tree.actuated], v0=float(table.get("v0", V0)),
             payloads=[str(label) for label in table.get("payloads", ())], passive=passive,
         )  # fmt: skip
+        model = replace(model, preload=tuple(map(float, table.get("preload", ()))))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RobotError(
             f"{path} contains no model of a parallel robot ({error!r}); give a folder of calib identify"
@@ -229,11 +230,11 @@ def _inverse(information: np.ndarray) -> np.ndarray:
     return np.linalg.inv(information * unit * unit[:, None]) * unit * unit[:, None]
 
 
-def whole(model: ParallelModel, values: np.ndarray, preload: float) -> Purpose:
+def whole(model: ParallelModel, values: np.ndarray) -> Purpose:
     """Return the purpose of all base parameters, rows in units of what equal noise of all torques makes of them."""
     known = model.known
     base = bases.find(ParallelModel(known, model.terms, rows_named(known), ()))
     columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
-    plan: Any = PlatformRegressor(model, columns, values, preload)
+    plan: Any = PlatformRegressor(model, columns, values)
     sigmas = np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
     return Purpose(ExcitedModel(plan, plan, None, None, False), IdentifiableColumns(None, sigmas, base.names))

@@ -71,6 +71,7 @@ class ParallelMechanism:
         model = dynamics.model
         return {
             "robot": ROBOT, "kind": model.torque_rows.name, "unit": unit, "payloads": list(model.payloads),
+            "preload": model.preload,
             "v0": next((one.settings[0] for one in model.terms if one.shape == "sign"), V0),
             "values": dict(zip(model.names, map(float, dynamics.values))),
             "base": dict(zip(base.names, expressions(base))), "regrouping": regrouping(base),

@@ -98,12 +98,14 @@ class ParallelModel:
         terms: the drives' terms; their joints are those of the tree.
         torque_rows: ``platform``, ``motor`` or ``power`` rows (`rows_named`).
         payloads: labels of bodies that the platform may carry.
+        preload: (n - r,) mean overconstraint of redundant actuators (`velocities.overconstraint`) [N m or N]; (): 0.
     """
 
     known: ClosedRobot
     terms: tuple[DriveTerm, ...]
     torque_rows: TorqueRows
     payloads: tuple[str, ...] = ()
+    preload: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if doubled := sorted({name for name in self.names if self.names.count(name) > 1}):
@@ -210,6 +212,13 @@ class ParallelModel:
         fixed = self.platform_parameters(values, carried)
         wrench = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity) @ fixed
         return np.einsum("ntr,nt->nr", J.joints, tree) + np.einsum("nkr,nk->nr", J.platform, wrench)
+
+    def actuator_torques(
+        self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
+    ) -> np.ndarray:
+        """Return the torques (N, n) of the actuators for parameters (p,): of redundant ones with the preload."""
+        forces = self.platform_force(values, motion, carried)
+        return distributed(self.known, motion.jacobians, forces, np.array(self.preload or [0.0]))
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
         """Return the torques (N, n_t) of the opened legs with their drives, without the platform."""
@@ -417,13 +426,11 @@ class PlatformRegressor:
         model: of the robot.
         columns: (b,) of the model's that count.
         values: (p,) parameters that predict torques; None where unknown.
-        preload: overconstraint of redundant actuators [N m or N].
     """
 
     model: ParallelModel
     columns: np.ndarray
     values: np.ndarray | None = None
-    preload: float = 0.0
     carried: Collection[str] | None = None
 
     def motion(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
@@ -441,10 +448,9 @@ class PlatformRegressor:
         return self.slopes(x, v, a, self._columns, weights)
 
     def torques(self, motion: LoopMotion) -> np.ndarray:
-        """Return the actuators' torques (N, n) of a motion, by the model's `values`."""
+        """Return the actuators' torques (N, n) of a motion, by the model's `values` and preload."""
         assert self.values is not None
-        forces = self.model.platform_force(self.values, motion, self.carried)
-        return distributed(self.model.known, motion.jacobians, forces, self.preload)
+        return self.model.actuator_torques(self.values, motion, self.carried)
 
     def speeds(self, motion: LoopMotion) -> np.ndarray:
         """Return the actuators' speeds (N, n) of a motion."""
