@@ -35,6 +35,7 @@ from calib.procedure.dynamic_stage.verdict import (
 from calib.procedure.findings import Verdict, lines_of, settle
 from calib.procedure.robot_kinds import refuse_unread
 from calib.rooms.parallel.geometry_share import propagate
+from calib.rooms.parallel.identical_legs import legs_differ
 from calib.rooms.parallel.mechanism.closure import ClosedRobot
 from calib.rooms.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians, overconstraint
@@ -98,6 +99,8 @@ def identify_parallel(
     model = model_of(known, settings)
     found: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
     noticed = [*_payloads(model, found, inputs.cases)]
+    if settings.identical_legs:
+        noticed += legs_differ(found, inputs.cases)
     if known.robot.redundant:
         noticed.append(finding("torques-projected", actuators=known.robot.n, freedoms=known.robot.r))
         preloads = [_preload(known, inputs, case) for case in inputs.cases]
@@ -120,8 +123,10 @@ def identify_parallel(
 def model_of(known: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
     """Return the model of a robot that the settings ask for, with their torque rows."""
     v0 = per_joint(settings.v0, 1, "v0")[0]
-    payloads = tuple(settings.payloads)
-    return make_parallel_model(known, settings.sets, v0, settings.torque_rows, payloads, settings.passive)
+    return make_parallel_model(
+        known, settings.sets, v0, settings.torque_rows, tuple(settings.payloads), settings.passive,
+        settings.identical_legs,
+    )  # fmt: skip
 
 
 def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
@@ -176,7 +181,7 @@ def _driven_joints(
 ) -> tuple[str, ...]:
     """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
     joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
-    friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.terms])
+    friction = np.array([False] * model.inertial + [one.form.dissipative for one in model.columns])
     values, taken, moved = np.where(friction, found.dynamics.values, 0.0), np.zeros(len(joints)), 0.0
     for case in cases:
         every = max(1, len(case.motion) // (10 * MAX_SAMPLES))

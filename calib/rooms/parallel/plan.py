@@ -72,7 +72,7 @@ class _PlatformDynamics:
         return self.model.actuator_torques(values, self.model.moved(q, v, a), self.carried)
 
     def _rubbing(self) -> np.ndarray:
-        own = [one.shape in ("velocity", "sign") for one in self.model.terms]
+        own = [one.shape in ("velocity", "sign") for one in self.model.columns]
         return np.array([False] * self.model.inertial + own)
 
 
