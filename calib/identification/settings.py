@@ -126,9 +126,7 @@ class IdentificationSettings(Choices):
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
-    require(
-        not (settings.passive or settings.identical_legs), "passive, identical_legs: for parallel robots", UsageError
-    )
+    require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))

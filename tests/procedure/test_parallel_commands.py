@@ -52,6 +52,7 @@ def folder(tmp_path_factory):
             np.savetxt(path / "three.csv", table, delimiter=",", header="t,q1,q2,q3,tau1,tau2,tau3", comments="")
     files = '[payload.5]\n[files."load.csv"]\npayload = ["5"]\n[files."other.csv"]\npayload = ["5"]\n'
     (path / "options.toml").write_text(files)
+    (path / "dropped.toml").write_text('drop = ["Fc11"]\n' + files)
     (path / "power.toml").write_text('rows = "power"\n' + files)
     parameters = loop_parameters(known)
     true = closed(changed(known.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
@@ -239,11 +240,12 @@ def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
     assert said in "".join(capsys.readouterr())
 
 
-def test_encoders_passive_joints_and_payloads_are_noted(folder, tmp_path):
-    words = ["--options", folder / "options.toml", "--out", tmp_path, "--no-plots"]
+def test_encoders_passive_joints_payloads_and_dropped_parameters_are_noted(folder, tmp_path):
+    words = ["--options", folder / "dropped.toml", "--out", tmp_path, "--no-plots"]
     assert calib("identify", "dualv", folder / "shifted.csv", *words) == 0
-    codes = {one["code"] for one in json.loads((tmp_path / "metrics.json").read_text())["noticed"]}
-    assert {"encoders-contradict", "passive-joints-unread", "payload-never"} <= codes
+    noticed = {one["code"]: one["values"] for one in json.loads((tmp_path / "metrics.json").read_text())["noticed"]}
+    assert {"encoders-contradict", "passive-joints-unread", "payload-never"} <= set(noticed)
+    assert noticed["needed-parameters-dropped"]["names"] == ["Fc11"]
 
 
 def test_parallel_robots_are_in_no_list_of_serial_arms():
