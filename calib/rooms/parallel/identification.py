@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ from calib.rooms.parallel.mechanism.velocities import loop_jacobians, overconstr
 from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
-OF_ARMS = {"couplings", "terms", "loop", "gravity", "payload_values"}  # settings
+OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}  # settings
+SIMULATED = ("iv", "didim")  # methods that simulate any robot
 MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
 
 Recorded = str | Path | Recording
@@ -113,8 +115,7 @@ def identify_parallel(
     carried = None
     if robot.covariance is not None:
         (progress or (lambda words: None))("the geometry's share of the covariance")
-        torques = [actuator_torques(inputs, case) for case in inputs.cases]
-        carried = propagate(found, robot.covariance, inputs.cases, torques, progress)
+        carried = propagate(found, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
     return ParallelDynamics(
         **vars(judged), inputs=inputs, found=found, findings=findings, carried=carried, seed=settings.seed
     )
@@ -202,9 +203,9 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     method = method_named(settings.method)
-    if _of_arms(method):
+    if method.name not in SIMULATED and _of_arms(method):
         what = "simulates" if method.needs_simulation else "differentiates the torques of"
-        known = ", ".join(name for name, one in METHODS.items() if not _of_arms(one))
+        known = ", ".join(name for name, one in METHODS.items() if name in SIMULATED or not _of_arms(one))
         raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take {known}")
 
 

@@ -145,7 +145,7 @@ class ParallelModel:
         if self.identical_legs:
             size, starts = self.legs[0][2].stop, self.known.robot.starts
             first[: size * len(self.legs)] %= size
-            motors = {one.joint: k for k, one in enumerate(self.terms, self._bodies) if one.shape == "acceleration"}
+            motors = {one.joint: k for k, one in enumerate(self.terms, self._bodies) if one.name.startswith("Ia")}
             for joint, k in motors.items():
                 first[k] = motors.get(joint % int(starts[1]), k)
         return first
@@ -342,6 +342,19 @@ class ParallelModel:
         payloads = range(platform + 10, self._bodies)
         every = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
         return np.array(list(dict.fromkeys(self.owners[every])), dtype=int)
+
+    def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
+        """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
+        from calib.rooms.parallel.mechanism.simulation import ParallelPlant  # stands on this module
+
+        joints = [int(self.known.robot.actuated[one.acts[0][0]]) for one in terms]
+        own = (replace(one, acts=((j, ((j, 1.0),)),)) for one, j in zip(terms, joints))
+        return ParallelPlant(replace(self, terms=(*self.terms, *own)), values)
+
+    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
+        """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
+        at_home = loop_jacobians(self.known, self.known.home)
+        return np.sqrt((at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])) ** 2 @ noise**2)
 
     def load_cases(self) -> Loads:
         return (None, ()) if self.payloads else (None,)
