@@ -209,7 +209,8 @@ def identify_instrumental(
     rows = model.torque_rows
     if not rows.has_bodies or rows is POWER or not cases:
         raise UsageError(
-            f"instruments from simulation need a recording with its reference, and rows of torques; found '{rows.name}'"
+            "instruments from simulation need a recording with its reference, and rows motor, link or both (of a "
+            f"parallel robot motor or platform); found '{rows.name}'"
         )
     observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
     data, friction = pool(triangulate(observed), model.rows), _Friction((), model, decimator, None)

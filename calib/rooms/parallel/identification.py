@@ -13,6 +13,7 @@ from calib.data.recordings.recording import Recording
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, UsageError, finding
 from calib.estimation.whiteness import inflation
+from calib.identification.checks.recorded_motion import DesignedMotion
 from calib.identification.friction.passivity import MIN_ENERGY_SHARE
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions
@@ -73,6 +74,7 @@ def identify_parallel(
     method: str | None = None,
     friction: str | None = None,
     seed: int = 0,
+    designed: Sequence[DesignedMotion] = (),
     on_read: Callable[[IdentificationInputs], None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelDynamics:
@@ -83,6 +85,7 @@ def identify_parallel(
         options: filters, payloads, drives, method; ``rows``: motor (on the platform's coordinates where actuators are
             redundant) or power; ``passive``: friction of the passive joints.
         method, friction: in place of the options'.
+        designed: motions of `calib excite`, the reference of recordings that have none, for options with a [loop].
 
     Raises:
         UsageError: for options that only serial arms know.
@@ -95,7 +98,7 @@ def identify_parallel(
     options = replace(options, settings=replace(options.settings, torque_rows=rows, seed=seed, **chosen))
     refuse_options_of_arms(options.settings, options)
     settings = options.settings
-    inputs = gather(robot, recordings, validate, options=options, seed=seed, progress=progress)
+    inputs = gather(robot, recordings, validate, options=options, seed=seed, designed=designed, progress=progress)
     if on_read is not None:
         on_read(inputs)
     model = model_of(known, settings)
@@ -109,7 +112,7 @@ def identify_parallel(
         noticed += [one for own in preloads for one in own]
         mean = np.mean([[one.values["mean"] for one in own] for own in preloads], axis=0)
         found = replace(found, dynamics=replace(found.dynamics, model=replace(model, preload=tuple(mean.tolist()))))
-    noticed = (*parameter_findings(found), *settle(noticed))
+    noticed = (*parameter_findings(found), *found.loop.findings, *settle(noticed))
     findings = ModelFindings(resting_parameters(found), noticed=noticed)
     judged = assess(inputs, found, findings)
     carried = None

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -23,7 +24,6 @@ from calib.records import frozen
 from calib.rooms.closed_loop.controllers import Reference
 from calib.rooms.closed_loop.simulation import Sensing, SimulatedRun, failure, sample_ticks
 from calib.rooms.parallel.mechanism.closure import compiled
-from calib.rooms.parallel.mechanism.parallel_model import ParallelModel
 from calib.rooms.parallel.mechanism.velocities import loop_jacobians
 
 FAR = 0.3  # [rad or m] between encoders and reference at which a run has diverged
@@ -35,11 +35,11 @@ class ParallelPlant:
     """A parallel robot to simulate, in place of a serial arm's `calib.rooms.closed_loop.simulation.Plant`.
 
     Attributes:
-        model: of the robot with its drive terms; parameters (p,) of it.
+        model: `ParallelModel` of the robot with its drive terms, which makes this robot; parameters (p,) of it.
         carried: payloads on board; None: all.
     """
 
-    model: ParallelModel
+    model: Any
     parameters: np.ndarray
     carried: Collection[str] | None = None
 
@@ -122,7 +122,7 @@ class ParallelPlant:
         return _stacked(own), model.platform_parameters(values, self.carried), drives
 
 
-def _robot(model: ParallelModel) -> tuple:
+def _robot(model: Any) -> tuple:
     """Return the arrays that describe a robot to `simulation_kernels.run`."""
     robot = model.known.robot
     legs = [compiled(leg) for leg in robot.legs]
