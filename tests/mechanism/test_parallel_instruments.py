@@ -131,8 +131,8 @@ def test_what_no_simulation_can_follow_is_said():
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ({"method": "cloe"}, r"parallel robots take ols, wls.*iv, didim"),
-        ({"method": "pc-iv"}, "simulates a serial arm"),
+        ({"method": "cloe"}, r"parallel robots take ols, wls.*iv, didim, pc-iv, pc-didim"),
+        ({"method": "gtls"}, "differentiates the torques of a serial arm"),
         ({"rows": "power"}, r"rows = 'power' is not supported; methods that do: ols, wls"),
         ({"loop": None}, r"needs a \[loop\]|state the controller"),
     ],

@@ -45,7 +45,7 @@ from calib.rooms.parallel.robots import ParallelMechanism
 from calib.workers.threads import one_blas_thread
 
 OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}  # settings
-SIMULATED = ("iv", "didim")  # methods that simulate any robot
+SIMULATED = ("iv", "didim", "pc-iv", "pc-didim")  # methods that simulate any robot
 MAX_SAMPLES = 200  # of a recording, at which redundant encoders are compared
 
 Recorded = str | Path | Recording
@@ -206,15 +206,15 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     method = method_named(settings.method)
-    if method.name not in SIMULATED and _of_arms(method):
+    if _of_arms(method):
         what = "simulates" if method.needs_simulation else "differentiates the torques of"
-        known = ", ".join(name for name, one in METHODS.items() if name in SIMULATED or not _of_arms(one))
+        known = ", ".join(name for name, one in METHODS.items() if not _of_arms(one))
         raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take {known}")
 
 
 def _of_arms(method: Method) -> bool:
     """Return whether a method requires the model of a serial arm."""
-    return method.needs_simulation or method.name == "ml"
+    return method.name in ("ml", "gtls") or (method.needs_simulation and method.name not in SIMULATED)
 
 
 def _encoders(known: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
